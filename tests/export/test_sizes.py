@@ -23,8 +23,7 @@ from edp.export.c.target import core_files
 from edp.ir.rls import Adaptation, AdaptationSpec
 from edp.ir.w8a16.quantise import outline
 from edp.networks.input_range import usual_range
-from edp.workflows.compression.formats import FORMATS
-from edp.workflows.compression.formats.base import resource_usage
+from edp.workflows.compression.formats import FORMATS, resource_usage
 
 ARM = ("-std=c99", "-O2", "-ffp-contract=off", "-mthumb", "-mcpu=cortex-m4", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16",
        "-ffunction-sections", "-fdata-sections")  # fmt: skip

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from edp.errors import ConfigError
-from edp.workflows.search.context import Outcome, SearchContext
+from edp.workflows.search.context import SearchContext
+from edp.workflows.search.engine import run_phases
 from edp.workflows.search.modules import THESIS_MODULES, TOGGLES, fitting
 from edp.workflows.search.phases import PHASES
 from edp.workflows.search.phases.isolation import arm_settings
 from edp.workflows.search.plan import load_plan
-from edp.workflows.search.run_phases import run_phases
 from edp.workflows.search.settings import SearchSpec
 from edp.workflows.search.space import Choice, Real, apply, elastic, halved
-from edp.workflows.search.trainings import SCORES, costs_of, settings_of
+from edp.workflows.search.trainings import SCORES, Outcome, costs_of, settings_of
 
 PLAN = load_plan(None, "thesis")
 DOC = Path(__file__).parents[2] / "docs/thesis_preset.md"
@@ -251,9 +251,9 @@ def test_trainings_have_epochs_that_the_judging_sessions_validate_and_the_test_s
 def test_the_plan_of_phase_2_5_is_made_on_the_mean_absolute_error(walked):
     """By hand from the trainings of phase 0: eq. 2.18 for each backbone, eq. 2.21 with the largest."""
     found, orders = walked
-    facts = found.decided["planning"].facts
-    features = found.decided["isolation"].facts["features"]
-    backbone = found.decided["calibration"].facts["backbone"]
+    facts = found.decided["planning"].to_json()["facts"]
+    features = found.decided["isolation"].to_json()["facts"]["features"]
+    backbone = found.decided["calibration"].to_json()["facts"]["backbone"]
     world = World()
     errors = {}
     for order in orders[: 6 * 30]:
@@ -273,18 +273,20 @@ def test_only_phase_1_is_pruned_and_phase_4_begins_without_a_warm_start(walked):
     ended = [order for order in orders if order.until is not None]
     assert {order.until for order in ended} == {12}
     assert all(not order.settings["model"]["blocks"] for order in ended)
-    values = [trial["values"] for trial in found.decided["synthesis"].facts["trials"]]
-    assert found.decided["calibration"].facts["baseline"]["learning_rate"] not in [v["learning_rate"] for v in values]
+    values = [trial["values"] for trial in found.decided["synthesis"].to_json()["facts"]["trials"]]
+    assert found.decided["calibration"].to_json()["facts"]["baseline"]["learning_rate"] not in [
+        v["learning_rate"] for v in values
+    ]
     assert all(
         set(v) == {"learning_rate", "weight_decay", "dropout", "schedule", "patience", "smoothness"} for v in values
     )
-    on = found.decided["synthesis"].facts["on"]
+    on = found.decided["synthesis"].to_json()["facts"]["on"]
     assert set(PLAN.spec.toggles) <= set(on)
-    assert set(on) - set(PLAN.spec.toggles) == set(found.decided["confirmation"].facts["confirmed"])
-    registered = fitting(found.decided["calibration"].facts["settings"], among=PLAN.spec.modules)
-    assert set(found.decided["exploration"].facts["on"]) == {*registered, *PLAN.spec.toggles}
-    first = found.decided["exploration"].facts["trials"][0]
-    earlier = found.decided["synthesis"].facts
+    assert set(on) - set(PLAN.spec.toggles) == set(found.decided["confirmation"].to_json()["facts"]["confirmed"])
+    registered = fitting(found.decided["calibration"].to_json()["facts"]["settings"], among=PLAN.spec.modules)
+    assert set(found.decided["exploration"].to_json()["facts"]["on"]) == {*registered, *PLAN.spec.toggles}
+    first = found.decided["exploration"].to_json()["facts"]["trials"][0]
+    earlier = found.decided["synthesis"].to_json()["facts"]
     assert set(first["modules"]) == set(earlier["modules"])
     assert all(first["values"][name] == earlier["values"][name] for name in PLAN.spec.deferred)
 

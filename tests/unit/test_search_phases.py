@@ -10,15 +10,15 @@ import pytest
 from edp.config.experiment import load_experiment, plain_tree
 from edp.errors import ConfigError, DataError
 from edp.evaluation.controller import Budget
-from edp.workflows.search.context import Outcome, SearchContext, set_apart
+from edp.workflows.search.context import SearchContext, set_apart
+from edp.workflows.search.engine import run_phases
 from edp.workflows.search.modules import THESIS_MODULES
 from edp.workflows.search.phases import PHASES
-from edp.workflows.search.run_phases import run_phases
 from edp.workflows.search.settings import CompressionSpec, SearchSpec
 from edp.workflows.search.smaller import Recipe
 from edp.workflows.search.space import Choice, Real
 from edp.workflows.search.study import SamplerSpec
-from edp.workflows.search.trainings import SCORES, settings_of
+from edp.workflows.search.trainings import SCORES, Outcome, settings_of
 
 SESSIONS = tuple(f"s{number:02d}" for number in range(12))
 SPACE = {"learning_rate": Real(1e-4, 1e-1, log=True), "units": Choice((4, 8, 16))}
@@ -100,7 +100,7 @@ def found():
 
 
 def test_phase_0_takes_the_better_feature_set_and_says_how_sure_it_is(found):
-    facts = found.decided["isolation"].facts
+    facts = found.decided["isolation"].to_json()["facts"]
     assert facts["features"] == "FG2"
     assert set(facts["arms"]) == {"lstm FG1", "lstm FG2", "hybrid FG1", "hybrid FG2"}
     assert all(held["p"] < 0.05 and held["change"] < -0.05 for held in facts["comparisons"].values())
@@ -115,7 +115,7 @@ def test_phase_0_holds_the_best_backbone_against_the_others():
     def hybrid_gains(settings):
         return by_rate(settings) * (0.9 if settings["model"]["backbone"]["kind"] == "hybrid" else 1.0)
 
-    facts = run_phases(context(), World(hybrid_gains), until="isolation").decided["isolation"].facts
+    facts = run_phases(context(), World(hybrid_gains), until="isolation").decided["isolation"].to_json()["facts"]
     (held,) = facts["backbones"].values()
     assert held["best"] == "hybrid"
     assert list(facts["backbones"]) == ["lstm"]
@@ -135,7 +135,7 @@ def test_phase_0_pairs_all_arms_on_the_same_folds_and_seeds():
 
 
 def test_phase_1_finds_the_rate_and_the_smallest_size_that_is_not_bettered(found):
-    facts = found.decided["calibration"].facts
+    facts = found.decided["calibration"].to_json()["facts"]
     assert facts["backbone"] == "hybrid"
     assert abs(np.log10(facts["baseline"]["learning_rate"]) + 2.5) < 1.0
     assert facts["settings"]["task"]["features"] == "FG2"
@@ -163,7 +163,11 @@ def test_backbones_are_chosen_on_all_folds_but_in_the_thesis_by_one(mode):
         return by_rate(settings) - 0.7 * (settings["model"]["backbone"]["kind"] == "hybrid")
 
     spec = dataclasses.replace(SPEC, mode=mode)
-    facts = run_phases(context(spec), OneFoldMisleads(hybrid_gains), until="calibration").decided["calibration"].facts
+    facts = (
+        run_phases(context(spec), OneFoldMisleads(hybrid_gains), until="calibration")
+        .decided["calibration"]
+        .to_json()["facts"]
+    )
     kept = {name: held["score"] for name, held in facts["backbones"].items()}
     if mode == "sound":
         assert kept["lstm"] < kept["hybrid"]
@@ -185,7 +189,7 @@ def test_decisions_are_plain_and_come_again_without_a_training(found):
     for name in ("isolation", "calibration"):
         plain = json.loads(json.dumps(again.decided[name].to_json()))
         assert plain == json.loads(json.dumps(first.decided[name].to_json()))
-        assert first.decided[name].facts == found.decided[name].facts
+        assert first.decided[name].to_json()["facts"] == found.decided[name].to_json()["facts"]
         assert all(sentence.endswith(".") for sentence in plain["sentences"])
 
 
@@ -193,7 +197,7 @@ def test_trainings_that_diverge_count_as_the_worst_and_are_never_chosen():
     def brittle(settings):
         return None if settings["training"]["optimizer"]["learning_rate"] > 1e-2 else by_rate(settings)
 
-    facts = run_phases(context(), World(brittle), until="calibration").decided["calibration"].facts
+    facts = run_phases(context(), World(brittle), until="calibration").decided["calibration"].to_json()["facts"]
     assert facts["baseline"]["learning_rate"] <= 1e-2
     statuses = [status for trial in facts["backbones"]["lstm"]["trials"] for status in trial["statuses"]]
     assert "diverged" in statuses
@@ -203,7 +207,10 @@ def test_trainings_that_diverge_count_as_the_worst_and_are_never_chosen():
             None if settings["task"]["features"] == "FG1" and settings["model"]["backbone"]["kind"] == "lstm" else 5.0
         )
 
-    assert run_phases(context(), World(fg1_breaks), until="isolation").decided["isolation"].facts["features"] == "FG2"
+    assert (
+        run_phases(context(), World(fg1_breaks), until="isolation").decided["isolation"].to_json()["facts"]["features"]
+        == "FG2"
+    )
     usual = context().base["training"]["optimizer"]["learning_rate"]
 
     def only_as_it_was(settings):
@@ -216,7 +223,7 @@ def test_trainings_that_diverge_count_as_the_worst_and_are_never_chosen():
 def test_what_costs_too_much_is_not_trained_and_a_cost_gives_a_front():
     spec = dataclasses.replace(SPEC, limits={"parameters": 4000.0}, cost="parameters", backbones=("lstm",))
     world = World(by_rate)
-    facts = run_phases(context(spec), world, until="calibration").decided["calibration"].facts
+    facts = run_phases(context(spec), world, until="calibration").decided["calibration"].to_json()["facts"]
     trials = facts["backbones"]["lstm"]["trials"]
     assert any(trial["parameters"] > 4000 for trial in trials)
     assert all((trial["score"] is None) == (trial["parameters"] > 4000) for trial in trials)
@@ -228,7 +235,8 @@ def test_what_costs_too_much_is_not_trained_and_a_cost_gives_a_front():
 def test_the_thesis_mode_uses_its_own_estimates():
     spec = dataclasses.replace(SPEC, mode="thesis")
     sound, thesis = (
-        run_phases(context(s), World(by_rate), until="isolation").decided["isolation"].facts for s in (SPEC, spec)
+        run_phases(context(s), World(by_rate), until="isolation").decided["isolation"].to_json()["facts"]
+        for s in (SPEC, spec)
     )
     assert sound["arms"]["lstm FG1"]["split_interval"] is not None
     assert thesis["arms"]["lstm FG1"]["split_interval"] is None
@@ -299,7 +307,7 @@ def sound():
 
 
 def test_the_design_passes_what_helps_and_stops_what_harms(sound):
-    facts = sound[0].decided["screening"].facts
+    facts = sound[0].decided["screening"].to_json()["facts"]
     assert set(facts["registered"]) == set(THESIS_MODULES)
     assert "squeeze_excitation" in facts["passed"]
     assert "zoneout" not in facts["passed"]
@@ -309,30 +317,30 @@ def test_the_design_passes_what_helps_and_stops_what_harms(sound):
 
 def test_the_plan_says_how_many_runs_and_why(sound):
     decision = sound[0].decided["planning"]
-    assert 3 <= decision.facts["runs"] <= 6
+    assert 3 <= decision.facts.runs <= 6
     assert "To see 2 %" in decision.sentences[0]
 
 
 def test_a_plan_that_no_number_of_runs_meets_makes_the_most_that_are_allowed(sound):
     small = dataclasses.replace(sound[0], spec=dataclasses.replace(CONFIRMED, least_effect=1e-4))
     decision = run_phases(small, World(with_effects), phases=["planning"]).decided["planning"]
-    assert decision.facts["runs"] == 6
-    assert decision.facts["enough"] is None
+    assert decision.facts.runs == 6
+    assert decision.facts.enough is None
     assert "6 runs are made nevertheless" in decision.sentences[1]
 
 
 def test_only_what_really_helps_is_confirmed(sound):
-    facts = sound[0].decided["confirmation"].facts
+    facts = sound[0].decided["confirmation"].to_json()["facts"]
     assert facts["confirmed"] == ["squeeze_excitation"]
     by_name = {held["module"]: held for held in facts["evidence"]}
-    assert set(by_name) == set(sound[0].decided["screening"].facts["registered"])
+    assert set(by_name) == set(sound[0].decided["screening"].to_json()["facts"]["registered"])
     assert by_name["squeeze_excitation"]["change"] == pytest.approx(-0.06, abs=0.02)
     assert by_name["zoneout"]["p"] == 1.0
 
 
 def test_what_a_look_drops_is_not_trained_any_more(sound):
-    facts = sound[0].decided["confirmation"].facts
-    runs = sound[0].decided["planning"].facts["runs"]
+    facts = sound[0].decided["confirmation"].to_json()["facts"]
+    runs = sound[0].decided["planning"].to_json()["facts"]["runs"]
     for held in facts["evidence"]:
         assert held["runs"] in (0, 5, runs)
         assert (held["runs"] == 5 and runs > 5) == bool(held["dropped_after"])
@@ -341,9 +349,9 @@ def test_what_a_look_drops_is_not_trained_any_more(sound):
 def test_the_thesis_mode_walks_the_same_phases_by_its_own_rules():
     spec = dataclasses.replace(CONFIRMED, mode="thesis", module_trials=3, run_seeds=2, most_runs=4)
     found = run_phases(context(spec), World(with_effects), until="confirmation")
-    screening, confirmation = (found.decided[name].facts for name in ("screening", "confirmation"))
+    screening, confirmation = (found.decided[name].to_json()["facts"] for name in ("screening", "confirmation"))
     assert "squeeze_excitation" in screening["passed"]
-    assert found.decided["planning"].facts["runs"] <= 4
+    assert found.decided["planning"].to_json()["facts"]["runs"] <= 4
     assert "squeeze_excitation" in confirmation["confirmed"]
     assert {held["metric"] for held in confirmation["evidence"]} == {"mae", "rmse", "p95", "p99"}
 
@@ -356,14 +364,14 @@ def test_without_a_survivor_nothing_is_trained():
         decided={
             **first.decided,
             "screening": dataclasses.replace(
-                first.decided["screening"], facts={**first.decided["screening"].facts, "passed": []}
+                first.decided["screening"], facts=dataclasses.replace(first.decided["screening"].facts, passed=())
             ),
         },
     )
     trained = world.trained
     found = run_phases(first, world, phases=["confirmation"])
     assert world.trained == trained
-    assert found.decided["confirmation"].facts["confirmed"] == []
+    assert found.decided["confirmation"].to_json()["facts"]["confirmed"] == []
 
 
 def test_the_synthesis_opens_the_test_sessions_once_and_only_there(sound):
@@ -374,7 +382,7 @@ def test_the_synthesis_opens_the_test_sessions_once_and_only_there(sound):
     assert all(order["judged"] == list(SESSIONS[9:11]) and order["train"] == list(SESSIONS[:9]) for order in opened)
     assert {order["updates"] for order in opened} == {CONFIRMED.final_updates}
     assert not any(set(order["train"]) & set(SESSIONS[9:]) for order in orders)
-    facts = found.decided["synthesis"].facts
+    facts = found.decided["synthesis"].to_json()["facts"]
     assert facts["modules"] == ["squeeze_excitation"]
     assert facts["test"]["synthesis"]["composite"] < facts["test"]["baseline"]["composite"]
     assert facts["test_gain"]["low"] < facts["test_gain"]["change"] < 0
@@ -387,14 +395,14 @@ def test_the_synthesis_opens_the_test_sessions_once_and_only_there(sound):
 
 def test_the_exploration_starts_from_the_synthesis_and_is_judged_on_fresh_folds(sound):
     found, world = sound
-    facts = found.decided["exploration"].facts
+    facts = found.decided["exploration"].to_json()["facts"]
     first = facts["trials"][0]
-    assert first["modules"] == found.decided["synthesis"].facts["modules"]
+    assert first["modules"] == found.decided["synthesis"].to_json()["facts"]["modules"]
     assert facts["runs"] == 6
     assert facts["teacher"] in ("synthesis", "exploration")
     assert (
         "squeeze_excitation"
-        in (facts if facts["teacher"] == "exploration" else found.decided["synthesis"].facts)["modules"]
+        in (facts if facts["teacher"] == "exploration" else found.decided["synthesis"].to_json()["facts"])["modules"]
     )
     seeds = {order["seed"] for order in map(json.loads, world.done)}
     fresh = {context(CONFIRMED).seed("run", run, 0) for run in range(6, 12)}
@@ -402,7 +410,7 @@ def test_the_exploration_starts_from_the_synthesis_and_is_judged_on_fresh_folds(
 
 
 def test_the_exploration_varies_the_options_of_modules_that_are_on(sound):
-    facts = sound[0].decided["exploration"].facts
+    facts = sound[0].decided["exploration"].to_json()["facts"]
     for trial in facts["trials"]:
         asked = {name.partition(".")[0] for name in trial["values"] if "." in name}
         assert asked == set(trial["modules"]) & {name.partition(".")[0] for name in facts["options"]}
@@ -418,9 +426,9 @@ def test_synergies_that_no_module_has_alone_are_found_by_the_exploration():
     spec = dataclasses.replace(CONFIRMED, free_trials=40)
     world = World(together)
     found = run_phases(context(spec), world)
-    facts = found.decided["exploration"].facts
+    facts = found.decided["exploration"].to_json()["facts"]
     assert {"squeeze_excitation", "temporal_difference"} <= set(facts["modules"])
-    alone = found.decided["confirmation"].facts["confirmed"]
+    alone = found.decided["confirmation"].to_json()["facts"]["confirmed"]
     assert facts["teacher"] == "exploration" or {"squeeze_excitation", "temporal_difference"} <= set(alone)
 
 
@@ -435,10 +443,10 @@ def test_phase_6_compares_on_development_sessions_and_opens_the_second_lock_box_
     for order in made:
         assert order["train"] == list(context.training)
         assert order["updates"] == CONFIRMED.final_updates
-        assert order["settings"] == found.decided["exploration"].facts["teacher_settings"]
+        assert order["settings"] == found.decided["exploration"].to_json()["facts"]["teacher_settings"]
     assert all(order["judged"] == list(context.validation) for order in made[:-2])
     assert not any(set(order["judged"]) & set(SESSIONS[11:]) for order in orders if order not in sealed)
-    facts = found.decided["compression"].facts
+    facts = found.decided["compression"].to_json()["facts"]
     assert facts["chosen"] is not None
     row = facts["rows"][facts["chosen"]]
     assert row["error"] == min(one["error"] for one in facts["rows"] if not one["over"])
@@ -453,13 +461,13 @@ def test_phase_6_can_be_left_out_and_a_budget_that_nothing_meets_ends_in_a_sente
     off = dataclasses.replace(CONFIRMED, compression=CompressionSpec(on=False))
     world = World(with_effects)
     found = run_phases(dataclasses.replace(before, spec=off), world, phases=["compression"])
-    assert (world.trained, found.decided["compression"].facts["on"]) == (0, False)
+    assert (world.trained, found.decided["compression"].to_json()["facts"]["on"]) == (0, False)
     assert PHASES["compression"].trainings(dataclasses.replace(before, spec=off)) == 0
     tight = dataclasses.replace(CONFIRMED, compression=CompressionSpec(budget=Budget(name="none", cycles=10)))
     found = run_phases(dataclasses.replace(before, spec=tight), world, phases=["compression"])
     assert world.trained == 1
     assert "budget 'none': cycles = 10 can be met by no width" in found.decided["compression"].sentences[0]
-    assert found.decided["compression"].facts["chosen"] is None
+    assert found.decided["compression"].to_json()["facts"]["chosen"] is None
 
 
 def test_phase_6_whose_teacher_fails_opens_nothing(sound):

@@ -10,12 +10,15 @@ import pytest
 
 from edp.config.experiment import load_experiment
 from edp.errors import ConfigError
-from edp.workflows.search.context import Decision, Outcome, SearchContext
-from edp.workflows.search.run_phases import run_phases
+from edp.evaluation.study import Decision
+from edp.evaluation.study_facts import IsolationFacts
+from edp.stats.variance import PairedVariance
+from edp.workflows.search.context import SearchContext
+from edp.workflows.search.engine import run_phases
 from edp.workflows.search.settings import SearchSpec
 from edp.workflows.search.space import Choice, Real
 from edp.workflows.search.study import SamplerSpec, Study
-from edp.workflows.search.trainings import SCORES, TrainingRequest, settings_of
+from edp.workflows.search.trainings import SCORES, Outcome, TrainingRequest, settings_of
 
 SESSIONS = tuple(f"s{number:02d}" for number in range(12))
 SPACE = {"learning_rate": Real(1e-4, 1e-1, log=True), "units": Choice((4, 8))}
@@ -30,7 +33,17 @@ SPEC = SearchSpec(
     rungs=(0.125, 0.25, 0.5),
     pruner="median",
 )
-ISOLATION = Decision("isolation", {"features": "FG2"}, ())
+FACTS = IsolationFacts(
+    arms={},
+    runs=6,
+    seeds=1,
+    features="FG2",
+    mean_scores={},
+    comparisons={},
+    backbones={},
+    variance=PairedVariance(0.0, 0.0),
+)
+ISOLATION = Decision("isolation", FACTS, ())
 
 
 def context(**changes):
@@ -64,7 +77,7 @@ class World:
 
 def calibrated(do, **changes):
     decision = run_phases(context(**changes), do, phases=["calibration"]).decided["calibration"]
-    return decision, decision.facts["backbones"]["lstm"]["trials"]
+    return decision, decision.to_json()["facts"]["backbones"]["lstm"]["trials"]
 
 
 @pytest.fixture(scope="module")

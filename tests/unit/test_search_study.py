@@ -23,7 +23,7 @@ def study(kind="tpe", root=7, **options):
 
 def value(trial):
     return (
-        (math.log10(trial.values["learning_rate"]) + 2.5) ** 2 + trial.values["units"] / 64 + ("b" not in trial.flags)
+        (math.log10(trial.values["learning_rate"]) + 2.5) ** 2 + trial.values["units"] / 64 + ("b" not in trial.modules)
     )
 
 
@@ -72,16 +72,16 @@ def test_it_finds_better_ones_than_chance():
 
 def test_switches_that_bar_one_another_are_never_on_together():
     asked = run(study("random"), [30])
-    assert any("a" in trial.flags for trial in asked)
-    assert any("c" in trial.flags for trial in asked)
-    assert not any({"a", "c"} <= set(trial.flags) for trial in asked)
+    assert any("a" in trial.modules for trial in asked)
+    assert any("c" in trial.modules for trial in asked)
+    assert not any({"a", "c"} <= set(trial.modules) for trial in asked)
 
 
 def test_a_warm_start_is_asked_first_and_counts():
     made = study()
     made.suggest({"learning_rate": 1e-2, "units": 16}, ["b"])
     (first,) = made.ask(1)
-    assert (first.number, dict(first.values), first.flags) == (0, {"learning_rate": 1e-2, "units": 16}, ("b",))
+    assert (first.number, dict(first.values), first.modules) == (0, {"learning_rate": 1e-2, "units": 16}, ("b",))
     made.tell(0, [0.1])
     assert [trial.number for trial in made.ask(2)] == [1, 2]
 
@@ -91,7 +91,7 @@ def test_an_option_is_asked_where_its_switch_is_on_and_comes_again(kind):
     def asked():
         made = study(kind, options={"a": {"a.heads": Choice((2, 4))}, "b": {"b.form": Choice(("x", "y"))}})
         found = run(made, [3, 3, 3])
-        return [(trial.flags, dict(trial.options)) for trial in found]
+        return [(trial.modules, dict(trial.options)) for trial in found]
 
     found = asked()
     for flags, options in found:
@@ -105,7 +105,7 @@ def test_a_warm_start_may_name_options_of_what_is_on():
     made = study(options={"a": {"a.heads": Choice((2, 4))}})
     made.suggest({"units": 16}, ["a"], {"a.heads": 4})
     (first,) = made.ask(1)
-    assert (first.flags, dict(first.options)) == (("a",), {"a.heads": 4})
+    assert (first.modules, dict(first.options)) == (("a",), {"a.heads": 4})
     with pytest.raises(ConfigError, match=r"no option 'a.heads' of what is on"):
         made.suggest({}, ["b"], {"a.heads": 4})
     with pytest.raises(ConfigError, match=r"a\.heads = 3 is not in"):

@@ -10,7 +10,7 @@ from edp.config.experiment import load_experiment
 from edp.errors import ConfigError, DataError
 from edp.jobs.processes import LocalPool
 from edp.storage.ledger import Ledger
-from edp.workflows.search.dispatch import Dispatcher
+from edp.workflows.search.engine import Dispatcher
 from edp.workflows.search.jobs import job_of
 from edp.workflows.search.trainings import SCORES, TrainingRequest, experiment_of, settings_of, train_order
 

@@ -11,18 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.console import JsonFlag, duration, emit, out, table
 from edp.cli.options import LogsArgument, MapOption, RepairOption, check_effects, source_of
+from edp.cli.progress import shown_progress
 from edp.errors import count_of
-from edp.storage.reading import Table
 from edp.wording import number
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
-
-    from edp.workflows.search.context import Decision
     from edp.workflows.search.runner import SearchResult
-    from edp.workflows.search.study_log import StudyLog
+    from edp.workflows.search.study_log import StudyStatus
 
 StudyArgument = Annotated[Path, typer.Argument(help="Folder of a study, as in edp search --study.")]
 DEFAULT = "run"
@@ -100,7 +97,7 @@ def run(
     Example: `edp search logs/ --study studies/first --phase screening --set search.features='["FG2", "own.toml"]'`
     """
     from edp.workflows.search.plan import load_plan
-    from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
+    from edp.workflows.search.runner import Resources, run_search
 
     # JSON quotes the path as TOML wants it.
     changes = [*changes, f"search.compression.budget={json.dumps(str(budget))}"] if budget is not None else changes
@@ -115,15 +112,8 @@ def run(
         open_cluster=open_cluster,
     )
     source = source_of(data, signal_map, repair)
-    with progress(as_json) as shown:
-        display = SearchDisplay(shown, Steps(as_json), as_json)
-        callbacks = SearchCallbacks(
-            on_note=display.on_note,
-            on_phase=display.on_phase,
-            on_progress=display.on_progress,
-            on_decision=display.on_decision,
-        )
-        result = run_search(source, plan, study, resources, phase, callbacks)
+    with shown_progress("search", as_json, "trainings done") as progress:
+        result = run_search(source, plan, study, resources, phase, progress)
         # Pictures take long; an unfinished study is drawn when it is asked for.
         page = _write_report(study, None, pictures=result.state == "finished")
     emit(as_json, _facts(result) | {"report": str(page)}, lambda: _show(result, page))
@@ -135,12 +125,10 @@ def status(study: StudyArgument, as_json: JsonFlag = False) -> None:
 
     Example: `edp search status studies/first`
     """
-    from edp.storage.study_file import reading_parts
     from edp.workflows.search.study_log import look_at
 
-    progress = look_at(study)
-    with reading_parts(study):
-        emit(as_json, progress, lambda: _show_status(progress))
+    state = look_at(study)
+    emit(as_json, state.to_json(), lambda: _show_status(state))
 
 
 @app.command("report")
@@ -182,49 +170,9 @@ def _show_journal(file: Path, names: Sequence[str]) -> None:
     out.print(f"next: optuna-dashboard {file}")
 
 
-class SearchDisplay:
-    """Shows phases, trainings and the time left; decisions as sentences."""
-
-    def __init__(self, shown: Progress, steps: Steps, quiet: bool) -> None:
-        self.shown, self.steps, self.quiet = shown, steps, quiet
-        self.bar = shown.add_task("search", total=1.0, note="reading recordings")
-        self.title = ""
-
-    def on_note(self, text: str) -> None:
-        """Print a sentence."""
-        if not self.quiet:
-            out.print(text)
-
-    def on_phase(self, name: str, study_log: StudyLog) -> None:
-        """Print the beginning of a phase."""
-        from edp.workflows.search.phases import PHASES
-
-        self.title = f"phase {list(PHASES).index(name) + 1} of {len(PHASES)}, {PHASES[name].title}"
-        self.on_progress(study_log)
-
-    def on_progress(self, study_log: StudyLog) -> None:
-        """Show how far it is."""
-        counts, left = study_log.counts(), study_log.seconds_left()
-        # No more than are asked for: workers may be idle at the end of a batch.
-        running = min(study_log.workers, counts["asked"] - counts["done"])
-        remaining, done = max(0, counts["total"] - counts["done"]), count_of(counts["done"], "training")
-        note = f"{self.title}: {done}, {running} running, {remaining} left"
-        self.shown.update(self.bar, completed=counts["done"] / max(1, counts["total"]), note=note)
-        self.steps.say(f"search: {note}" + ("" if not left else f", at most {duration(max(1.0, left))}"))
-
-    def on_decision(self, decision: Decision) -> None:
-        """Print a decision and its reason."""
-        from edp.workflows.search.phases import PHASES
-
-        if not self.quiet:
-            out.print(PHASES[decision.phase].title, style="bold")
-            for sentence in decision.sentences:
-                out.print(f"  {sentence}")
-
-
 def _write_report(study: Path, output: Path | None, pictures: bool) -> Path:
+    from edp.evaluation.study import read_study
     from edp.report import write_study_page
-    from edp.storage.study_file import read_study
 
     return write_study_page(read_study(study), study if output is None else output, pictures).page
 
@@ -243,6 +191,12 @@ def _facts(result: SearchResult) -> dict[str, object]:
 
 
 def _show(result: SearchResult, page: Path) -> None:
+    from edp.workflows.search.phases import PHASES
+
+    for decision in result.context.decided.values():
+        out.print(PHASES[decision.phase].title, style="bold")
+        for sentence in decision.sentences:
+            out.print(f"  {sentence}")
     out.print(f"study: {result.folder}, {result.state}; {count_of(result.trained, 'training')} now")
     out.print(f"report: {page}")
     if result.teacher is None:
@@ -256,36 +210,34 @@ def _show(result: SearchResult, page: Path) -> None:
 
 def _deploying(result: SearchResult) -> str:
     """Return the command that deploys the network chosen by phase 6."""
-    facts = result.context.decided["compression"].facts
+    from edp.evaluation.study_facts import SmallerFacts
+
+    facts = result.context.facts(SmallerFacts)
     run = result.networks.get("chosen", result.networks.get("teacher"))
-    if facts["rows"][facts["chosen"]]["format"] == "w8a16":
+    if facts.chosen is not None and facts.rows[facts.chosen].format == "w8a16":
         return f"edp quantise {run} --out {result.folder / 'w8a16'}"
     return f"edp export {run} --to c --out firmware/predictor"
 
 
-def _show_status(progress: Table) -> None:
-    counts = progress["counts"]
-    running = f"process {progress['holder']}" if progress["holder"] else "nobody now"
-    out.print(
-        f"{progress['data']['path']}: {progress['data']['sessions']} sessions, {number(progress['data']['hours'], 2)} h"
-    )
-    out.print(f"mode {progress['mode']}, {progress['state']}, coordinated by {running}; written {progress['updated']}")
+def _show_status(state: StudyStatus) -> None:
+    study = state.study
+    running = f"process {state.holder}" if state.holder else "nobody now"
+    out.print(f"{study.data.path}: {study.data.sessions} sessions, {number(study.data.hours, 2)} h")
+    out.print(f"mode {study.mode}, {study.state}, coordinated by {running}; written {study.updated}")
     rows = [
         (
-            phase["title"],
-            f"{phase['trained']}/{phase['trainings']}",
-            phase.get("pruned", 0),
-            phase["failed"],
-            duration(phase["seconds"]),
-            "decided" if phase["ended"] else "under way",
+            phase.title,
+            f"{phase.trained}/{phase.trainings}",
+            phase.pruned,
+            phase.failed,
+            duration(phase.seconds),
+            "decided" if phase.ended else "under way",
         )
-        for phase in progress["phases"]
+        for phase in study.phases
     ]
     table("phases", ["phase", "trainings", "pruned", "failed", "training time", "state"], rows)
-    out.print(
-        f"{count_of(counts['done'], 'training')} done, {progress['running']} running, "
-        f"{counts['total'] - counts['done']} left"
-    )
-    for decision in progress["decisions"]:
-        for sentence in decision["sentences"]:
+    counts = study.counts
+    out.print(f"{count_of(counts.done, 'training')} done, {state.running} running, {counts.total - counts.done} left")
+    for decision in study.decisions:
+        for sentence in decision.sentences:
             out.print(f"  {sentence}")

@@ -6,6 +6,7 @@ registries by the names of these fields; `build` and `plain_tree` are those of a
 
 from __future__ import annotations
 
+import math
 import types
 import typing
 from collections.abc import Mapping, Sequence
@@ -123,6 +124,7 @@ class SettingsTree:
         usual_kinds: by field, the kind that a table without ``kind`` means.
         what: the kind of file, as messages call it.
         positions: by the type of a list of fixed length, what stands at each position.
+        null_is_nan: whether null stands for a number that is not finite, for which JSON has no word.
     """
 
     def __init__(
@@ -131,11 +133,13 @@ class SettingsTree:
         usual_kinds: Mapping[str, str] | None = None,
         what: str = "settings",
         positions: Mapping[Any, tuple[str, ...]] | None = None,
+        null_is_nan: bool = False,
     ) -> None:
         self.parts = dict(parts or {})
         self.usual_kinds = dict(usual_kinds or {})
         self.what = what
         self.positions = dict(positions or {})
+        self.null_is_nan = null_is_nan
 
     def plain(self, value: Any, name: str = "") -> Any:
         """Nested plain values of a spec tree; registered parts carry their ``kind``; None is left out.
@@ -243,6 +247,8 @@ class SettingsTree:
     def _value(self, name: str, hint: Any, value: Any, path: str, problems: list[str]) -> Any:
         if value is None and _allows_none(hint):
             return None  # JSON has a word for it; TOML leaves the key out
+        if value is None and self.null_is_nan and hint is float:
+            return math.nan
         hint = _stated(hint)
         form = _form(hint)
         if name in self.parts:

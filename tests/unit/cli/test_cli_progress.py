@@ -11,7 +11,6 @@ from edp.cli import console
 from edp.cli.console import BoundedProgress, Steps, TimeLeft, count_text, left_text, progress
 from edp.cli.progress import Display, StageDisplay
 from edp.cli.screen import ScreeningDisplay
-from edp.cli.search import SearchDisplay
 from edp.training import TrainingProgress
 from edp.training.free_run import FreeRunProgress
 from edp.training.progress_steps import free_run_steps, training_steps
@@ -51,10 +50,10 @@ def screening(shown):
 
 
 def search(shown):
-    display = SearchDisplay(shown, steps(), quiet=False)
+    phase = display(shown, "search", "trainings done").stage("phase 1 of 8, isolation")
+    trainings = phase.stage("training", 2)
     for done in (0, 2, 5):
-        counts = {"done": done, "asked": 2, "total": 2}
-        display.on_progress(SimpleNamespace(counts=lambda c=counts: c, seconds_left=lambda: 0.2, workers=2))
+        trainings.step(done, share=done / 2, seconds_left=0.2, trained=done, workers=2)
 
 
 def logs(shown):
@@ -92,7 +91,7 @@ USERS = {
     "training_steps": train,
     "free_run_steps": fit,
     "ScreeningDisplay": screening,
-    "SearchDisplay": search,
+    "search": search,
     "log": logs,
     "Display": loops,
     "StageDisplay": methods,
@@ -220,7 +219,7 @@ def unplanned(node):
 
 def test_counts_and_times_of_progress_are_written_in_one_place():
     found = list(functions())
-    assert {"progress.py", "screen.py", "search.py"} <= {file for file, _ in found}
+    assert {"progress.py", "screen.py"} <= {file for file, _ in found}
     for file, node in found:
         assert not list(unplanned(node)) or (file, node.name) == ("console.py", "count_text"), (file, node.name)
     for file in COMMANDS.glob("*.py"):
@@ -263,6 +262,6 @@ def test_no_other_display_exists():
             node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef) and "add_task(" in ast.unparse(node)
         }
     assert importers == {"console.py"}
-    assert owners == set(USERS) - {"StageDisplay", "log", "free_run_steps", "training_steps"}
+    assert owners == set(USERS) - {"StageDisplay", "log", "search", "free_run_steps", "training_steps"}
     with progress() as shown:
         assert isinstance(shown, BoundedProgress)

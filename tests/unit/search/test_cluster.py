@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from noted_progress import NotedProgress
 from ray_nodes import needs_ray, three_nodes
 
 import edp.jobs.cluster
@@ -17,7 +18,7 @@ from edp.jobs.cluster import RayPool
 from edp.jobs.processes import LocalPool
 from edp.storage.ledger import Ledger, TrainingStatus, read_state
 from edp.workflows.search.plan import load_plan
-from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
+from edp.workflows.search.runner import Resources, run_search
 
 CHANGES = (
     'task={targets=["speed"], horizons=[1]}',
@@ -42,15 +43,13 @@ def test_a_study_on_three_nodes_of_which_one_is_killed_finds_what_one_machine_fi
     plan = load_plan(None, "quick", CHANGES)
     done = []
 
-    def kill_one(study_log):
-        if study_log.trained == 4 and not done:
-            done.append(study_log.workers)
+    def kill_one(count, trained, workers, **values):
+        if trained == 4 and not done:
+            done.append(workers)
             cluster.kill(2)
 
     resources = Resources(cluster=cluster.address)
-    there = run_search(
-        six_sessions, plan, tmp_path / "there", resources, "calibration", SearchCallbacks(on_progress=kill_one)
-    )
+    there = run_search(six_sessions, plan, tmp_path / "there", resources, "calibration", NotedProgress(kill_one))
     assert done == [3]
     here = run_search(six_sessions, plan, tmp_path / "here", Resources(workers=1), "calibration")
     assert there.digest == here.digest

@@ -6,8 +6,7 @@ from edp.config.experiment import load_experiment
 from edp.jobs.processes import LocalPool
 from edp.storage.ledger import Ledger, TrainingStatus
 from edp.workflows.search.context import SearchContext
-from edp.workflows.search.dispatch import Dispatcher
-from edp.workflows.search.run_phases import run_phases
+from edp.workflows.search.engine import Dispatcher, run_phases
 from edp.workflows.search.settings import SearchSpec
 from edp.workflows.search.trainings import settings_of
 
@@ -60,4 +59,4 @@ def test_a_search_that_was_stopped_does_nothing_twice_and_decides_the_same(conte
     again = search(lambda record, order, now: seen.append(now))
     assert not any(seen)
     assert again == decision
-    assert decision.facts["arms"]["lstm all"]["seed"] > 0
+    assert decision.facts.arms["lstm all"].seed > 0

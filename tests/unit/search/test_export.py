@@ -9,34 +9,52 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
 from edp.errors import ConfigError, StorageError
+from edp.evaluation.study import Decision, SessionSets, StudyData, StudyFile
+from edp.evaluation.study_facts import CalibratedBackbone, CalibrationFacts, SynthesisFacts, TrialRow
 from edp.workflows.search.export import export_study
 from edp.workflows.search.plan import space_of
 from edp.workflows.search.space import Choice, Real
 
 SPACE = {"learning_rate": {"low": 1e-4, "high": 5e-3, "log": True}, "units": [8, 16]}
 RATES = ({"learning_rate": 1e-3, "units": 8}, {"learning_rate": 2e-3, "units": 16})
-TRIALS = [
-    {"number": 0, "values": RATES[0], "score": 12.5, "parameters": 100.0, "statuses": ["done"]},
-    {"number": 1, "values": RATES[1], "score": None, "parameters": 300.0, "statuses": ["oom"]},
-]
-JOINT = [{"number": 0, "values": {"learning_rate": 1e-3}, "modules": ["stanh"], "score": 11.0, "parameters": 101.0}]
+TRIALS = (
+    TrialRow(number=0, values=RATES[0], score=12.5, mae=3.5, parameters=100.0, statuses=("done",)),
+    TrialRow(number=1, values=RATES[1], score=None, mae=None, parameters=300.0, statuses=("oom",)),
+)
+JOINT = TrialRow(number=0, values={"learning_rate": 1e-3}, modules=("stanh",), score=11.0, mae=None, parameters=101.0)
 
 
 def study(folder, cost="none", decisions=True):
-    found = [
-        {"phase": "isolation", "facts": {}},
-        {"phase": "calibration", "facts": {"backbones": {"lstm": {"trials": TRIALS}}}},
-        {"phase": "synthesis", "facts": {"trials": JOINT, "on": {"stanh": 1.0, "zoneout": 0.0}}},
-    ]
-    held = {
-        "schema": 2,
-        "state": "finished",
-        "mode": "sound",
-        "unit": "bar",
-        "spec": {"space": SPACE, "cost": cost},
-        "decisions": found if decisions else found[:1],
-    }
-    (folder / "study.json").write_text(json.dumps(held))
+    lstm = CalibratedBackbone(**vars(TRIALS[0]), trials=TRIALS)
+    calibration = CalibrationFacts(backbones={"lstm": lstm}, backbone="lstm", baseline=RATES[0], settings={})
+    synthesis = SynthesisFacts(
+        settings={},
+        values={},
+        modules=("stanh",),
+        score=11.0,
+        costs={},
+        on={"stanh": 1.0, "zoneout": 0.0},
+        trials=(JOINT,),
+        said_of_pruned=(),
+        test={},
+        test_gain=None,
+        antagonistic=(),
+    )
+    file = StudyFile(
+        state="finished",
+        mode="sound",
+        unit="bar",
+        preset="quick",
+        data=StudyData("logs", 2, 1.0, "00"),
+        spec={"space": SPACE, "cost": cost},
+        sessions=SessionSets((), ()),
+        modules={},
+        decisions=(Decision("calibration", calibration, ()), Decision("synthesis", synthesis, ())) if decisions else (),
+        phases=(),
+        history=(),
+        openings=(),
+    )
+    (folder / "study.json").write_text(json.dumps(file.to_json()))
     return folder
 
 
@@ -49,7 +67,7 @@ def test_questions_and_answers_come_back(tmp_path):
     assert (file.name, names) == ("optuna.journal", ["calibration lstm", "synthesis"])
     first, second = loaded(file, "calibration lstm").trials
     assert (first.params, first.value) == (RATES[0], 12.5)
-    assert first.user_attrs == {"parameters": 100.0}
+    assert first.user_attrs == {"mae": 3.5, "parameters": 100.0}
     assert second.state is TrialState.FAIL
     (joint,) = loaded(file, "synthesis").trials
     assert joint.params == {"learning_rate": 1e-3, "stanh": 1, "zoneout": 0}

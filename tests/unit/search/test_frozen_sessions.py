@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from noted_progress import NotedProgress
 
 from edp.config.experiment import load_experiment, plain_tree
 from edp.data.frozen import SECOND_TEST_SET, ByFrozen, Session
@@ -32,7 +33,7 @@ from edp.workflows.compression import (
 from edp.workflows.compression.quantise import quantise
 from edp.workflows.search.phases.compression import order_of, recipe_of, teacher_settings
 from edp.workflows.search.plan import load_plan
-from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
+from edp.workflows.search.runner import Resources, run_search
 from edp.workflows.search.smaller import Recipe, before, make_smaller
 from edp.workflows.search.study_log import look_at
 from edp.workflows.search.trainings import experiment_of
@@ -198,14 +199,14 @@ def test_no_frozen_session_trains_or_chooses_from_the_study_to_the_compressed_ne
 
 
 def test_the_networks_of_phase_6_are_runs_like_any_other(study, tmp_path):
-    facts = study.context.decided["compression"].facts
+    facts = study.context.decided["compression"].to_json()["facts"]
     assert facts["held_out_test"] is not None
     row = facts["rows"][facts["chosen"]]
     chosen = study.networks.get("chosen", study.networks["teacher"])
     assert load_bundle(chosen).predictor.spec.backbone.units == row["units"] or row["units"] is None
     scores = read_json(evaluate(chosen, baselines=()) / "scores.json")["models"]["network"]
     assert set(scores["recordings"]) == set(study.context.test)
-    assert look_at(study.folder)["phases"][-1]["name"] == "compression"
+    assert look_at(study.folder).study.phases[-1].name == "compression"
 
 
 def test_a_frozen_session_under_another_name_is_still_frozen(study, run, six_sessions, tmp_path):
@@ -268,13 +269,13 @@ def test_phase_6_killed_after_each_training_comes_to_the_same(
     folder = shutil.copytree(explored, tmp_path / "study")
     sittings = 0
 
-    def kill(study_log):
-        if study_log.trained >= (2 if harm == "none" else 1):
+    def kill(done, trained, **values):
+        if trained >= (2 if harm == "none" else 1):
             raise Killed
 
     for _ in range(20):
         try:
-            found = run_search(six_sessions, plan, folder, Here(workers=1), callbacks=SearchCallbacks(on_progress=kill))
+            found = run_search(six_sessions, plan, folder, Here(workers=1), progress=NotedProgress(kill))
         except Killed:
             sittings += 1
             if harm != "none":

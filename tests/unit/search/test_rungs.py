@@ -7,10 +7,12 @@ import signal
 import time
 
 import pytest
+from noted_progress import NotedProgress
 
 import edp.storage
 from edp.config.experiment import load_experiment
 from edp.errors import LostError, StorageError
+from edp.evaluation.study import read_study
 from edp.jobs.perform import perform
 from edp.jobs.processes import LocalPool
 from edp.report import write_study_page
@@ -24,12 +26,11 @@ from edp.storage.ledger import (
     left_state,
     read_state,
 )
-from edp.storage.study_file import read_study
-from edp.workflows.search.dispatch import Dispatcher
+from edp.workflows.search.engine import Dispatcher
 from edp.workflows.search.export import export_study
 from edp.workflows.search.jobs import job_of as job_of_order
 from edp.workflows.search.plan import load_plan
-from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
+from edp.workflows.search.runner import Resources, run_search
 from edp.workflows.search.study_log import look_at
 from edp.workflows.search.trainings import TrainingRequest, settings_of
 
@@ -251,11 +252,11 @@ def study(six_sessions, plan, tmp_path_factory):
 
 
 def untimed(folder):
-    return [{**row, "seconds": 0} for row in read_study(folder)["history"]]
+    return [{**row, "seconds": 0} for row in read_study(folder).to_json()["history"]]
 
 
 def test_a_study_shows_what_was_pruned_and_never_as_failed(study, plan):
-    held = read_study(study.folder)
+    held = read_study(study.folder).to_json()
     trials = held["decisions"][1]["facts"]["backbones"]["lstm"]["trials"]
     ended = sum(trial["pruned"] for trial in trials)
     assert 0 < ended < 12
@@ -268,7 +269,7 @@ def test_a_study_shows_what_was_pruned_and_never_as_failed(study, plan):
     assert all("rung" not in row for row in rows if row["status"] == "done")
     assert study.trained == held["counts"]["done"] == 24
     assert not list(study.folder.glob("ledger/states/*"))
-    page = write_study_page(held, study.folder / "report", pictures=False).page.read_text()
+    page = write_study_page(read_study(study.folder), study.folder / "report", pictures=False).page.read_text()
     assert f"{ended} of them pruned" in page
     assert "of them failed" not in page
 
@@ -293,17 +294,17 @@ def test_a_study_that_is_stopped_between_rungs_again_and_again_comes_to_the_same
     for _ in range(20):
         heard = []
 
-        def stop(study_log, heard=heard, limit=15 + 5 * stops):
+        def stop(done, heard=heard, limit=15 + 5 * stops, **values):
             heard.append(1)
             if len(heard) > limit:
                 raise Stop
 
         try:
-            again = run_search(six_sessions, plan, tmp_path, CREW, "calibration", SearchCallbacks(on_progress=stop))
+            again = run_search(six_sessions, plan, tmp_path, CREW, "calibration", NotedProgress(stop))
             break
         except Stop:
             stops += 1
-            assert look_at(tmp_path)["state"] == "stopped"
+            assert look_at(tmp_path).study.state == "stopped"
     assert stops > 4
     assert (again.digest, again.context.decided) == (study.digest, study.context.decided)
     assert untimed(tmp_path) == untimed(study.folder)

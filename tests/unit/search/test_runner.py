@@ -4,18 +4,19 @@ import json
 from dataclasses import replace
 
 import pytest
+from noted_progress import NotedProgress
 
 from edp.config.experiment import load_experiment
 from edp.errors import BusyError, ConfigError, DataError, LostError, StorageError
+from edp.evaluation.study import read_study
 from edp.jobs.base import ended
 from edp.jobs.perform import perform
 from edp.logs import read_recording, write_recording
 from edp.logs.source import DataSource
 from edp.storage import write_json
 from edp.storage.ledger import Ledger, TrainingStatus
-from edp.storage.study_file import read_study
 from edp.workflows.search.plan import SearchPlan, load_plan
-from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
+from edp.workflows.search.runner import Resources, run_search
 from edp.workflows.search.study_log import look_at
 
 CHANGES = (
@@ -98,7 +99,7 @@ def test_all_phases_run_and_leave_a_teacher_that_can_be_trained(finished, plan):
     teacher = load_experiment(finished.teacher, preset="quick")
     assert teacher.task.targets == plan.experiment.task.targets
     assert teacher.model.backbone.units in (2, 4)
-    study = read_study(finished.folder)
+    study = read_study(finished.folder).to_json()
     assert study["state"] == "finished"
     assert study["unit"] == "mm/s"
     assert study["counts"]["done"] == study["counts"]["asked"] == study["counts"]["total"] == finished.trained
@@ -116,7 +117,7 @@ def test_the_test_sessions_judge_only_behind_the_recorded_opening(finished):
     assert second == set(last.judged)
     assert len(second) in (1, 2)
     assert len(sealed) in (1, 2)  # winner and baseline may be the same network
-    assert [one["test_set"] for one in read_study(finished.folder)["openings"]] == [
+    assert [one.test_set for one in read_study(finished.folder).openings] == [
         "test sessions",
         "second test sessions",
     ]
@@ -127,27 +128,27 @@ def test_a_search_that_was_stopped_again_and_again_trains_nothing_twice_and_find
 ):
     done = []
 
-    def stop_every_30(study_log):
-        if study_log.trained >= 30:
+    def stop_every_30(done, trained, **values):
+        if trained >= 30:
             raise Stop
 
     trained = 0
     for _ in range(20):
         try:
-            found = run_search(six_sessions, plan, tmp_path, CREW, callbacks=SearchCallbacks(on_progress=stop_every_30))
+            found = run_search(six_sessions, plan, tmp_path, CREW, progress=NotedProgress(stop_every_30))
         except Stop:
-            study = look_at(tmp_path)
-            assert study["state"] == "stopped"
-            assert study["holder"] is None
+            status = look_at(tmp_path)
+            assert status.study.state == "stopped"
+            assert status.holder is None
             trained += 30
-            done.append(study["counts"]["done"])
+            done.append(status.study.counts.done)
             continue
         trained += found.trained
         break
     assert len(done) > 1
     assert trained == finished.trained
     assert found.digest == finished.digest
-    ours, theirs = read_study(tmp_path), read_study(finished.folder)
+    ours, theirs = (read_study(folder).to_json() for folder in (tmp_path, finished.folder))
     for part in ("decisions", "sessions", "spec", "data"):
         assert ours[part] == theirs[part]
     untimed = [[{**row, "seconds": 0} for row in study["history"]] for study in (ours, theirs)]
@@ -231,9 +232,9 @@ def test_damaged_records_are_set_apart_and_trained_again(six_sessions, plan, tmp
     digest = run_search(six_sessions, plan, tmp_path, CREW, until="isolation").digest
     records = sorted((tmp_path / "ledger/records").glob("*.json"))
     records[0].write_bytes(records[0].read_bytes()[:-40])
-    notes = []
-    again = run_search(six_sessions, plan, tmp_path, CREW, "isolation", SearchCallbacks(on_note=notes.append))
-    assert "1 damaged records were set apart" in notes[0]
+    progress = NotedProgress()
+    again = run_search(six_sessions, plan, tmp_path, CREW, "isolation", progress)
+    assert "1 damaged records were set apart" in progress.notes[0]
     assert (again.trained, again.digest) == (1, digest)
 
 
@@ -241,7 +242,7 @@ def test_trainings_that_all_fail_are_told_with_their_reason(six_sessions, plan, 
     beyond = load_plan(None, "quick", (*CHANGES, "judge.skip=5000"))
     with pytest.raises(DataError, match=r"all 8 trainings of a batch failed; the first says: "):
         run_search(six_sessions, beyond, tmp_path, CREW)
-    assert read_study(tmp_path)["phases"][0]["failed"] == 8
+    assert read_study(tmp_path).phases[0].failed == 8
 
 
 def test_a_lost_training_stops_the_search_and_is_tried_again(six_sessions, plan, tmp_path):

@@ -4,16 +4,17 @@ import dataclasses
 import json
 
 import pytest
+from noted_progress import NotedProgress
 
 from edp.config.experiment import load_experiment
+from edp.evaluation.study import read_study
 from edp.jobs.perform import perform
 from edp.report import write_study_page
 from edp.storage.ledger import Ledger
-from edp.storage.study_file import read_study
 from edp.training.parts import fit_part
-from edp.workflows.search.dispatch import Dispatcher
+from edp.workflows.search.engine import Dispatcher
 from edp.workflows.search.plan import load_plan
-from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
+from edp.workflows.search.runner import Resources, run_search
 from edp.workflows.search.trainings import (
     TrainingRequest,
     experiment_of,
@@ -161,16 +162,16 @@ def test_all_phases_run_by_the_rules_of_the_thesis_and_leave_a_teacher(finished,
     assert finished.state == "finished"
     teacher = load_experiment(finished.teacher, preset="thesis")
     assert teacher.model.backbone.units in (2, 4)
-    study = read_study(finished.folder)
+    study = read_study(finished.folder).to_json()
     assert study["mode"] == "thesis"
     assert study["counts"]["done"] == study["counts"]["asked"] == finished.trained
     assert {row["status"] for row in study["history"]} == {"done"}
-    assert set(finished.context.decided["synthesis"].facts["on"]) >= set(plan.spec.toggles)
+    assert set(finished.context.decided["synthesis"].to_json()["facts"]["on"]) >= set(plan.spec.toggles)
     with Ledger(finished.folder / "ledger") as ledger:
         held = list(ledger)
     assert {record.identity.epochs for record in held} == {3}
     tests = {*finished.context.test, *finished.context.second}
-    assert finished.context.decided["compression"].facts["chosen"] is not None
+    assert finished.context.decided["compression"].to_json()["facts"]["chosen"] is not None
     for record in held:
         split = record.identity.split
         assert not tests & {*split["train"], *split["validation"]}
@@ -188,14 +189,14 @@ def test_its_report_is_written_and_speaks_of_epochs(finished, tmp_path):
 
 @pytest.mark.slow
 def test_stopped_again_and_again_it_comes_to_the_same(six_sessions, plan, finished, tmp_path):
-    def stop_every_25(study_log):
-        if study_log.trained >= 25:
+    def stop_every_25(done, trained, **values):
+        if trained >= 25:
             raise Stop
 
     trained = 0
     for _ in range(20):
         try:
-            found = run_search(six_sessions, plan, tmp_path, CREW, callbacks=SearchCallbacks(on_progress=stop_every_25))
+            found = run_search(six_sessions, plan, tmp_path, CREW, progress=NotedProgress(stop_every_25))
         except Stop:
             trained += 25
             continue

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError, closest
+from edp.evaluation.study import StudyFile
 from edp.recording import Recording
 from edp.report.common.chart import BLUE, GREY, Chart, ChartAxis, DataSeries, Mark, Panel, Range, with_unit
 from edp.report.run.charts import horizon_chart
 from edp.report.run.facts import Facts
 from edp.report.run.figures import downsample
 from edp.report.search.charts import study_charts
-from edp.report.search.facts import StudyFacts
 from edp.signals import KINDS, Channel
 from edp.wording import label_by_name, short_labels
 
@@ -81,7 +81,7 @@ def score_figure(facts: Facts) -> go.Figure:
     return _figure(chart)
 
 
-def study_figure(study: StudyFacts, name: str | None = None) -> go.Figure:
+def study_figure(study: StudyFile, name: str | None = None) -> go.Figure:
     """A figure of a study by name; without one the first that there are facts for.
 
     Raises:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import html
 from collections.abc import Iterable, Sequence
 
+from edp.evaluation.study import StudyFile
 from edp.report.run.facts import Facts
 from edp.report.run.tables import comparison_tables
 from edp.report.search import words
-from edp.report.search.facts import StudyFacts
 from edp.report.search.tables import phases_table
 from edp.table import Table
 from edp.wording import printable
@@ -83,7 +83,7 @@ def score_tables(facts: Facts) -> list[Table]:
     return comparison_tables(facts)
 
 
-def study_html(study: StudyFacts) -> str:
+def study_html(study: StudyFile) -> str:
     """What a search came to, and how far its phases are."""
     sentences = " ".join([words.headline(study), *words.verdict(study)])
     phases = phases_table(study)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from edp.evaluation.study import StudyFile
 from edp.report.common.chart import (
     BLUE,
     DROPPED,
@@ -28,7 +29,6 @@ from edp.report.common.chart import (
     Texts,
     with_unit,
 )
-from edp.report.search.facts import StudyFacts
 from edp.report.search.views import (
     COSTS,
     ArmView,
@@ -47,7 +47,7 @@ from edp.table import chance
 from edp.wording import decimals_for, number
 
 
-def study_charts(study: StudyFacts) -> list[Chart]:
+def study_charts(study: StudyFile) -> list[Chart]:
     """Every figure that there are facts for."""
     views = forests(study)
     charts = [

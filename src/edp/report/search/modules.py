@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from edp.errors import count_of
-from edp.report.search.facts import StudyFacts, known, of_phase, real
+from edp.evaluation.study import StudyFile
+from edp.evaluation.study_facts import SoundConfirmation, SoundScreening, ThesisConfirmation, ThesisScreening
+from edp.report.search.facts import finite, of_phase
+from edp.stats.confirm import ModuleEvidence
+from edp.stats.thesis_confirm import ThesisEvidence
 from edp.table import Column, Table, chance, figures
 from edp.wording import interval
 
@@ -21,10 +24,8 @@ GROUPS = {
 OTHER = "Other"
 
 
-def modules_tables(study: StudyFacts) -> tuple[Table, ...]:
+def modules_tables(study: StudyFile) -> tuple[Table, ...]:
     """Table 4.5: phases 2 and 3 side by side, and every test of phase 3."""
-    if "screening" not in study.facts:
-        return ()
     sheets = (_modules_thesis if study.mode == "thesis" else _modules_sound)(study)
     return tuple(sheet for sheet in sheets if sheet is not None)
 
@@ -37,29 +38,29 @@ def ordered(names: Sequence[str]) -> list[tuple[str, str]]:
     return [*known_ones, *((OTHER, name) for name in names if name not in listed)]
 
 
-@of_phase("screening", ())
-def _modules_sound(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Table | None, ...]:
-    evidence = _evidence(study)
+@of_phase(SoundScreening, ())
+def _modules_sound(study: StudyFile, facts: SoundScreening) -> tuple[Table | None, ...]:
+    confirmation = study.facts(SoundConfirmation)
+    evidence = {} if confirmation is None else confirmation.by_module()
     rows, marked = [], set()
-    for group, name in ordered(facts["registered"]):
-        effect = facts["modules"][name]
+    for group, name in ordered(facts.registered):
+        effect = facts.modules[name]
         entry = evidence.get(name)
-        tested = entry is not None and entry["change"] is not None
-        size = known(entry["d_z"]["value"]) if entry is not None and entry["d_z"] else None
+        size = finite(entry.d_z.value) if entry is not None and entry.d_z is not None else None
+        tests: tuple[float | str | None, ...] = (None,) * 4
+        if entry is not None and entry.change is not None:
+            tests = (100 * entry.change, span(entry.low, entry.high), entry.p, entry.adjusted)
         rows.append(
             (
                 study.module(name),
                 group,
-                100 * real(effect["change"]),
-                100 * real(entry["change"]) if entry is not None and tested else None,
-                span(entry) if entry is not None and tested else None,
-                real(entry["p"]) if entry is not None and tested else None,
-                real(entry["adjusted"]) if entry is not None and tested else None,
+                100 * effect.change,
+                *tests,
                 size,
-                _verdict(study, name, entry, name in facts["passed"]),
+                _verdict(study, entry, name in facts.passed),
             )
         )
-        if entry is not None and entry["confirmed"]:
+        if entry is not None and entry.confirmed:
             marked.add(len(rows) - 1)
     columns = (
         Column("Module"),
@@ -72,21 +73,18 @@ def _modules_sound(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Table |
         Column("d_z", "Cohen", figures([], signed=True, decimals=2)),
         Column("Verdict", is_text=True),
     )
-    caption = (
-        f"Modules in phases 2 and 3; below zero is better, p is adjusted over all {len(facts['registered'])} modules"
-    )
+    caption = f"Modules in phases 2 and 3; below zero is better, p is adjusted over all {len(facts.registered)} modules"
     return Table(caption, columns, tuple(rows), frozenset(marked), name="modules"), _tests(study), _effects(study)
 
 
-@of_phase("screening", None)
-def _effects(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
+@of_phase(SoundScreening, None)
+def _effects(study: StudyFile, facts: SoundScreening) -> Table | None:
     """Main effects of the two-level design."""
     rows = []
-    for _, name in ordered(facts["registered"]):
-        effect = facts["modules"][name]
-        shares = (100 * real(effect["change"]), 100 * real(effect["importance"]))
-        verdict = "goes on" if name in facts["passed"] else "stops"
-        rows.append((study.module(name), shares[0], real(effect["p"]), shares[1], verdict))
+    for _, name in ordered(facts.registered):
+        effect = facts.modules[name]
+        verdict = "goes on" if name in facts.passed else "stops"
+        rows.append((study.module(name), 100 * effect.change, effect.p, 100 * effect.importance, verdict))
     columns = (
         Column("Module"),
         Column("Change", "%", figures([], signed=True, decimals=2)),
@@ -98,36 +96,31 @@ def _effects(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
     return Table(caption, columns, tuple(rows), name="effects")
 
 
-def _evidence(study: StudyFacts) -> dict[str, Mapping[str, Any]]:
-    facts = study.facts.get("confirmation", {})
-    return {entry["module"]: entry for entry in facts.get("evidence", ())}
-
-
-def _verdict(study: StudyFacts, name: str, entry: Mapping[str, Any] | None, passed: bool) -> str:
+def _verdict(study: StudyFile, entry: ModuleEvidence | None, passed: bool) -> str:
     if not passed:
         return "stopped"
     if entry is None:
-        return "not in phase 3" if "confirmation" in study.facts else "goes on"
-    if entry["dropped_after"]:
-        return f"dropped after {count_of(entry['dropped_after'], 'run')}"
-    return "confirmed" if entry["confirmed"] else "not confirmed"
+        return "not in phase 3" if "confirmation" in study.decided else "goes on"
+    if entry.dropped_after:
+        return f"dropped after {count_of(entry.dropped_after, 'run')}"
+    return "confirmed" if entry.confirmed else "not confirmed"
 
 
-@of_phase("confirmation", None)
-def _tests(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
+@of_phase(SoundConfirmation, None)
+def _tests(study: StudyFile, facts: SoundConfirmation) -> Table | None:
     """What other tests say of the modules that phase 3 tested."""
     rows = []
-    for entry in facts["evidence"]:
-        if entry["change"] is None:
+    for entry in facts.evidence:
+        if entry.change is None:
             continue
-        tests = (known(entry[name]) for name in ("p", "resampled_p", "paired_p", "mixed_p"))
+        tests = map(finite, (entry.p, entry.resampled_p, entry.paired_p, entry.mixed_p))
         rows.append(
             (
-                study.module(entry["module"]),
-                int(entry["runs"]),
+                study.module(entry.module),
+                entry.runs,
                 *tests,
-                span(entry["d_z"], 1.0) if entry["d_z"] else None,
-                None if entry["stability"] is None else 100 * real(entry["stability"]),
+                None if entry.d_z is None else span(entry.d_z.low, entry.d_z.high, 1.0),
+                None if entry.stability is None else 100 * entry.stability,
             )
         )
     columns = (
@@ -143,27 +136,27 @@ def _tests(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
     return Table("Other tests on the same trainings; all one-sided, not adjusted", columns, tuple(rows), name="tests")
 
 
-@of_phase("screening", ())
-def _modules_thesis(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Table | None, ...]:
-    evidence = study.facts.get("confirmation", {}).get("evidence", ())
-    metrics = list(dict.fromkeys(str(entry["metric"]) for entry in evidence))
-    by_cell = {(entry["module"], entry["metric"]): entry for entry in evidence}
-    confirmed = set(study.facts.get("confirmation", {}).get("confirmed", ()))
+@of_phase(ThesisScreening, ())
+def _modules_thesis(study: StudyFile, facts: ThesisScreening) -> tuple[Table | None, ...]:
+    confirmation = study.facts(ThesisConfirmation) or ThesisConfirmation(confirmed=(), evidence=())
+    metrics = list(dict.fromkeys(entry.metric for entry in confirmation.evidence))
+    by_cell = {(entry.module, entry.metric): entry for entry in confirmation.evidence}
+    confirmed = set(confirmation.confirmed)
     rows, every, marked = [], [], set()
-    for group, name in ordered(facts["registered"]):
+    for group, name in ordered(facts.registered):
         entry = by_cell.get((name, metrics[0])) if metrics else None
         tests = _thesis_cells(entry)
-        verdict = "stopped" if name not in facts["passed"] else "goes on"
+        verdict = "stopped" if name not in facts.passed else "goes on"
         if entry is not None:
             verdict = "confirmed" if name in confirmed else "not confirmed"
-        rows.append((study.module(name), group, known(facts["modules"][name]["gain"]), *tests, verdict))
+        rows.append((study.module(name), group, facts.modules[name].gain, *tests, verdict))
         if name in confirmed:
             marked.add(len(rows) - 1)
         for metric in metrics:
             if (name, metric) in by_cell:
                 cell = by_cell[name, metric]
-                every.append((study.module(name), metric.upper(), real(cell["beta"]), *_thesis_cells(cell),
-                              "passed" if cell["passed"] else "not passed"))  # fmt: skip
+                every.append((study.module(name), metric.upper(), cell.beta, *_thesis_cells(cell),
+                              "passed" if cell.passed else "not passed"))  # fmt: skip
     tests_columns = (
         Column("p", "as printed", chance),
         Column("p", "mixed model", chance),
@@ -195,15 +188,13 @@ def _modules_thesis(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Table 
     )
 
 
-def _thesis_cells(entry: Mapping[str, Any] | None) -> tuple[float | None, ...]:
+def _thesis_cells(entry: ThesisEvidence | None) -> tuple[float | None, ...]:
     if entry is None:
         return (None,) * 5
-    tests = (real(entry[name]) for name in ("printed_p", "p", "adjusted"))
-    return (*tests, known(entry["d_z"]), 100 * real(entry["stability"]))
+    return entry.printed_p, entry.p, entry.adjusted, finite(entry.d_z), 100 * entry.stability
 
 
-def span(entry: Mapping[str, Any], scale: float = 100.0) -> str | None:
-    """An interval as text."""
-    if entry.get("low") is None or entry.get("high") is None:
-        return None
-    return interval(scale * real(entry["low"]), scale * real(entry["high"]), signed=True)
+def span(low: float | None, high: float | None, scale: float = 100.0) -> str | None:
+    """Return an interval as text, None if an end is not finite."""
+    low, high = finite(low), finite(high)
+    return None if low is None or high is None else interval(scale * low, scale * high, signed=True)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from edp.evaluation.study import StudyFile
 from edp.report.common.chart import Chart
 from edp.report.common.page import Fold, Page, Paragraph, Part, Points, Section, Subsection, Terms
 from edp.report.common.picture import write_pictures
 from edp.report.search import words
 from edp.report.search.charts import study_charts
-from edp.report.search.facts import StudyFacts, facts_of, reading
+from edp.report.search.facts import reading
 from edp.report.search.tables import study_tables
 from edp.storage import make_folder, write_bytes
 from edp.table import Table
@@ -74,21 +74,20 @@ class StudyReport:
     pictures: tuple[Path, ...]
 
 
-def write_study_page(study: Mapping[str, Any], out: str | Path, pictures: bool = True) -> StudyReport:
+def write_study_page(study: StudyFile, out: str | Path, pictures: bool = True) -> StudyReport:
     """Write the report of a study: ``report.html``, ``report.md``, ``tables/*.csv`` and ``pictures/*``.
 
     A study that is not finished gets a report of what is decided and how far the rest is.
 
     Args:
-        study: content of ``study.json`` (`edp.storage.study_file.read_study`).
+        study: content of ``study.json`` (`edp.evaluation.study.read_study`).
         out: folder; it is made.
         pictures: whether to write them, which takes most of the time.
 
     Raises:
-        StorageError: the study is of another schema or damaged, or a file cannot be written.
+        StorageError: parts of the study contradict one another, or a file cannot be written.
     """
-    facts = facts_of(study)
-    page, text, tables = reading("study.json", lambda: _contents(facts))
+    page, text, tables = reading("study.json", lambda: _contents(study))
     folder = make_folder(out)
     target, document = folder / "report.html", folder / "report.md"
     write_bytes(target, page.encode("utf-8", "replace"))
@@ -97,16 +96,16 @@ def write_study_page(study: Mapping[str, Any], out: str | Path, pictures: bool =
     for name, table in tables.items():
         table_files.append(make_folder(folder / "tables") / f"{name}.csv")
         write_bytes(table_files[-1], table.csv().encode("utf-8", "replace"))
-    drawn = reading("study.json", lambda: write_pictures(folder / "pictures", study_charts(facts))) if pictures else []
+    drawn = reading("study.json", lambda: write_pictures(folder / "pictures", study_charts(study))) if pictures else []
     return StudyReport(target, document, tuple(table_files), tuple(drawn))
 
 
-def _contents(facts: StudyFacts) -> tuple[str, str, dict[str, Table]]:
-    tables = study_tables(facts)
-    return build_study_page(facts, tables).html(), study_text(facts, tables), tables
+def _contents(study: StudyFile) -> tuple[str, str, dict[str, Table]]:
+    tables = study_tables(study)
+    return build_study_page(study, tables).html(), study_text(study, tables), tables
 
 
-def build_study_page(study: StudyFacts, tables: Mapping[str, Table]) -> Page:
+def build_study_page(study: StudyFile, tables: Mapping[str, Table]) -> Page:
     """Return the page of a study.
 
     Args:
@@ -114,7 +113,7 @@ def build_study_page(study: StudyFacts, tables: Mapping[str, Table]) -> Page:
         tables: what `study_tables` returns.
     """
     charts = {chart.name: chart for chart in study_charts(study)}
-    get, is_sound = tables.get, study.mode == "sound"
+    get, is_sound, second = tables.get, study.mode == "sound", study.sessions.second
 
     def missing(*phases: str) -> Part | None:
         text = words.missing(study, *phases)
@@ -193,8 +192,8 @@ def build_study_page(study: StudyFacts, tables: Mapping[str, Table]) -> Page:
                 "openings",
                 "Sealed test set",
                 [
-                    f"Sessions set apart before anything else: {', '.join(study.test)}"
-                    f"{'; for phase 6 ' + ', '.join(study.second) if study.second else ''}. Each opening is recorded "
+                    f"Sessions set apart before anything else: {', '.join(study.sessions.test)}"
+                    f"{'; for phase 6 ' + ', '.join(second) if second else ''}. Each opening is recorded "
                     "before it is made; only the first is free of choices that an earlier one could have steered.",
                     get("openings") or Paragraph("Not opened yet.", "missing"),
                 ],
@@ -224,23 +223,24 @@ def _sentences(lines: Sequence[str]) -> str | Points:
     return Points(lines[1:], lines[0]) if len(lines) > MOST_IN_A_LINE else " ".join(lines)
 
 
-def _settings(study: StudyFacts) -> list[tuple[str, str]]:
+def _settings(study: StudyFile) -> list[tuple[str, str]]:
     """Return data, sessions and settings of a study."""
-    sessions = [("development", study.development), ("test", study.test), ("second sealed test set", study.second)]
+    sets = study.sessions
+    sessions = [("development", sets.development), ("test", sets.test), ("second sealed test set", sets.second)]
     return [
-        ("data", study.data["path"]),
-        ("hash of the data", study.data["hash"]),
+        ("data", study.data.path),
+        ("hash of the data", study.data.hash),
         *((name, ", ".join(names)) for name, names in sessions if names),
         *words.settings(study),
     ]
 
 
-def _about(study: StudyFacts) -> str:
-    hours = number(study.data["hours"], 1)
-    return f"{study.mode} mode · preset {study.preset} · {study.data['sessions']} sessions, {hours} h · {study.state}"
+def _about(study: StudyFile) -> str:
+    hours = number(study.data.hours, 1)
+    return f"{study.mode} mode · preset {study.preset} · {study.data.sessions} sessions, {hours} h · {study.state}"
 
 
-def study_text(study: StudyFacts, tables: Mapping[str, Table]) -> str:
+def study_text(study: StudyFile, tables: Mapping[str, Table]) -> str:
     """The report as Markdown: what came out, what was decided and why, what it can show, and the tables."""
     lines = [f"# Model search on {in_markdown(study.title)}", "", f"{in_markdown(_about(study))}.", ""]
     lines += [in_markdown(words.headline(study)), "", in_markdown(" ".join(words.verdict(study))), ""]

@@ -2,36 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
-from edp.report.search.facts import StudyFacts, of_phase, real
+from edp.evaluation.compression import Scores
+from edp.evaluation.study import StudyFile
+from edp.evaluation.study_facts import SmallerFacts
+from edp.report.search.facts import of_phase
 from edp.table import Column, Table, figures
 from edp.wording import number, percent
 
 
-@of_phase("compression", None)
-def smaller_table(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
+@of_phase(SmallerFacts, None)
+def smaller_table(study: StudyFile, facts: SmallerFacts) -> Table | None:
     """Every network in every number format: what it takes, its error, and whether it fits; the front is marked."""
     rows = tuple(
         (
-            str(row["name"]),
-            str(row["recipe"]),
-            real(row["resource_usage"]["parameters"]),
-            real(row["resource_usage"]["parameter_bytes"]),
-            real(row["resource_usage"]["cycles"][2]),
-            real(row["resource_usage"]["macs_tick"]),
-            _mean(row["scores"], "mae"),
-            _mean(row["scores"], "composite"),
-            100 * (real(row["error"]) - 1),
-            "chosen" if index == facts["chosen"] else ", ".join(row["over"]) or "fits",
+            row.name,
+            row.recipe,
+            float(row.resource_usage.parameters),
+            float(row.resource_usage.parameter_bytes),
+            float(row.resource_usage.cycles[2]),
+            float(row.resource_usage.macs_tick),
+            _mean(row.scores, "mae"),
+            _mean(row.scores, "composite"),
+            100 * (row.error - 1),
+            "chosen" if index == facts.chosen else ", ".join(row.over) or "fits",
         )
-        for index, row in enumerate(facts.get("rows", ()))
+        for index, row in enumerate(facts.rows)
     )
     count = figures([], decimals=0)
     columns = (
         Column("Network"),
-        Column("Made by", is_text=True),
+        Column("Made by"),
         Column("Parameters", "", count),
         Column("Parameters", "bytes", count),
         Column("Cycles", "per tick, high", count),
@@ -42,25 +42,24 @@ def smaller_table(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
         Column("Budget", is_text=True),
     )
     caption = "Smaller networks of the teacher on development sessions that do not train; marked: the front"
-    return Table(caption, columns, rows, frozenset(map(int, facts.get("front", ()))), name="compression")
+    return Table(caption, columns, rows, frozenset(facts.front), name="compression")
 
 
-def _mean(scores: Mapping[str, Mapping[str, Any]], name: str) -> float:
-    values = [real(entry[name]) for entry in scores.values()]
-    return sum(values) / len(values)
+def _mean(scores: Scores, name: str) -> float:
+    return sum(by_score[name] for by_score in scores.values()) / len(scores)
 
 
-@of_phase("compression", "")
-def chosen_words(study: StudyFacts, facts: Mapping[str, Any]) -> str:
+@of_phase(SmallerFacts, "")
+def chosen_words(study: StudyFile, facts: SmallerFacts) -> str:
     """What was chosen for the controller, and what the second sealed test set says of it."""
-    if not facts["on"]:
+    if not facts.on or facts.budget is None:
         return ""
-    if facts["chosen"] is None:
-        return f"No network fits the budget '{facts['budget']['name']}'."
-    row = facts["rows"][int(facts["chosen"])]
-    size = number(real(row["resource_usage"]["parameter_bytes"]) / 1000, 1)
-    text = f"For the controller {row['name']} is chosen, with {size} kB of parameters"
-    if facts["held_out_test"] is None:
+    if facts.chosen is None:
+        return f"No network fits the budget '{facts.budget.name}'."
+    row = facts.rows[facts.chosen]
+    size = number(row.resource_usage.parameter_bytes / 1000, 1)
+    text = f"For the controller {row.name} is chosen, with {size} kB of parameters"
+    if facts.held_out_test is None:
         return f"{text}; it could not be judged on the second sealed test set."
-    change = percent(real(facts["held_out_test"]["error"]) - 1, signed=True)
+    change = percent(facts.held_out_test.error - 1, signed=True)
     return f"{text}; on the second sealed test set its error is {change} against the teacher's."

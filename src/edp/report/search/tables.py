@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from edp.errors import count_of
+from edp.evaluation.study import PhaseRow, StudyFile
+from edp.evaluation.study_facts import CalibrationFacts, ExplorationFacts, IsolationFacts, SynthesisFacts
 from edp.report.common.chart import with_unit
-from edp.report.search.facts import StudyFacts, known, of_phase, real
+from edp.report.search.facts import of_phase
 from edp.report.search.modules import modules_tables, ordered, span
 from edp.report.search.smaller import smaller_table
 from edp.report.search.views import arm_views, titled
@@ -17,7 +18,7 @@ from edp.table import Column, Table, Value, chance, figures, plainly
 from edp.wording import count_text, duration, moment, number, percent
 
 
-def study_tables(study: StudyFacts) -> dict[str, Table]:
+def study_tables(study: StudyFile) -> dict[str, Table]:
     """Every table that there are facts for, by name."""
     sheets = (
         variance_table(study),
@@ -34,20 +35,18 @@ def study_tables(study: StudyFacts) -> dict[str, Table]:
     return {sheet.name: sheet for sheet in sheets if sheet is not None and sheet.rows}
 
 
-def variance_table(study: StudyFacts) -> Table | None:
+@of_phase(IsolationFacts, None)
+def variance_table(study: StudyFile, facts: IsolationFacts) -> Table | None:
     """Table 4.3: mean error and its standard deviations, of MAE and of the composite score."""
     rows = []
     for arm in arm_views(study):
         spreads = [value for s in (arm.mae, arm.composite) for value in (s.mean, s.split, s.seed)]
         rows.append((arm.backbone, arm.features, *spreads))
-    if not rows:
-        return None
     heads = [(f"{name}{part}", study.unit) for name in ("MAE", "Composite") for part in ("", ", σ split", ", σ seed")]
     columns = (Column("Architecture"), Column("Features"), *_numbers(heads, [row[2:] for row in rows]))
-    facts = study.facts["isolation"]
-    seeds = count_of(facts["seeds"], "seed")
-    caption = f"Variance by architecture and feature set: {count_of(facts['runs'], 'run')} of {seeds} each"
-    marked = frozenset(index for index, row in enumerate(rows) if row[1] == facts["features"])
+    seeds = count_of(facts.seeds, "seed")
+    caption = f"Variance by architecture and feature set: {count_of(facts.runs, 'run')} of {seeds} each"
+    marked = frozenset(index for index, row in enumerate(rows) if row[1] == facts.features)
     return Table(caption, columns, tuple(rows), marked, name="variance")
 
 
@@ -56,29 +55,29 @@ def _numbers(heads: Sequence[tuple[str, str]], rows: Sequence[Sequence[Value]]) 
     return tuple(Column(*head, figures(values)) for head, values in zip(heads, zip(*rows), strict=True))
 
 
-@of_phase("isolation", None)
-def features_table(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
+@of_phase(IsolationFacts, None)
+def features_table(study: StudyFile, facts: IsolationFacts) -> Table | None:
     """The chosen feature set against the next best, by backbone; the best backbone with it against the others."""
     rows: tuple[tuple[Value, ...], ...] = tuple(
         (
             titled(backbone),
-            f"{facts['features']} against {comparison['reference']}",
-            100 * real(comparison["change"]),
-            span(comparison),
-            real(comparison["p"]),
+            f"{facts.features} against {comparison.reference}",
+            100 * comparison.change,
+            span(comparison.low, comparison.high),
+            comparison.p,
         )
-        for backbone, comparison in facts["comparisons"].items()
+        for backbone, comparison in facts.comparisons.items()
     )
     # No p-value of these: which is the best was seen first.
     rows += tuple(
         (
-            titled(comparison["best"]),
-            f"against {titled(backbone)}, both {facts['features']}",
-            100 * real(comparison["change"]),
-            span(comparison),
+            titled(comparison.best),
+            f"against {titled(backbone)}, both {facts.features}",
+            100 * comparison.change,
+            span(comparison.low, comparison.high),
             None,
         )
-        for backbone, comparison in facts["backbones"].items()
+        for backbone, comparison in facts.backbones.items()
     )
     columns = (
         Column("Architecture"),
@@ -90,25 +89,24 @@ def features_table(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
     return Table("Feature sets and architectures on the same folds with the same seeds", columns, rows, name="features")
 
 
-@of_phase("calibration", None)
-def calibration_table(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
+@of_phase(CalibrationFacts, None)
+def calibration_table(study: StudyFile, facts: CalibrationFacts) -> Table | None:
     """Table 4.4: scores of all questions of each architecture, and what the efficiency rule takes."""
     rows = []
-    final = facts["final"]["scores"] if "final" in facts else {}
-    for backbone, calibration in facts["backbones"].items():
-        done = [trial for trial in calibration["trials"] if trial["score"] is not None]
-        scores = [real(trial["score"]) for trial in done]
-        errors = [value for trial in done if (value := known(trial["mae"])) is not None]
+    final = {} if facts.final is None else facts.final.scores
+    for backbone, calibration in facts.backbones.items():
+        scores = [trial.score for trial in calibration.trials if trial.score is not None]
+        errors = [trial.mae for trial in calibration.trials if trial.score is not None and trial.mae is not None]
         rows.append(
             (
                 titled(backbone),
-                f"{len(done)} of {len(calibration['trials'])}",
+                f"{len(scores)} of {len(calibration.trials)}",
                 *_spread(scores),
                 min(scores, default=None),
                 *_spread(errors),
-                real(calibration["score"]),
-                known(final.get(backbone)),
-                real(calibration["parameters"]),
+                calibration.score,
+                final.get(backbone),
+                calibration.parameters,
             )
         )
     heads = [
@@ -121,9 +119,10 @@ def calibration_table(study: StudyFacts, facts: Mapping[str, Any]) -> Table | No
         *_numbers(heads, [row[2:9] for row in rows]),
         Column("Parameters", "of the choice", _count),
     )
-    marked = frozenset(i for i, name in enumerate(facts["backbones"]) if name == facts["backbone"])
-    features = study.facts["isolation"]["features"]
-    caption = f"Questions of phase 1 with feature set {features}; chosen is the smallest size that no larger one repays"
+    marked = frozenset(i for i, name in enumerate(facts.backbones) if name == facts.backbone)
+    isolation = study.facts(IsolationFacts)
+    features = "" if isolation is None else f" with feature set {isolation.features}"
+    caption = f"Questions of phase 1{features}; chosen is the smallest size that no larger one repays"
     return Table(caption, columns, tuple(rows), marked, name="calibration")
 
 
@@ -137,65 +136,63 @@ def _count(value: Value) -> str:
     return count_text(value) if isinstance(value, int | float) else plainly(value)
 
 
-def selection_table(study: StudyFacts) -> Table | None:
+def selection_table(study: StudyFile) -> Table | None:
     """Table 4.6: how often each module was on among the questions of phases 4 and 5."""
-    on = {name: study.facts[name]["on"] for name in ("synthesis", "exploration") if name in study.facts}
+    decisions = {"Phase 4": study.facts(SynthesisFacts), "Phase 5": study.facts(ExplorationFacts)}
+    on = {name: facts.on for name, facts in decisions.items() if facts is not None}
     names = list(dict.fromkeys(name for counts in on.values() for name in counts))
     rows: list[tuple[str, list[float]]] = []
     for name in names:
-        shares = [100 * real(counts[name]) if name in counts else 0.0 for counts in on.values()]
+        shares = [100 * counts[name] if name in counts else 0.0 for counts in on.values()]
         rows.append((study.module(name), [*shares, float(np.mean(shares))]))
     rows.sort(key=lambda row: (-row[1][-1], row[0]))
-    heads = {"synthesis": "Phase 4", "exploration": "Phase 5"}
     columns = (
         Column("Module"),
-        *(Column(heads[name], "%", figures([], decimals=1)) for name in on),
+        *(Column(name, "%", figures([], decimals=1)) for name in on),
         Column("Mean", "%", figures([], decimals=1)),
     )
     caption = "How often each module was on among the questions"
     return Table(caption, columns, tuple((module, *shares) for module, shares in rows), name="selection")
 
 
-def identifiers(study: StudyFacts) -> dict[str, str]:
+def identifiers(study: StudyFile) -> dict[str, str]:
     """Table 4.7: short names of the modules, in their order."""
     return {name: f"M{number}" for number, (_, name) in enumerate(ordered(list(study.modules)), 1)}
 
 
-def identifiers_table(study: StudyFacts) -> Table | None:
+def identifiers_table(study: StudyFile) -> Table | None:
     """Table 4.7."""
     rows = tuple((short, study.module(name), name) for name, short in identifiers(study).items())
     columns = (Column("ID"), Column("Module", is_text=True), Column("Name in settings", is_text=True))
-    return Table("Module identifiers", columns, rows, name="identifiers") if "synthesis" in study.facts else None
+    return Table("Module identifiers", columns, rows, name="identifiers") if "synthesis" in study.decided else None
 
 
-@of_phase("synthesis", None)
-def holdout_table(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
+@of_phase(SynthesisFacts, None)
+def holdout_table(study: StudyFile, facts: SynthesisFacts) -> Table | None:
     """Table 4.8: baseline and winners; in brackets the change against the baseline."""
-    calibrated = study.facts["calibration"]
-    base = calibrated["backbones"][calibrated["backbone"]]
-    free = study.facts.get("exploration")
-    arms: list[tuple[Mapping[str, Any], Sequence[str]]] = [(base, ()), (facts["costs"], facts["modules"])]
-    if free is not None:
-        arms.append((free["costs"], free["modules"]))
+    calibrated, free = study.facts(CalibrationFacts), study.facts(ExplorationFacts)
+    if calibrated is None:
+        return None
+    winners = [facts] if free is None else [facts, free]
+    modules = [(), *(winner.modules for winner in winners)]
+    costs = [calibrated.backbones[calibrated.backbone].costs, *(winner.costs for winner in winners)]
     short = identifiers(study)
-    sizes = [real(costs["parameters"]) for costs, _ in arms]
-    work = [real(costs["macs_tick"]) for costs, _ in arms]
-    test = facts["test"]
+    sizes, work = ([one[name] for one in costs] for name in ("parameters", "macs_tick"))
     rows: list[tuple[Value, ...]] = [
-        ("Active modules", *(", ".join(short.get(name, name) for name in own) or "none" for _, own in arms)),
+        ("Active modules", *(", ".join(short.get(name, name) for name in own) or "none" for own in modules)),
         ("Parameters", *(_against(size, sizes[0], count_text) for size in sizes)),
         ("FP32 (MB)", *(number(4e-6 * size, 4) for size in sizes)),
         ("MACs per tick", *(_against(value, work[0], count_text) for value in work)),
     ]
     for key, name in {"composite": "Composite", "mae": "MAE", "rmse": "RMSE", "p95": "P95", "p99": "P99"}.items():
-        values = [known(test[arm][key]) for arm in ("baseline", "synthesis")]
+        values = [facts.test[arm][key] for arm in ("baseline", "synthesis")]
         cells = [None if v is None else _against(v, values[0], lambda x: number(x, 3)) for v in values]
         rows.append((with_unit(f"{name} on test sessions", study.unit), *cells, *([None] * (free is not None))))
     if free is not None:
-        fresh = [real(free["fresh"][arm]) for arm in ("synthesis", "exploration")]
+        fresh = [free.fresh[arm] for arm in ("synthesis", "exploration")]
         cells = [number(fresh[0], 3), f"{number(fresh[1], 3)} ({percent(fresh[1] / fresh[0] - 1, True)} to phase 4)"]
         rows.append((with_unit("Composite on fresh folds", study.unit), None, *cells))
-    names = ("Baseline", "Winner of phase 4", "Winner of phase 5")[: len(arms)]
+    names = ("Baseline", "Winner of phase 4", "Winner of phase 5")[: len(costs)]
     seeds = study.spec.get("run_seeds", "–")
     caption = f"Baseline and winners; test scores are means of {seeds} seeds, in brackets the change to the baseline"
     return Table(
@@ -203,37 +200,33 @@ def holdout_table(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
     )
 
 
-def _against(value: float, reference: float | None, show: Any) -> str:
+def _against(value: float, reference: float | None, show: Callable[[float], str]) -> str:
     """A value, and its change against the reference where it is another."""
     if reference is None or value == reference or reference == 0:
-        return str(show(value))
+        return show(value)
     return f"{show(value)} ({percent(value / reference - 1, signed=True)})"
 
 
-def openings_table(study: StudyFacts) -> Table | None:
+def openings_table(study: StudyFile) -> Table | None:
     """Every opening of the sealed test sets."""
     rows = tuple(
-        (
-            moment(opening.get("time")),
-            str(opening.get("why", "")),
-            len(opening.get("judged", ())),
-            str(opening.get("test_set", "")),
-        )
-        for opening in study.openings
+        (moment(opening.time), opening.why, len(opening.judged), opening.test_set) for opening in study.openings
     )
     columns = (Column("When"), Column("Why", is_text=True), Column("Trainings"), Column("Test set", is_text=True))
     return Table("Openings of the sealed test sets", columns, rows, name="openings")
 
 
-def phases_table(study: StudyFacts) -> Table | None:
+def phases_table(study: StudyFile) -> Table | None:
     """Trainings and time of each phase, and their sums."""
     rows: list[tuple[Value, ...]] = [
-        (p.heading, p.trainings, p.trained, p.pruned, p.failed, p.seconds, p.wall_s, _status(study, p.name))
-        for p in study.phases
+        (p.heading, p.trainings, p.trained, p.pruned, p.failed, p.seconds, p.wall_s, _status(study, p))
+        for p in study.all_phases
     ]
     sums = (
         sum(counts)
-        for counts in zip(*((p.trainings, p.trained, p.pruned, p.failed, p.seconds, p.wall_s) for p in study.phases))
+        for counts in zip(
+            *((p.trainings, p.trained, p.pruned, p.failed, p.seconds, p.wall_s) for p in study.all_phases)
+        )
     )
     if rows:
         rows.append(("All", *sums, None))
@@ -256,10 +249,7 @@ def _time(value: Value) -> str:
     return duration(value) if isinstance(value, int | float) else plainly(value)
 
 
-def _status(study: StudyFacts, name: str) -> str:
-    if name in study.facts:
+def _status(study: StudyFile, phase: PhaseRow) -> str:
+    if phase.name in study.decided:
         return "decided"
-    phase = study.phase(name)
-    if phase is None or not phase.began:
-        return "to come"
-    return study.state
+    return study.state if phase.began else "to come"

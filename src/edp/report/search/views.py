@@ -5,29 +5,33 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from edp.errors import count_of
+from edp.evaluation.study import NUMBERS, StudyFile
+from edp.evaluation.study_facts import (
+    CalibrationFacts,
+    ExplorationFacts,
+    IsolationFacts,
+    JointFacts,
+    Scalar,
+    ScreeningFacts,
+    SoundConfirmation,
+    SoundScreening,
+    SynthesisFacts,
+    ThesisConfirmation,
+    ThesisPlanning,
+    ThesisScreening,
+)
 from edp.report.common.chart import with_unit
-from edp.report.search.facts import NUMBERS, StudyFacts, known, of_phase, pair, real
+from edp.report.search.facts import finite, of_phase
 from edp.stats.effects import effect_interval
+from edp.stats.variance import SplitVariance
 
 COSTS = {"parameters": "Parameters", "macs_tick": "Multiply-accumulates per tick"}
 BACKBONES = {"lstm": "LSTM", "gru": "GRU", "tcn": "TCN", "hybrid": "Hybrid"}
 METRICS = {"mae": "MAE", "rmse": "RMSE", "p95": "P95", "p99": "P99"}
-
-
-@dataclass(frozen=True)
-class ArmSpread:
-    """Mean and standard deviations of one arm of phase 0; `seed` is None with one seed."""
-
-    mean: float
-    split: float
-    seed: float | None
-    split_interval: tuple[float, float] | None
-    seed_interval: tuple[float, float] | None
 
 
 @dataclass(frozen=True)
@@ -46,29 +50,21 @@ class ArmView:
     features: str
     chosen: bool
     scores: tuple[tuple[float, ...], ...]
-    composite: ArmSpread
-    mae: ArmSpread
+    composite: SplitVariance
+    mae: SplitVariance
 
 
-@of_phase("isolation", ())
-def arm_views(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[ArmView, ...]:
+@of_phase(IsolationFacts, ())
+def arm_views(study: StudyFile, facts: IsolationFacts) -> tuple[ArmView, ...]:
     """The arms of phase 0 in their order."""
     views = []
-    for name, arm in facts["arms"].items():
+    for name, arm in facts.arms.items():
         backbone, _, features = name.partition(" ")
-        scores = tuple(tuple(real(score) for score in seeds) for seeds in arm["by_run"])
-        if not all(scores):
+        if not all(arm.by_run):
             raise ValueError("an arm without a score")
-        view = ArmView(
-            titled(backbone), features, features == facts["features"], scores, _spread(arm), _spread(arm["mae"])
-        )
-        views.append(view)
+        chosen = features == facts.features
+        views.append(ArmView(titled(backbone), features, chosen, arm.by_run, arm, arm.mae))
     return tuple(views)
-
-
-def _spread(arm: Mapping[str, Any]) -> ArmSpread:
-    intervals = (pair(arm["split_interval"]), pair(arm["seed_interval"]))
-    return ArmSpread(real(arm["mean"]), real(arm["split"]), known(arm["seed"]), *intervals)
 
 
 def titled(backbone: str) -> str:
@@ -95,64 +91,54 @@ class PointView:
     picked: str = ""
 
 
-def point_views(study: StudyFacts) -> tuple[PointView, ...]:
+def point_views(study: StudyFile) -> tuple[PointView, ...]:
     """Every network with a score and a cost; of a phase that has not decided yet, what the history holds."""
-    points = [*_calibrated(study), *_together(study), *_free(study)]
+    points = [*_calibrated(study)]
+    for kind, number in ((SynthesisFacts, 4), (ExplorationFacts, 5)):
+        facts = study.facts(kind)
+        points += [] if facts is None else _joint(study, facts, number)
     for name in ("calibration", "synthesis", "exploration"):
-        if name not in study.facts:
+        if name not in study.decided:
             points += [
-                PointView(f"Phase {NUMBERS[name]}, so far", training.score, costs, training.label)
-                for training in study.history
-                if training.phase == name and training.score is not None
-                if (costs := _known({"parameters": training.parameters, "macs_tick": training.macs_tick}))
+                PointView(f"Phase {NUMBERS[name]}, so far", row.score, costs, row.label)
+                for row in study.ended
+                if row.phase == name and row.score is not None
+                if (costs := _above_zero({"parameters": row.parameters, "macs_tick": row.macs_tick}))
             ]
     return tuple(points)
 
 
-@of_phase("calibration", ())
-def _calibrated(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[PointView, ...]:
+@of_phase(CalibrationFacts, ())
+def _calibrated(study: StudyFile, facts: CalibrationFacts) -> tuple[PointView, ...]:
     points = []
-    for backbone, calibration in facts["backbones"].items():
-        for trial in calibration["trials"]:
-            if trial["score"] is not None:
-                took = trial["number"] == calibration["number"]
-                what = "baseline" if backbone == facts["backbone"] else f"taken of {titled(backbone)}"
-                values = (trial["score"], {name: trial.get(name) for name in COSTS}, valued(trial["values"]))
-                points.append(_point(f"Phase 1, {titled(backbone)}", *values, what if took else ""))
+    for backbone, calibration in facts.backbones.items():
+        for trial in calibration.trials:
+            if trial.score is not None:
+                what = "baseline" if backbone == facts.backbone else f"taken of {titled(backbone)}"
+                picked = what if trial.number == calibration.number else ""
+                group, costs = f"Phase 1, {titled(backbone)}", _above_zero(trial.costs)
+                points.append(PointView(group, trial.score, costs, valued(trial.values), picked))
     return tuple(points)
 
 
-@of_phase("synthesis", ())
-def _together(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[PointView, ...]:
-    return _joint(study, facts, "Phase 4", "winner of phase 4")
-
-
-@of_phase("exploration", ())
-def _free(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[PointView, ...]:
-    return _joint(study, facts, "Phase 5", "winner of phase 5")
-
-
-def _joint(study: StudyFacts, facts: Mapping[str, Any], group: str, winner: str) -> tuple[PointView, ...]:
-    done = [trial for trial in facts["trials"] if trial["score"] is not None]
-    best = min(done, key=lambda trial: (real(trial["score"]), trial["number"]), default=None)
+def _joint(study: StudyFile, facts: JointFacts, number: int) -> list[PointView]:
+    scores = {trial.number: trial.score for trial in facts.trials if trial.score is not None}
+    best = min(scores, key=lambda trial: (scores[trial], trial), default=None)
     points = []
-    for trial in done:
-        modules = ", ".join(study.module(name) for name in trial["modules"]) or "no module"
-        label = f"{modules}; {valued(trial['values'])}"
-        costs = {name: trial.get(name) for name in COSTS}
-        points.append(_point(group, trial["score"], costs, label, winner if trial is best else ""))
-    return tuple(points)
+    for trial in facts.trials:
+        if trial.score is not None:
+            modules = ", ".join(study.module(name) for name in trial.modules or ()) or "no module"
+            label = f"{modules}; {valued(trial.values)}"
+            picked = f"winner of phase {number}" if trial.number == best else ""
+            points.append(PointView(f"Phase {number}", trial.score, _above_zero(trial.costs), label, picked))
+    return points
 
 
-def _point(group: str, score: Any, costs: Mapping[str, Any], label: str, picked: str) -> PointView:
-    return PointView(group, real(score), _known(costs), label, picked)
+def _above_zero(costs: Mapping[str, float | None]) -> dict[str, float]:
+    return {name: value for name, value in costs.items() if value is not None and value > 0}
 
 
-def _known(costs: Mapping[str, Any]) -> dict[str, float]:
-    return {name: real(value) for name, value in costs.items() if value is not None and real(value) > 0}
-
-
-def valued(values: Mapping[str, Any]) -> str:
+def valued(values: Mapping[str, Scalar]) -> str:
     """Settings as ``units 64, loss huber``."""
     return ", ".join(
         f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}" for name, value in values.items()
@@ -212,75 +198,79 @@ class Forest:
     gate: float | None = None
 
 
-def forests(study: StudyFacts) -> tuple[Forest, ...]:
+def forests(study: StudyFile) -> tuple[Forest, ...]:
     """Phase 3 and phase 2, as far as they are decided; in the thesis's mode phase 3 by metric."""
     candidates = (*_confirmed(study), *_screened(study))
     return tuple(forest for forest in candidates if forest.effects)
 
 
-@of_phase("confirmation", ())
-def _confirmed(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Forest, ...]:
-    evidence = facts["evidence"]
-    if study.mode == "sound":
-        effects = [_sound(study, entry) for entry in evidence if entry["change"] is not None]
-        gate = -100.0 * real(study.spec["least_gain"])
-        return (Forest("confirmation", "Phase 3: confirmation", "", CHANGE, _ranked(effects), gate),)
-    splits = int(study.facts["planning"]["runs"])
+CHANGE = "Change of the baseline's mean score [%]; left is better"
+
+
+def _confirmed(study: StudyFile) -> tuple[Forest, ...]:
+    return (*_sound(study), *_thesis(study))
+
+
+@of_phase(SoundConfirmation, ())
+def _sound(study: StudyFile, facts: SoundConfirmation) -> tuple[Forest, ...]:
+    effects = []
+    for entry in facts.evidence:
+        value, low, high = (None if one is None else 100.0 * one for one in (entry.change, entry.low, entry.high))
+        if value is not None:
+            dropped = (
+                f"dropped after {count_of(entry.dropped_after, 'run')}" if entry.dropped_after else "not confirmed"
+            )
+            remark = "confirmed" if entry.confirmed else dropped
+            tests = (entry.p, entry.adjusted, entry.confirmed, remark)
+            effects.append(EffectView(study.module(entry.module), value, low, high, *tests))
+    gate = -100.0 * float(study.spec["least_gain"])
+    return (Forest("confirmation", "Phase 3: confirmation", "", CHANGE, _ranked(effects), gate),)
+
+
+@of_phase(ThesisConfirmation, ())
+def _thesis(study: StudyFile, facts: ThesisConfirmation) -> tuple[Forest, ...]:
+    planning = study.facts(ThesisPlanning)
+    views: dict[str, list[EffectView]] = {}
+    for entry in facts.evidence if planning is not None else ():
+        size = finite(entry.d_z)
+        bound = math.copysign(math.inf, entry.beta) if size is None else size
+        interval = effect_interval(bound, planning.runs if planning is not None else 0)
+        value = size if size is not None else math.copysign(99.0, entry.beta)
+        remark = "passed" if entry.passed else "not passed"
+        tests = (entry.printed_p, entry.adjusted, entry.passed, remark)
+        view = EffectView(study.module(entry.module), value, finite(interval.low), finite(interval.high), *tests)
+        views.setdefault(entry.metric, []).append(view)
     return tuple(
         Forest(
             f"confirmation_{metric}",
             f"Phase 3: confirmation, {METRICS.get(metric, metric)}",
             METRICS.get(metric, metric),
             "Cohen's d_z of the splits; left is better",
-            _ranked(_thesis(study, entry, splits) for entry in evidence if entry["metric"] == metric),
+            _ranked(own),
             -0.5,
         )
-        for metric in dict.fromkeys(str(entry["metric"]) for entry in evidence)
+        for metric, own in views.items()
     )
 
 
-CHANGE = "Change of the baseline's mean score [%]; left is better"
-
-
-def _sound(study: StudyFacts, entry: Mapping[str, Any]) -> EffectView:
-    after = int(entry["dropped_after"])
-    remark = (
-        "confirmed" if entry["confirmed"] else f"dropped after {count_of(after, 'run')}" if after else "not confirmed"
-    )
-    value, low, high = (100.0 * real(entry[name]) for name in ("change", "low", "high"))
-    p, adjusted = real(entry["p"]), real(entry["adjusted"])
-    return EffectView(study.module(entry["module"]), value, low, high, p, adjusted, bool(entry["confirmed"]), remark)
-
-
-def _thesis(study: StudyFacts, entry: Mapping[str, Any], splits: int) -> EffectView:
-    size = known(entry["d_z"])
-    interval = effect_interval(math.copysign(math.inf, real(entry["beta"])) if size is None else size, splits)
-    low, high = (bound if math.isfinite(bound) else None for bound in (interval.low, interval.high))
-    value = size if size is not None else math.copysign(99.0, real(entry["beta"]))
-    p, adjusted, good = real(entry["printed_p"]), real(entry["adjusted"]), bool(entry["passed"])
-    remark = "passed" if good else "not passed"
-    return EffectView(study.module(entry["module"]), value, low, high, p, adjusted, good, remark)
-
-
-@of_phase("screening", ())
-def _screened(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Forest, ...]:
-    passed = set(facts["passed"])
-    title = "Phase 2: screening"
-    effects = []
-    for name, entry in facts["modules"].items():
-        good = name in passed
-        remark = "goes on" if good else "stops"
-        if study.mode == "thesis":
-            gain = known(entry["gain"])
-            if gain is not None:
-                effects.append(EffectView(study.module(name), -gain, None, None, None, None, good, remark))
-        else:
-            value, effect, error = (real(entry[key]) for key in ("change", "effect", "error"))
-            reach = 1.96 * error * abs(value / effect) if effect else 0.0
-            ends = (100.0 * (value - reach), 100.0 * (value + reach))
-            effects.append(EffectView(study.module(name), 100.0 * value, *ends, real(entry["p"]), None, good, remark))
-    axis = with_unit("Best question less the baseline's median, left is better", study.unit)
-    return (Forest("screening", title, "", axis if study.mode == "thesis" else CHANGE, _ranked(effects)),)
+@of_phase(ScreeningFacts, ())
+def _screened(study: StudyFile, facts: ScreeningFacts) -> tuple[Forest, ...]:
+    axis, effects = CHANGE, []
+    if isinstance(facts, SoundScreening):
+        for name, effect in facts.modules.items():
+            value = effect.change
+            reach = 1.96 * effect.error * abs(value / effect.effect) if effect.effect else 0.0
+            low, high = 100.0 * (value - reach), 100.0 * (value + reach)
+            tests = (effect.p, None, name in facts.passed, "goes on" if name in facts.passed else "stops")
+            effects.append(EffectView(study.module(name), 100.0 * value, low, high, *tests))
+    if isinstance(facts, ThesisScreening):
+        axis = with_unit("Best question less the baseline's median, left is better", study.unit)
+        for name, row in facts.modules.items():
+            if row.gain is not None:
+                verdict = "goes on" if name in facts.passed else "stops"
+                view = EffectView(study.module(name), -row.gain, None, None, None, None, name in facts.passed, verdict)
+                effects.append(view)
+    return (Forest("screening", "Phase 2: screening", "", axis, _ranked(effects)),)
 
 
 def _ranked(effects: Iterable[EffectView]) -> tuple[EffectView, ...]:
@@ -309,20 +299,25 @@ class PhaseTrack:
     pruned: frozenset[int] = frozenset()
 
 
-def tracks(study: StudyFacts) -> tuple[PhaseTrack, ...]:
+def tracks(study: StudyFile) -> tuple[PhaseTrack, ...]:
     """The search's history by phase."""
+    tested, titles = study.tested(), {phase.name: phase.title for phase in study.phases}
+    rows = [(row, index in tested) for index, row in enumerate(study.history) if row.status != "waiting"]
     views = []
-    for name, test in dict.fromkeys((training.phase, training.test) for training in study.history):
-        own = [(position, h) for position, h in enumerate(study.history, 1) if (h.phase, h.test) == (name, test)]
-        scores = [math.nan if training.score is None else training.score for _, training in own]
-        best = np.fmin.accumulate(np.array(scores))
-        phase = study.phase(name)
-        heading = f"Phase {NUMBERS[name]}" if name in NUMBERS else (phase.title if phase else name)
-        heading += ", test sessions" if test else ""
-        labels = tuple(f"{training.label}, {training.status}" for _, training in own)
-        key = f"{name} test" if test else name
-        places, pruned = tuple(p for p, _ in own), frozenset(p for p, training in own if training.status == "pruned")
-        views.append(PhaseTrack(key, heading, places, tuple(scores), labels, tuple(best.tolist()), pruned))
+    for name, test in dict.fromkeys((row.phase, on_test) for row, on_test in rows):
+        own = [(number, row) for number, (row, on_test) in enumerate(rows, 1) if (row.phase, on_test) == (name, test)]
+        scores = [math.nan if row.score is None else row.score for _, row in own]
+        heading = f"Phase {NUMBERS[name]}" if name in NUMBERS else titles.get(name, name)
+        track = PhaseTrack(
+            name=f"{name} test" if test else name,
+            heading=f"{heading}, test sessions" if test else heading,
+            places=tuple(number for number, _ in own),
+            scores=tuple(scores),
+            labels=tuple(f"{row.label}, {row.status}" for _, row in own),
+            best=tuple(np.fmin.accumulate(np.array(scores)).tolist()),
+            pruned=frozenset(number for number, row in own if row.status == "pruned"),
+        )
+        views.append(track)
     return tuple(views)
 
 

@@ -3,37 +3,47 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from edp.errors import count_of
 from edp.evaluation.guard import ErrorOutcome, outcome_of
-from edp.report.search.facts import NUMBERS, StudyFacts, known, of_phase, real
+from edp.evaluation.study import NUMBERS, StudyFile
+from edp.evaluation.study_facts import (
+    CalibrationFacts,
+    ConfirmationFacts,
+    ExplorationFacts,
+    IsolationFacts,
+    ScreeningFacts,
+    SoundPlanning,
+    SynthesisFacts,
+    ThesisPlanning,
+)
+from edp.report.search.facts import of_phase
 from edp.report.search.smaller import chosen_words
 from edp.report.search.views import titled
 from edp.wording import behind, count_text, duration, listed, number, percent, setting_text
 
 
-def headline(study: StudyFacts) -> str:
+def headline(study: StudyFile) -> str:
     """What came out, or how far it is."""
-    if "synthesis" in study.facts:
+    if "synthesis" in study.decided:
         return _result(study)
-    decided = sum(phase.name in study.facts for phase in study.phases)
+    decided = sum(phase.name in study.decided for phase in study.all_phases)
     how = {"running": "is running", "finished": "ended early"}.get(study.state, f"was {study.state}")
-    done = count_of(len(study.history), "training")
-    return f"The search {how}: {decided} of {len(study.phases)} phases are decided, {done} done."
+    done = count_of(len(study.ended), "training")
+    return f"The search {how}: {decided} of {len(study.all_phases)} phases are decided, {done} done."
 
 
-@of_phase("synthesis", "")
-def _result(study: StudyFacts, facts: Mapping[str, Any]) -> str:
-    ours, base = (known(facts["test"][arm]["composite"]) for arm in ("synthesis", "baseline"))
-    own = [study.module(name) for name in facts["modules"]]
+@of_phase(SynthesisFacts, "")
+def _result(study: StudyFile, facts: SynthesisFacts) -> str:
+    ours, base = (facts.test[arm]["composite"] for arm in ("synthesis", "baseline"))
+    own = [study.module(name) for name in facts.modules]
     names = listed(own) if len(own) <= 3 else f"{len(own)} modules"
     if ours is None or base is None:
         return "A final training failed, so that nothing can be said of the test sessions."
-    sessions = count_of(len(study.test), "test session")
-    gain = facts["test_gain"]
-    outcome = outcome_of(ours / base - 1, None if gain is None else real(gain["high"]))
+    sessions = count_of(len(study.sessions.test), "test session")
+    gain = facts.test_gain
+    outcome = outcome_of(ours / base - 1, None if gain is None else gain.high)
     what = f"With {names}" if own else "Tuned anew, with no module,"
     figures = f"{number(ours, 3)}{behind(study.unit)} on {sessions}"
     if outcome is ErrorOutcome.BETTER:
@@ -47,7 +57,7 @@ def _result(study: StudyFacts, facts: Mapping[str, Any]) -> str:
     )
 
 
-def verdict(study: StudyFacts) -> list[str]:
+def verdict(study: StudyFile) -> list[str]:
     """What was decided, in short."""
     lines = [
         _how_sure(study),
@@ -58,93 +68,98 @@ def verdict(study: StudyFacts) -> list[str]:
         chosen_words(study),
     ]
     if study.state != "finished":
-        where = next((phase for phase in study.phases if phase.name not in study.facts), None)
+        where = next((phase for phase in study.all_phases if phase.name not in study.decided), None)
         lines.append(f"The search {'is' if study.state == 'running' else 'was'} {study.state}")
         lines[-1] += f" in {where.heading.lower()}" if where else ""
         lines[-1] += "." if study.state == "running" else "; the same command goes on with it."
     return [line for line in lines if line]
 
 
-@of_phase("synthesis", "")
-def _how_sure(study: StudyFacts, facts: Mapping[str, Any]) -> str:
-    gain = facts["test_gain"]
+@of_phase(SynthesisFacts, "")
+def _how_sure(study: StudyFile, facts: SynthesisFacts) -> str:
+    gain = facts.test_gain
     if gain is None:
         return "With one seed or one test session there is no interval for that."
-    low, high = (percent(real(gain[end]), signed=True) for end in ("low", "high"))
-    unsure = "" if real(gain["high"]) < 0 or real(gain["low"]) > 0 else ", so chance alone may have done it"
+    low, high = (percent(end, signed=True) for end in (gain.low, gain.high))
+    unsure = "" if gain.high < 0 or gain.low > 0 else ", so chance alone may have done it"
     return f"The 95 % interval of the change is {low} to {high}{unsure}."
 
 
-@of_phase("isolation", "")
-def _features(study: StudyFacts, facts: Mapping[str, Any]) -> str:
-    means = facts["mean_scores"]
-    if len(means) < 2:
+@of_phase(IsolationFacts, "")
+def _features(study: StudyFile, facts: IsolationFacts) -> str:
+    if len(facts.mean_scores) < 2:
         return ""
-    sure = all(real(comparison["p"]) < real(study.spec["alpha"]) for comparison in facts["comparisons"].values())
-    return f"Feature set {facts['features']} goes on" + (
+    sure = all(comparison.p < float(study.spec["alpha"]) for comparison in facts.comparisons.values())
+    return f"Feature set {facts.features} goes on" + (
         ", better with every backbone." if sure else ", though not every backbone shows that it is better."
     )
 
 
-@of_phase("calibration", "")
-def _baseline(study: StudyFacts, facts: Mapping[str, Any]) -> str:
-    calibration = facts["backbones"][facts["backbone"]]
-    return f"The baseline is {titled(facts['backbone'])} with {count_text(real(calibration['parameters']))} parameters."
+@of_phase(CalibrationFacts, "")
+def _baseline(study: StudyFile, facts: CalibrationFacts) -> str:
+    parameters = facts.backbones[facts.backbone].costs["parameters"]
+    return f"The baseline is {titled(facts.backbone)} with {count_text(parameters)} parameters."
 
 
-@of_phase("confirmation", "")
-def _confirmed(study: StudyFacts, facts: Mapping[str, Any]) -> str:
-    names = [study.module(name) for name in facts["confirmed"]]
-    registered = len(study.facts["screening"]["registered"])
+@of_phase(ConfirmationFacts, "")
+def _confirmed(study: StudyFile, facts: ConfirmationFacts) -> str:
+    names = [study.module(name) for name in facts.confirmed]
+    registered = len(_registered(study))
     if not names:
         return f"None of {registered} modules is confirmed."
     which = f": {listed(names)}" if len(names) <= 6 else ""
     return f"{len(names)} of {registered} modules {'is' if len(names) == 1 else 'are'} confirmed{which}."
 
 
-@of_phase("exploration", "")
-def _teacher(study: StudyFacts, facts: Mapping[str, Any]) -> str:
-    change = percent(real(facts["change"]), signed=True)
-    if facts["teacher"] == "exploration":
+@of_phase(ScreeningFacts, ())
+def _registered(study: StudyFile, facts: ScreeningFacts) -> tuple[str, ...]:
+    return facts.registered
+
+
+@of_phase(ExplorationFacts, "")
+def _teacher(study: StudyFile, facts: ExplorationFacts) -> str:
+    change = percent(facts.change, signed=True)
+    if facts.teacher == "exploration":
         return f"The free search of phase 5 found a better one still ({change} on fresh folds)."
     return f"The free search of phase 5 found nothing that fresh folds bear out ({change})."
 
 
-def tiles(study: StudyFacts) -> list[tuple[str, str, str]]:
+def tiles(study: StudyFile) -> list[tuple[str, str, str]]:
     """Key figures: value, unit, what."""
-    pruned = sum(training.status == "pruned" for training in study.history)
-    failed = sum(training.status not in ("done", "pruned") for training in study.history)
+    pruned = sum(training.status == "pruned" for training in study.ended)
+    failed = sum(training.status not in ("done", "pruned") for training in study.ended)
     trained = sum(phase.seconds for phase in study.phases)
     exceptions = [f"{count} of them {what}" for count, what in ((pruned, "pruned"), (failed, "failed")) if count]
-    tiles = [(count_text(len(study.history)), "", ", ".join(["trainings", *exceptions]))]
+    tiles = [(count_text(len(study.ended)), "", ", ".join(["trainings", *exceptions]))]
     if trained:
         clock = duration(sum(phase.wall_s for phase in study.phases))
         value, _, unit = duration(trained).partition(" ")
         tiles.append((value, unit, f"of training, {clock} by the clock"))
-    if "confirmation" in study.facts:
-        confirmed, asked = study.facts["confirmation"]["confirmed"], study.facts["screening"]["registered"]
-        tiles.append((count_text(len(confirmed)), "", f"of {len(asked)} modules confirmed"))
+    confirmation = study.facts(ConfirmationFacts)
+    if confirmation is not None:
+        confirmed = count_text(len(confirmation.confirmed))
+        tiles.append((confirmed, "", f"of {len(_registered(study))} modules confirmed"))
     openings = len(study.openings)
-    sealed = count_of(len(study.test) + len(study.second), "session")
+    sealed = count_of(len(study.sessions.test) + len(study.sessions.second), "session")
     tiles.append((count_text(openings), "", f"opening{'s' * (openings != 1)} of {sealed} set apart"))
     return tiles
 
 
-def caveats(study: StudyFacts) -> list[str]:
+def caveats(study: StudyFile) -> list[str]:
     """What such trainings can and cannot show, from the settings of this study."""
-    spec = study.spec
+    spec, sessions = study.spec, study.sessions
     updates, final = int(spec["updates"]), int(spec["final_updates"])
     horizon = count_of(int(spec["horizon"]), "sample")
     caveats = [
-        f"Every comparison is between trainings of {_length(spec, updates)}, judged {horizon} ahead. It shows which "
+        f"Every comparison is between trainings of {_length(study, updates)}, judged {horizon} ahead. It shows which "
         "part learns more from so little: a part that pays only after long training is missed, and one that only "
         "speeds up the start is favoured.",
-        f"Only the last trainings are longer ({_length(spec, final)}); they judge the whole network, not its single "
+        f"Only the last trainings are longer ({_length(study, final)}); they judge the whole network, not its single "
         "modules."
         if final > updates
-        else f"The last trainings are no longer ({_length(spec, final)}), so nothing is known of long ones.",
-        f"Sessions: {len(study.development)} that train and judge in turn, {len(study.test)} set apart"
-        + (f", {len(study.second)} more for phase 6" if study.second else "")
+        else f"The last trainings are no longer ({_length(study, final)}), so nothing is known of long ones.",
+        f"Sessions: {len(sessions.development)} that train and judge in turn, {len(sessions.test)} set apart"
+        + (f", {len(sessions.second)} more for phase 6" if sessions.second else "")
         + ". Intervals and p-values speak of sessions like these, not of another machine.",
         *_power(study),
         "Modules are tried on one baseline with one feature set; on another network they may do otherwise.",
@@ -163,49 +178,48 @@ def caveats(study: StudyFacts) -> list[str]:
     return caveats
 
 
-def _length(spec: Mapping[str, Any], updates: int) -> str:
+def _length(study: StudyFile, updates: int) -> str:
     """How long a training is, in words."""
-    epochs = int(spec.get("epochs", 1))
+    epochs = int(study.spec.get("epochs", 1))
     if epochs == 1:
         return f"{count_text(updates)} updates"
     each = f"{count_text(updates // epochs)} updates" if updates else "one pass over the data"
     return f"at most {epochs} epochs of {each}"
 
 
-def _power(study: StudyFacts) -> tuple[str, ...]:
+def _power(study: StudyFile) -> tuple[str, ...]:
     return (_sound_power if study.mode == "sound" else _thesis_power)(study)
 
 
-@of_phase("planning", ())
-def _sound_power(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[str, ...]:
-    effect = percent(real(study.spec["least_effect"]))
-    runs, power, limit = int(facts["runs"]), real(facts["power"]), real(facts["limit"])
+@of_phase(SoundPlanning, ())
+def _sound_power(study: StudyFile, facts: SoundPlanning) -> tuple[str, ...]:
+    effect = percent(float(study.spec["least_effect"]))
     text = (
-        f"{count_of(runs, 'run')} of each arm were planned to show an effect of {effect}, which they do with a "
+        f"{count_of(facts.runs, 'run')} of each arm were planned to show an effect of {effect}, which they do with a "
         "probability of "
-        f"{number(power, 2)}: a module that is not confirmed is not shown to be useless."
+        f"{number(facts.power, 2)}: a module that is not confirmed is not shown to be useless."
     )
-    if facts["enough"] is None:
-        text += f" No number of runs on these sessions could make that more than {number(limit, 2)}."
+    if facts.enough is None:
+        text += f" No number of runs on these sessions could make that more than {number(facts.limit, 2)}."
     return (text,)
 
 
-@of_phase("planning", ())
-def _thesis_power(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[str, ...]:
-    effect = percent(real(study.spec["least_effect"]))
+@of_phase(ThesisPlanning, ())
+def _thesis_power(study: StudyFile, facts: ThesisPlanning) -> tuple[str, ...]:
+    effect = percent(float(study.spec["least_effect"]))
     return (
-        f"{int(facts['runs'])} splits were planned to show an effect of {effect} by a formula that counts the spread "
+        f"{facts.runs} splits were planned to show an effect of {effect} by a formula that counts the spread "
         "of seeds only; the spread between splits and sessions makes that too few.",
     )
 
 
-def decided(study: StudyFacts) -> list[tuple[str, tuple[str, ...]]]:
+def decided(study: StudyFile) -> list[tuple[str, tuple[str, ...]]]:
     """Each phase with what it decided and why, or how far it is."""
-    decisions = []
-    for phase in study.phases:
-        lines = study.sentences.get(phase.name)
+    decisions, sentences = [], {decision.phase: decision.sentences for decision in study.decisions}
+    for phase in study.all_phases:
+        lines = sentences.get(phase.name)
         if lines is None:
-            count = sum(training.phase == phase.name for training in study.history)
+            count = sum(training.phase == phase.name for training in study.ended)
             lines = (f"Under way: {count_of(count, 'training')} done." if phase.began else "Has not begun.",)
         decisions.append((phase.heading, _grouped(lines)))
     return decisions
@@ -221,14 +235,14 @@ def _grouped(lines: Sequence[str]) -> tuple[str, ...]:
     return tuple(re.sub(r"(?<![\w-])-(?=\d)", "−", line) for line in grouped)
 
 
-def missing(study: StudyFacts, *names: str) -> str:
+def missing(study: StudyFile, *names: str) -> str:
     """That phases are not decided yet; empty where all are."""
-    absent = [NUMBERS[name] for name in names if name not in study.facts]
+    absent = [NUMBERS[name] for name in names if name not in study.decided]
     if not absent:
         return ""
     return f"Phase{'s' * (len(absent) > 1)} {listed(absent)} {'are' if len(absent) > 1 else 'is'} not decided yet."
 
 
-def settings(study: StudyFacts) -> list[tuple[str, str]]:
+def settings(study: StudyFile) -> list[tuple[str, str]]:
     """Settings of the search as text."""
     return [(key.replace("_", " "), setting_text(value)) for key, value in study.spec.items()]

@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from edp.evaluation.study import StudyFile, read_study
 from edp.report import Facts, headline
 from edp.report.notebook import html_of, score_figure, score_tables, study_figure, study_html, text_of
 from edp.report.run.facts import METRICS, comparison_rows, score
 from edp.report.search import words
-from edp.report.search.facts import StudyFacts, facts_of
-from edp.storage.study_file import read_study
 from edp.table import Table
 from edp.workflows.api.frames import OneFrame
 
@@ -91,7 +90,7 @@ class SearchStudy:
         facts: of the study.
     """
 
-    def __init__(self, facts: StudyFacts) -> None:
+    def __init__(self, facts: StudyFile) -> None:
         self._facts = facts
 
     @property
@@ -125,4 +124,4 @@ def load_study(path: str | Path) -> SearchStudy:
     Raises:
         StorageError: no study, or one of another version.
     """
-    return SearchStudy(facts_of(read_study(path)))
+    return SearchStudy(read_study(path))

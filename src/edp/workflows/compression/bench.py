@@ -45,6 +45,11 @@ class CompressionRequest:
     rounding: RoundingSpec | None = None
     of: CompressionRequest | None = None
 
+    @property
+    def begins_pruned(self) -> bool:
+        """Whether the network, or the one that it goes on from, begins with what pruning leaves of the teacher."""
+        return self.pruned if self.of is None else self.of.begins_pruned
+
     def model(self, teacher: ModelSpec) -> ModelSpec:
         """The network's settings."""
         if self.of is not None:

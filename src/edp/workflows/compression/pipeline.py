@@ -21,7 +21,7 @@ from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
 from edp.stats.pareto import pareto
 from edp.workflows.compression.bench import CompressionRequest
-from edp.workflows.compression.formats.base import FORMATS, deploy
+from edp.workflows.compression.formats import FORMATS, deploy
 
 TEACHER = "teacher"
 

@@ -17,7 +17,7 @@ from edp.networks.predictor import ModelSpec, Predictor, build_model
 from edp.training.bundle import blank_scaler
 from edp.training.compression.pruning import check_pruning
 from edp.workflows.compression.bench import CompressionRequest
-from edp.workflows.compression.formats.base import FORMATS, resource_usage
+from edp.workflows.compression.formats import FORMATS, resource_usage
 from edp.workflows.compression.variants import rounded_order
 
 STEP = 4  # widths are multiples of it: what kernels compute at a time

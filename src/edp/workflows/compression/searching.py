@@ -28,7 +28,7 @@ from edp.training.progress_steps import training_steps
 from edp.training.strategy import DirectFit, TrainingStrategy
 from edp.workflows.compression.bench import Bench, CompressionRequest
 from edp.workflows.compression.distil import frozen_sessions, order_facts, read_run
-from edp.workflows.compression.formats.base import FORMATS
+from edp.workflows.compression.formats import FORMATS
 from edp.workflows.compression.pipeline import (
     TEACHER,
     Evaluator,

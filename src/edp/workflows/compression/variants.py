@@ -24,7 +24,7 @@ class CompressedCandidate:
         name: of the variant.
         order: what made it.
         network: in float32; it can be saved and exported.
-        number_format: a name of `edp.workflows.compression.formats.FORMATS`; it is judged in it.
+        number_format: a name of `edp.workflows.compression.FORMATS`; it is evaluated in it.
         parameter_bytes: as Table 4.9 counts them; None where the format says it.
     """
 
@@ -35,72 +35,57 @@ class CompressedCandidate:
     parameter_bytes: int | None = None
 
 
-Variant = Callable[[Bench], CompressedCandidate]
-VARIANTS: Registry[Variant] = Registry("variant")
+VARIANTS: Registry[Callable[[Bench], CompressedCandidate]] = Registry("variant")
 
 
 def rounded_order(of: CompressionRequest) -> CompressionRequest:
-    """The order to train on what another one made, with everything rounded."""
+    """Return the order to train on what another one made, with everything rounded."""
     return CompressionRequest(name=f"{of.name}_qat", units=of.units, rounding=RoundingSpec(), of=of)
 
 
-def _distilled(units: int) -> CompressionRequest:
-    return CompressionRequest(name=f"u{units}", units=units)
+@dataclass(frozen=True)
+class MadeByOrder:
+    """A variant whose network an order makes."""
+
+    name: str
+    order: CompressionRequest
+    number_format: str = "float32"
+
+    def __call__(self, bench: Bench) -> CompressedCandidate:
+        """Make the candidate; what was ordered before is not trained again."""
+        return CompressedCandidate(self.name, self.order, bench.network(self.order), self.number_format)
 
 
-def _rounded(bench: Bench, name: str, of: CompressionRequest | None) -> CompressedCandidate:
-    units = width_of(bench.teacher.spec) if of is None else of.units
-    begun = "teacher" if of is None else of.name
-    order = CompressionRequest(name=f"{begun}_thesis_qat", units=units, rounding=THESIS, of=of)
-    network = bench.network(order)
-    folded = sum(cost.parameters - cost.foldable for cost in network.costs())
-    rounded = sum(matrix.values.numel() for matrix in matrices_of(network, recurrent=False))
-    # Bytes as the thesis counts them: one for each rounded weight, four for the others.
-    return CompressedCandidate(name, order, network, "dynamic_int8", 4 * folded - 3 * rounded)
+@dataclass(frozen=True)
+class RoundedLikeThesis:
+    """A variant trained on with rounded convolutions and linear layers: the network of an order, or the teacher."""
+
+    name: str
+    order: CompressionRequest | None
+
+    def __call__(self, bench: Bench) -> CompressedCandidate:
+        """Make the candidate; what was ordered before is not trained again."""
+        units = width_of(bench.teacher.spec) if self.order is None else self.order.units
+        begun = "teacher" if self.order is None else self.order.name
+        order = CompressionRequest(name=f"{begun}_thesis_qat", units=units, rounding=THESIS, of=self.order)
+        network = bench.network(order)
+        folded = sum(cost.parameters - cost.foldable for cost in network.costs())
+        rounded = sum(matrix.values.numel() for matrix in matrices_of(network, recurrent=False))
+        # Bytes as the thesis counts them: one for each rounded weight, four for the others.
+        return CompressedCandidate(self.name, order, network, "dynamic_int8", 4 * folded - 3 * rounded)
 
 
-@VARIANTS.register("A_u32")
-def a_u32(bench: Bench) -> CompressedCandidate:
-    """A distilled student of 32 units."""
-    return CompressedCandidate("A_u32", _distilled(32), bench.network(_distilled(32)))
-
-
-@VARIANTS.register("A_u64")
-def a_u64(bench: Bench) -> CompressedCandidate:
-    """A distilled student of 64 units."""
-    return CompressedCandidate("A_u64", _distilled(64), bench.network(_distilled(64)))
-
-
-@VARIANTS.register("B_LPTQ")
-def b_lptq(bench: Bench) -> CompressedCandidate:
-    """The student of 64 units with its linear layers in dynamic INT8, not trained again."""
-    return CompressedCandidate("B_LPTQ", _distilled(64), bench.network(_distilled(64)), "dynamic_int8")
-
-
-@VARIANTS.register("C_QAT")
-def c_qat(bench: Bench) -> CompressedCandidate:
-    """The teacher, trained on under its own guidance with rounded convolutions and linear layers."""
-    return _rounded(bench, "C_QAT", None)
-
-
-@VARIANTS.register("C_u64_QAT")
-def c_u64_qat(bench: Bench) -> CompressedCandidate:
-    """The student of 64 units, trained on with rounded convolutions and linear layers."""
-    return _rounded(bench, "C_u64_QAT", _distilled(64))
-
-
-def _ours(bench: Bench, units: int) -> CompressedCandidate:
-    order = rounded_order(CompressionRequest(name=f"p{units}", units=units, pruned=True))
-    return CompressedCandidate(f"D_u{units}", order, bench.network(order), "w8a16")
-
-
-@VARIANTS.register("D_u32")
-def d_u32(bench: Bench) -> CompressedCandidate:
-    """Ours: the teacher pruned to 32 units, distilled, trained on with everything rounded, in W8A16."""
-    return _ours(bench, 32)
-
-
-@VARIANTS.register("D_u64")
-def d_u64(bench: Bench) -> CompressedCandidate:
-    """Ours: the teacher pruned to 64 units, distilled, trained on with everything rounded, in W8A16."""
-    return _ours(bench, 64)
+U32, U64 = (CompressionRequest(name=f"u{units}", units=units) for units in (32, 64))
+P32, P64 = (CompressionRequest(name=f"p{units}", units=units, pruned=True) for units in (32, 64))
+# A: distilled. B: with linear layers in dynamic INT8, not trained again. C: trained on with rounded numbers.
+# D, ours: pruned, distilled, trained on with everything rounded, in W8A16.
+for variant in (
+    MadeByOrder("A_u32", U32),
+    MadeByOrder("A_u64", U64),
+    MadeByOrder("B_LPTQ", U64, "dynamic_int8"),
+    RoundedLikeThesis("C_QAT", None),
+    RoundedLikeThesis("C_u64_QAT", U64),
+    MadeByOrder("D_u32", rounded_order(P32), "w8a16"),
+    MadeByOrder("D_u64", rounded_order(P64), "w8a16"),
+):
+    VARIANTS.register(variant.name)(variant)

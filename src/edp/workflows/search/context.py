@@ -3,83 +3,24 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.config.experiment import Table
 from edp.errors import ConfigError, DataError, closest
+from edp.evaluation.study import Decision, facts_of_kind
 from edp.stats.folds import repeated_folds, repeated_splits
-from edp.storage.ledger import Record
 from edp.workflows.search.modules import with_modules
 from edp.workflows.search.settings import SearchSpec
 from edp.workflows.search.space import WIDTHS, Candidate
-from edp.workflows.search.trainings import TrainingRequest
+from edp.workflows.search.trainings import Outcome, TrainingRequest
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What became of an order.
-
-    Attributes:
-        order: what was to be trained.
-        status: ``done``, or how it ended.
-        result: of `edp.workflows.search.trainings.train_order`, where it is done.
-        message: what went wrong.
-    """
-
-    order: TrainingRequest
-    status: str
-    result: Mapping[str, Any] | None = None
-    message: str = ""
-
-    @staticmethod
-    def of(order: TrainingRequest, record: Record) -> Outcome:
-        """The outcome of an order, from the ledger's record of it."""
-        return Outcome(order, str(record.status), record.result, record.message)
-
-    def score(self, session: str, horizon: int, name: str = "composite") -> float:
-        """A score on one session; NaN where the training did not end well, which counts as the worst."""
-        if self.result is None:
-            return float("nan")
-        return float(self.result["sessions"][session][str(horizon)][name])
-
-    def mean(self, horizon: int, name: str = "composite") -> float:
-        """A score, mean over the judging sessions; NaN where the training did not end well."""
-        return float(np.mean([self.score(session, horizon, name) for session in self.order.judged]))
-
-
-@dataclass(frozen=True)
-class Decision:
-    """What a phase found and decided.
-
-    Attributes:
-        phase: its name.
-        facts: plain values that later phases and the report read.
-        sentences: what was decided and why.
-    """
-
-    phase: str
-    facts: Mapping[str, Any]
-    sentences: tuple[str, ...]
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain values that JSON has: a number that is not finite becomes none."""
-        return {"phase": self.phase, "facts": _finite(self.facts), "sentences": list(self.sentences)}
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _finite(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+F = TypeVar("F")
 
 
 @dataclass(frozen=True)
@@ -100,13 +41,24 @@ class SearchContext:
 
     spec: SearchSpec
     base: Table
-    source: Mapping[str, Any]
+    source: Table
     development: tuple[str, ...]
     test: tuple[str, ...]
     channels: tuple[str, ...] = ()
     unit: str = "mm/s"
     decided: Mapping[str, Decision] = field(default_factory=dict)
     second: tuple[str, ...] = ()
+
+    def facts(self, kind: type[F]) -> F:
+        """Return the facts of an earlier phase.
+
+        Raises:
+            ConfigError: the phase has not run.
+        """
+        facts = facts_of_kind(list(self.decided.values()), kind)
+        if facts is None:
+            raise ConfigError(f"search: {kind.__name__} is needed, and that phase has not run; run all phases in order")
+        return facts
 
     @property
     # Sessions of the first run: choices of later phases rest on the same ones.
@@ -167,7 +119,7 @@ class SearchContext:
             for run in runs
         ]
 
-    def several(self, validation: tuple[str, ...]) -> dict[str, Any]:
+    def several(self, validation: tuple[str, ...]) -> Table:
         """What an order of several epochs says beside; nothing of one epoch."""
         if self.spec.epochs == 1:
             return {}

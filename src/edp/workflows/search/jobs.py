@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
+from edp.config.experiment import Table
 from edp.jobs.base import START, Job
 from edp.storage.ledger import TrainingIdentity, WithState, code_version, read_state
 from edp.storage.provenance import environment
@@ -30,7 +31,7 @@ def job_of(
     """
     # Threads are part of a result: sums change their order with them.
     settings = {**order.settings, "training": {**order.settings.get("training", {}), "threads": threads}}
-    config: dict[str, Any] = {"settings": settings, "updates": order.updates}
+    config: Table = {"settings": settings, "updates": order.updates}
     sessions = {"train": list(order.train), "judged": list(order.judged)}
     # One epoch leaves these out, so that keys of earlier studies stay what they were.
     if order.epochs > 1:
@@ -59,7 +60,7 @@ def job_of(
 _environment = cache(environment)  # looking up versions takes as long as a record
 
 
-def train(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str, Any] | WithState:
+def train(identity: TrainingIdentity, where: Mapping[str, Any]) -> Table | WithState:
     """Do the order; what differs from repeat to repeat is left to the record's measures.
 
     Where the file of a state cannot be read any more, it is trained from the beginning.

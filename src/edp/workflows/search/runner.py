@@ -5,19 +5,21 @@ from __future__ import annotations
 import hashlib
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import tomli_w
 
-from edp.config.experiment import Experiment, Table, build, plain_tree
+from edp.config.experiment import Experiment, build, plain_tree
 from edp.data.frozen import SECOND_TEST_SET, ByFrozen
 from edp.errors import ConfigError, DataError
+from edp.evaluation.study import Decision, SessionSets, StudyData, StudyFile, facts_of_kind
+from edp.evaluation.study_facts import ExplorationFacts, SynthesisFacts
 from edp.jobs import Executor, LocalPool, RayPool
 from edp.logs.source import DataSource
+from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.settings.bounds import MOST_THREADS, above, check_bounds, integer
 from edp.signals import KINDS
@@ -25,12 +27,11 @@ from edp.storage import make_folder, write_bytes
 from edp.storage.ledger import Ledger, Record, check_uncoordinated
 from edp.storage.portable import cores
 from edp.wording import typed
-from edp.workflows.search.context import Decision, SearchContext, is_enough, set_apart
-from edp.workflows.search.dispatch import Dispatcher
+from edp.workflows.search.context import SearchContext, is_enough, set_apart
+from edp.workflows.search.engine import Dispatcher, run_phases
 from edp.workflows.search.networks import JudgedNetwork, frozen_split, network_name, write_networks
 from edp.workflows.search.phases import PHASES
 from edp.workflows.search.plan import SearchPlan, plain_spec
-from edp.workflows.search.run_phases import run_phases
 from edp.workflows.search.sessions import SESSIONS_FILE, divide_logs
 from edp.workflows.search.study_log import StudyLog
 from edp.workflows.search.trainings import TrainingRequest, settings_of
@@ -86,23 +87,6 @@ class Resources:
         return LocalPool(self.workers or max(1, cores() // self.threads), self.threads)
 
 
-@dataclass(frozen=True, kw_only=True)
-class SearchCallbacks:
-    """Callbacks of a running search.
-
-    Attributes:
-        on_note: a sentence, such as that damaged records were set apart.
-        on_phase: a phase begins: its name.
-        on_progress: a training is asked for or has ended.
-        on_decision: a phase has decided.
-    """
-
-    on_note: Callable[[str], None] = lambda text: None
-    on_phase: Callable[[str, StudyLog], None] = lambda name, study_log: None
-    on_progress: Callable[[StudyLog], None] = lambda study_log: None
-    on_decision: Callable[[Decision], None] = lambda decision: None
-
-
 @dataclass(frozen=True)
 class SearchResult:
     """What a search has found so far.
@@ -134,7 +118,7 @@ def run_search(
     folder: str | Path,
     resources: Resources | None = None,
     until: str | None = None,
-    callbacks: SearchCallbacks | None = None,
+    progress: Progress = SILENT,
 ) -> SearchResult:
     """Search, or go on with a search where it stopped.
 
@@ -144,7 +128,7 @@ def run_search(
         folder: of the study: ``ledger``, ``study.json`` and, at the end, ``teacher.toml`` and ``networks``.
         resources: who does the trainings.
         until: name of the last phase to run.
-        callbacks: called as the search proceeds.
+        progress: receiver of the progress: stages are phases, units are trainings, notes are what was decided.
 
     Raises:
         BusyError: another process searches in this folder.
@@ -153,7 +137,7 @@ def run_search(
         LostError: the processes of a training were killed again and again.
         StorageError: the disk is full or the folder cannot be written; what was done stays.
     """
-    resources, callbacks = resources or Resources(), callbacks or SearchCallbacks()
+    resources = resources or Resources()
     if until is not None:
         _ = PHASES[until]
     check_uncoordinated(Path(folder) / "ledger")
@@ -165,7 +149,7 @@ def run_search(
     target = make_folder(folder)
     if parts is not None:
         source = DataSource(target / SESSIONS_FILE)
-        callbacks.on_note(
+        progress.note(
             f"too few logs for sessions ({len(recordings)}): divided into {len(data.names)} sessions of "
             f"{typed(parts.seconds, 3)} s or more ({source.path}); what is found holds for these logs, not for other "
             "days"
@@ -173,7 +157,7 @@ def run_search(
     with ExitStack() as open_things:
         ledger = open_things.enter_context(Ledger(target / "ledger"))
         if ledger.damaged:
-            callbacks.on_note(f"{len(ledger.damaged)} damaged records were set apart and will be trained again")
+            progress.note(f"{len(ledger.damaged)} damaged records were set apart and will be trained again")
         # A folder is bound to data and settings: another search in it would mix records.
         ledger.bind({"data": data.digest, **plan.to_plain()})
         if parts is not None:
@@ -182,10 +166,10 @@ def run_search(
         context = SearchContext(
             plan.spec, settings, source.to_plain(), development, test, data.channels, data.unit, second=second
         )
-        study_log = StudyLog(target, _facts(plan, data, source, context), context)
+        study_log = StudyLog(target, _study(plan, data, source, context), context)
         executor = open_things.enter_context(resources.gather())
         study_log.workers = executor.workers
-        observer = _Observer(ledger, study_log, context, callbacks)
+        observer = _Observer(ledger, study_log, context, progress)
         dispatcher = Dispatcher(
             ledger,
             executor,
@@ -254,13 +238,16 @@ class _Observer:
         judged_networks: networks that were judged on the second test set, by name: order and result.
     """
 
-    def __init__(self, ledger: Ledger, study_log: StudyLog, context: SearchContext, callbacks: SearchCallbacks) -> None:
-        self.ledger, self.study_log, self.context, self.callbacks = ledger, study_log, context, callbacks
+    def __init__(self, ledger: Ledger, study_log: StudyLog, context: SearchContext, progress: Progress) -> None:
+        self.ledger, self.study_log, self.context = ledger, study_log, context
+        self.progress = self.stage = progress
         self.judged_networks: dict[str, JudgedNetwork] = {}
 
     def on_phase(self, name: str, context: SearchContext) -> None:
         self.study_log.on_phase(name, context)
-        self.callbacks.on_phase(name, self.study_log)
+        phase = self.progress.stage(f"phase {list(PHASES).index(name) + 1} of {len(PHASES)}, {PHASES[name].title}")
+        self.stage = phase.stage("training", self.study_log.counts().total)
+        self.study_log.report(self.stage)
 
     def on_batch(self, batch: Mapping[str, TrainingRequest]) -> None:
         for test_set, sessions, why in (
@@ -271,7 +258,7 @@ class _Observer:
             if sealed:
                 self._open(test_set, sealed, why)
         self.study_log.on_batch(batch)
-        self.callbacks.on_progress(self.study_log)
+        self.study_log.report(self.stage)
 
     def _open(self, test_set: str, keys: Sequence[str], why: str) -> None:
         """Record an opening before it is made. ``edp compress`` may have opened the second test set before phase 6."""
@@ -279,7 +266,7 @@ class _Observer:
         earlier = [one for one in self.ledger.openings(test_set) if one.judged != tuple(keys)]
         self.ledger.open_test_set(test_set, keys, why, again=test_set == SECOND_TEST_SET)
         if earlier:
-            self.callbacks.on_note(
+            self.progress.note(
                 f"sealed test set '{test_set}' was opened on {earlier[0].time} ({earlier[0].why}), so this one "
                 "shows less"
             )
@@ -289,11 +276,12 @@ class _Observer:
         if record.result is not None and set(order.judged) & set(self.context.second):
             self.judged_networks[network_name(order)] = JudgedNetwork(order, record.result)
         self.study_log.on_record(record, order, trained)
-        self.callbacks.on_progress(self.study_log)
+        self.study_log.report(self.stage)
 
     def on_decision(self, decision: Decision) -> None:
         self.study_log.on_decision(decision)
-        self.callbacks.on_decision(decision)
+        for sentence in decision.sentences:
+            self.progress.note(sentence)
 
 
 def _refuse_twice(recordings: Sequence[Recording]) -> None:
@@ -333,35 +321,30 @@ def _check_channels(recordings: Sequence[Recording], plan: SearchPlan) -> str:
     return units.pop() if len(units) == 1 else "mixed units"
 
 
-def _facts(plan: SearchPlan, data: _Data, source: DataSource, context: SearchContext) -> Table:
-    return {
-        "mode": plan.spec.mode,
-        "unit": data.unit,
-        "preset": plan.preset,
-        "data": {
-            "path": source.label,
-            "sessions": len(data.names),
-            "hours": round(data.hours, 4),
-            "hash": data.digest,
-        },
-        "spec": plain_spec(plan.spec),
-        "sessions": {
-            "development": list(context.development),
-            "test": list(context.test),
-            "second": list(context.second),
-        },
-    }
+def _study(plan: SearchPlan, data: _Data, source: DataSource, context: SearchContext) -> StudyFile:
+    return StudyFile(
+        state="running",
+        mode=plan.spec.mode,
+        unit=data.unit,
+        preset=plan.preset,
+        data=StudyData(source.label, len(data.names), round(data.hours, 4), data.digest),
+        spec=plain_spec(plan.spec),
+        sessions=SessionSets(context.development, context.test, context.second),
+        modules={},
+        decisions=(),
+        phases=(),
+        history=(),
+        openings=(),
+    )
 
 
 def _write_teacher(folder: Path, context: SearchContext, split: ByFrozen) -> Path | None:
     """The winner's settings with the sessions that stay frozen, as `edp train --config` takes them."""
-    settings: Any = None
-    if "exploration" in context.decided:
-        settings = context.decided["exploration"].facts["teacher_settings"]
-    elif "synthesis" in context.decided:
-        settings = context.decided["synthesis"].facts["settings"]
-    if settings is None:
+    decisions = list(context.decided.values())
+    explored, joined = facts_of_kind(decisions, ExplorationFacts), facts_of_kind(decisions, SynthesisFacts)
+    if joined is None:
         return None
+    settings = joined.settings if explored is None else explored.teacher_settings
     file = folder / TEACHER
     write_bytes(file, tomli_w.dumps({**settings, "split": plain_tree(split, "split")}).encode())
     return file

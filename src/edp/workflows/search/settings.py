@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any
 
-from edp.config.experiment import FeatureSettings, plain_tree
+from edp.config.experiment import FeatureSettings, Table, plain_tree
 from edp.errors import ConfigError, closest
 from edp.evaluation.controller import Budget
+from edp.evaluation.study import MODES
 from edp.settings.bounds import (
     MOST_EPOCHS,
     MOST_TICKS,
@@ -22,7 +22,6 @@ from edp.settings.bounds import (
     shown,
     span,
 )
-from edp.storage.study_file import MODES
 from edp.workflows.compression import FORMATS
 from edp.workflows.compression.planning import SHARES
 from edp.workflows.search.modules import MODULES, TOGGLES
@@ -219,7 +218,7 @@ class SearchSpec:
             raise ConfigError("search: " + "; ".join(wrong) + " must hold")
 
     @property
-    def feature_sets(self) -> dict[str, Any]:
+    def feature_sets(self) -> dict[str, str | Table]:
         """By name, what ``task.features`` of an experiment is set to: a name, or a plain table."""
         return {
             feature_set if isinstance(feature_set, str) else feature_set.name: feature_set

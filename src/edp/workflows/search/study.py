@@ -10,15 +10,20 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from edp.errors import ConfigError
+from edp.evaluation.study_facts import TrialRow
 from edp.settings.bounds import MOST_NAMES, check_bounds, integer
+from edp.settings.tree import Table
 from edp.storage import replacing
-from edp.workflows.search.space import Candidate, Choice, Range, Real, Space, Value, check, names
+from edp.workflows.search.space import Candidate, Choice, Range, Real, Space, check, names
+from edp.workflows.search.trainings import Outcome, TrainingRequest
 
 if TYPE_CHECKING:
     import optuna
@@ -27,21 +32,52 @@ GP_TRIALS = 100  # a Gaussian process is the better sampler up to here, then it 
 STARTUP = 10
 
 
-@dataclass(frozen=True)
+@dataclass
 class Trial:
-    """One question of a study.
+    """A question of a study, from asking to its score.
 
     Attributes:
         number: from 0 in the order of asking.
         values: of the dimensions of the space.
-        flags: names of the switches that are on.
-        options: of the switches that are on.
+        modules: switches that are on, such as modules; `options`: values of their options.
+        settings: the experiment that it stands for.
+        costs: analytic costs of its network, by name; none if its values make no network.
+        requests: whole trainings, one a run; none if it is not trained for its costs.
+        outcomes: of the last part of each.
+        rungs: means over runs at steps before the end.
+        pruned: whether it was ended at the last rung.
+        score: mean over its runs; None if it was not trained, was pruned, or failed.
     """
 
     number: int
     values: Candidate
-    flags: tuple[str, ...] = ()
+    modules: tuple[str, ...] = ()
     options: Candidate = field(default_factory=dict)
+    settings: Table = field(default_factory=dict)
+    costs: Mapping[str, float] = field(default_factory=dict)
+    requests: list[TrainingRequest] = field(default_factory=list)
+    outcomes: list[Outcome] = field(default_factory=list)
+    rungs: dict[int, float] = field(default_factory=dict)
+    pruned: bool = False
+    score: float | None = None
+
+    def mean(self, horizon: int, name: str = "composite") -> float | None:
+        """Return a score, mean over its runs; None if there is none, or one did not end well."""
+        scores = [outcome.mean(horizon, name) for outcome in self.outcomes]
+        return float(np.mean(scores)) if scores and np.isfinite(scores).all() else None
+
+    def row(self, horizon: int) -> TrialRow:
+        """Return what the study's file says of it."""
+        return TrialRow(
+            number=self.number,
+            values={**self.values, **self.options},
+            score=self.score,
+            mae=None if self.pruned else self.mean(horizon, "mae"),
+            parameters=self.costs.get("parameters"),
+            macs_tick=self.costs.get("macs_tick"),
+            rungs=tuple(self.rungs.items()) or None,
+            pruned=self.pruned if self.rungs else None,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +144,8 @@ class Study:
         self._study = optuna.create_study(
             directions=["minimize"] * self.objectives,
             sampler=optuna.samplers.RandomSampler(seed=0),
-            pruner=PRUNERS[self.pruner](),
+            # Optuna's defaults: after five whole trials; the first rung is the warm-up.
+            pruner=optuna.pruners.MedianPruner() if self.pruner == "median" else optuna.pruners.NopPruner(),
         )
         self._distributions = {name: _distribution(self.space[name]) for name in names(self.space)} | {
             name: _distribution(Choice((0, 1))) for name in self.flags
@@ -242,66 +279,28 @@ class Study:
 
     def _sampler(self, number: int) -> optuna.samplers.BaseSampler:
         seed = int.from_bytes(hashlib.blake2b(f"{self.root} {number}".encode(), digest_size=4).digest(), "big")
-        kind = self.sampler.kind
+        kind, startup = self.sampler.kind, self.sampler.startup
         # A Gaussian process does not learn from trials that were refused for their costs.
         if kind == "gp" and (number >= GP_TRIALS or self.bounds):
             kind = "tpe"
-        sampler: optuna.samplers.BaseSampler = SAMPLERS[kind](seed, self.sampler.startup)
-        return sampler
+        from optuna.samplers import GPSampler, RandomSampler, TPESampler
+
+        if kind == "random":
+            return RandomSampler(seed=seed)
+        if kind == "thesis_tpe":
+            return TPESampler(seed=seed, n_startup_trials=startup, multivariate=False, constant_liar=False)
+        if kind == "tpe":
+            return TPESampler(seed=seed, n_startup_trials=startup, multivariate=True)
+        return GPSampler(
+            seed=seed,
+            n_startup_trials=startup,
+            independent_sampler=TPESampler(seed=seed, n_startup_trials=startup),
+            warn_independent_sampling=False,
+        )
 
 
-def _gp(seed: int, startup: int) -> Any:
-    from optuna.samplers import GPSampler, TPESampler
-
-    fallback = TPESampler(seed=seed, n_startup_trials=startup)
-    return GPSampler(
-        seed=seed,
-        n_startup_trials=startup,
-        independent_sampler=fallback,
-        warn_independent_sampling=False,
-    )
-
-
-def _tpe(seed: int, startup: int) -> Any:
-    from optuna.samplers import TPESampler
-
-    return TPESampler(seed=seed, n_startup_trials=startup, multivariate=True)
-
-
-def _thesis_tpe(seed: int, startup: int) -> Any:
-    from optuna.samplers import TPESampler
-
-    return TPESampler(seed=seed, n_startup_trials=startup, multivariate=False, constant_liar=False)
-
-
-def _random(seed: int, startup: int) -> Any:
-    from optuna.samplers import RandomSampler
-
-    return RandomSampler(seed=seed)
-
-
-SAMPLERS: dict[str, Callable[[int, int], Any]] = {
-    "gp": _gp,
-    "tpe": _tpe,
-    "thesis_tpe": _thesis_tpe,
-    "random": _random,
-}
-
-
-def _no_pruner() -> Any:
-    from optuna.pruners import NopPruner
-
-    return NopPruner()
-
-
-def _median() -> Any:
-    """Optuna's defaults: after five whole trials; the first rung is the warm-up."""
-    from optuna.pruners import MedianPruner
-
-    return MedianPruner()
-
-
-PRUNERS: dict[str, Callable[[], Any]] = {"none": _no_pruner, "median": _median}
+SAMPLERS = ("gp", "tpe", "thesis_tpe", "random")
+PRUNERS = ("none", "median")
 
 
 def _distribution(dimension: Range) -> Any:
@@ -315,43 +314,26 @@ def _distribution(dimension: Range) -> Any:
 
 
 @dataclass(frozen=True)
-class FinishedTrial:
-    """A question of a study that is over.
-
-    Attributes:
-        values: of its dimensions.
-        objectives: None where it was not trained to its end.
-        attributes: what else is known of it.
-        reports: values at steps before the end.
-        pruned: whether it was ended at the last of them.
-    """
-
-    values: Candidate
-    objectives: Sequence[float] | None
-    attributes: dict[str, Any]
-    reports: dict[int, float] = field(default_factory=dict)
-    pruned: bool = False
-
-
-@dataclass(frozen=True)
 class FinishedStudy:
-    """A study that is over: what was asked and what came of it, for a viewer.
+    """A study that is over, for a viewer.
 
     Attributes:
         name: of the study.
         space: dimensions and their ranges.
-        rows: its questions.
-        objectives: names of what was made small.
+        modules: switches.
+        trials: in the order of asking.
+        objectives: names of what was made small: the score, and a cost if there are two.
     """
 
     name: str
     space: Space
-    rows: Sequence[FinishedTrial]
+    modules: Sequence[str]
+    trials: Sequence[TrialRow]
     objectives: tuple[str, ...]
 
 
 def write_journal(path: str | Path, studies: Sequence[FinishedStudy]) -> None:
-    """A copy of studies as a journal that Optuna and its dashboard read; replaced whole, never appended to.
+    """Write studies as a journal that Optuna and its dashboard read; a file there is replaced whole.
 
     Raises:
         StorageError: it cannot be written.
@@ -363,38 +345,31 @@ def write_journal(path: str | Path, studies: Sequence[FinishedStudy]) -> None:
     # Replaced whole: a dashboard that reads meanwhile sees the old file or the new one.
     with replacing(path) as temporary:
         storage = optuna.storages.JournalStorage(JournalFileBackend(str(temporary)))
-        for study_copy in studies:
-            directions: list[Any] = ["minimize"] * len(study_copy.objectives)
-            study = optuna.create_study(storage=storage, study_name=study_copy.name, directions=directions)
-            study.set_user_attr("objectives", list(study_copy.objectives))
-            study.add_trials([_frozen(study_copy.space, row) for row in study_copy.rows])
+        for finished in studies:
+            directions: list[Any] = ["minimize"] * len(finished.objectives)
+            study = optuna.create_study(storage=storage, study_name=finished.name, directions=directions)
+            # A viewer shows objectives without units; the names carry them.
+            study.set_user_attr("objectives", list(finished.objectives))
+            study.add_trials([_frozen(finished, trial) for trial in finished.trials])
 
 
-def _frozen(space: Space, row: FinishedTrial) -> optuna.trial.FrozenTrial:
+def _frozen(study: FinishedStudy, trial: TrialRow) -> optuna.trial.FrozenTrial:
     from optuna.trial import TrialState, create_trial
 
-    answer, state = row.objectives, TrialState.FAIL if row.objectives is None else TrialState.COMPLETE
-    if row.pruned:  # Optuna, too, gives it the last value that it reported
-        answer, state = [row.reports[max(row.reports)]], TrialState.PRUNED
+    # Options of modules that were off are absent, switches are always there.
+    values = {**trial.values, **{module: int(module in (trial.modules or ())) for module in study.modules}}
+    space = {**study.space, **dict.fromkeys(study.modules, Choice((0, 1)))}
+    answer = None if trial.score is None else [trial.score, *(trial.costs[name] for name in study.objectives[1:])]
+    state = TrialState.FAIL if answer is None else TrialState.COMPLETE
+    # Pruned trials keep their reports, which the viewer draws as curves.
+    reports = dict(trial.rungs or ())
+    if trial.pruned:  # Optuna, too, gives it the last value that it reported
+        answer, state = [reports[max(reports)]], TrialState.PRUNED
     return create_trial(
         state=state,
-        values=None if answer is None else list(answer),
-        params=dict(row.values),
-        distributions={name: _distribution(space[name]) for name in row.values},
-        user_attrs=row.attributes,
-        intermediate_values=row.reports,
+        values=answer,
+        params=values,
+        distributions={name: _distribution(space[name]) for name in values},
+        user_attrs={"mae": trial.mae, **trial.costs},
+        intermediate_values=reports,
     )
-
-
-__all__ = [
-    "PRUNERS",
-    "SAMPLERS",
-    "Candidate",
-    "FinishedStudy",
-    "FinishedTrial",
-    "SamplerSpec",
-    "Study",
-    "Trial",
-    "Value",
-    "write_journal",
-]

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from edp.config.experiment import Table
 from edp.errors import StorageError
-from edp.storage import held_by, read_json, write_json
+from edp.evaluation.study import FILE, Decision, PhaseRow, StudyFile, TrainingCounts, TrainingRow, read_study
+from edp.progress import Progress
+from edp.storage import held_by, write_json
 from edp.storage.ledger import Opening, Record, digest_of
 from edp.storage.paths import entries_of
-from edp.storage.study_file import FILE, SCHEMA, read_study
-from edp.workflows.search.context import Decision, Outcome, SearchContext
+from edp.workflows.search.context import SearchContext
 from edp.workflows.search.modules import MODULES, title_of
 from edp.workflows.search.phases import PHASES
-from edp.workflows.search.trainings import TrainingRequest
+from edp.workflows.search.trainings import Outcome, TrainingRequest
 
 # Two seconds: a viewer does not follow faster, and a record a second would cost more than it tells.
 EVERY_S = 2.0
@@ -31,24 +33,22 @@ class StudyLog:
 
     Args:
         folder: of the study.
-        facts: what does not change: mode, preset, data, spec, sessions.
+        study: what does not change: mode, preset, data, spec, sessions.
         context: of the search, before any decision.
 
     Attributes:
         trained: trainings of this sitting.
-        decisions: of the phases that have ended.
         openings: openings of the sealed test sets.
         state: ``running``, ``stopped`` or ``finished``.
         workers: trainings that run side by side.
     """
 
-    def __init__(self, folder: Path, facts: Mapping[str, Any], context: SearchContext) -> None:
+    def __init__(self, folder: Path, study: StudyFile, context: SearchContext) -> None:
         self.file = folder / FILE
-        self.facts = dict(facts)
         self.horizon = context.spec.horizon
         self.decisions: list[Decision] = []
-        self.phases: dict[str, dict[str, Any]] = {}
-        self.rows: dict[str, dict[str, Any]] = {}
+        self.phases: dict[str, PhaseRow] = {}
+        self.rows: dict[str, TrainingRow] = {}
         self.openings: list[Opening] = []
         self.trained = 0
         self.workers = 1
@@ -60,43 +60,35 @@ class StudyLog:
         self._seconds = 0.0
         self._phase_began = 0.0
         self._written = 0.0
-        earlier = _held_before(self.file)
-        self._before = {phase["name"]: phase for phase in earlier.get("phases", [])}
-        self.facts["created"] = earlier.get("created", _now())
+        # The log is for viewers; the ledger holds all that counts: a log that cannot be read is written anew.
+        earlier = None
+        with contextlib.suppress(StorageError):
+            earlier = read_study(self.file)
+        self._before = {} if earlier is None else {phase.name: phase for phase in earlier.phases}
+        self.study = replace(study, created=_now() if earlier is None else earlier.created)
         self.state = "running"
 
     def on_phase(self, name: str, context: SearchContext) -> None:
         """A phase begins."""
-        earlier = self._before.get(name, {})
         self._phase_began = time.monotonic()
-        self._expected[name] = PHASES[name].trainings(context)
-        self.phases[name] = {
-            "name": name,
-            "title": PHASES[name].title,
-            "trainings": 0,
-            "trained": 0,
-            "failed": 0,
-            "pruned": 0,
-            "seconds": 0.0,
-            "wall_s": 0.0,
-            "began": earlier.get("began", _now()),
-            "ended": None,
-        }
-        for later in list(PHASES)[list(PHASES).index(name) + 1 :]:
+        began = self._before[name].began if name in self._before else _now()
+        self.phases[name] = PhaseRow(name=name, title=PHASES[name].title, began=began)
+        for later in list(PHASES)[list(PHASES).index(name) :]:
             self._expected[later] = PHASES[later].trainings(context)
         self.write(force=True)
 
     def on_batch(self, batch: Mapping[str, TrainingRequest]) -> None:
         """A batch of trainings is asked for, by key; those that were asked for before are no new ones."""
-        phase = self._phase
         self._row_of = {key: digest_of(order.whole.to_json()) for key, order in batch.items()}
         self._end_paused(self._row_of.values())
+        phase = list(self.phases.values())[-1]
         for key, order in batch.items():
+            # A training in parts is one row, so its key is that of the whole.
             if self._row_of[key] not in self.rows:
-                # A training in parts is one row, so its key is that of the whole.
-                phase["trainings"] += 1
-                row = {"phase": phase["name"], "number": len(self.rows), "label": label_of(order.settings)}
-                self.rows[self._row_of[key]] = row | {"status": "waiting", "seconds": 0.0}
+                phase = replace(phase, trainings=phase.trainings + 1)
+                row = TrainingRow(phase=phase.name, number=len(self.rows), label=label_of(order.settings))
+                self.rows[self._row_of[key]] = row
+        self.phases[phase.name] = phase
 
     def on_record(self, record: Record, order: TrainingRequest, trained: bool) -> None:
         """A training, or a part of one, is in the ledger."""
@@ -109,42 +101,44 @@ class StudyLog:
         outcome = Outcome.of(order, record)
         score, result = outcome.mean(self.horizon), record.result or {}
         seconds = float(record.measured.get("seconds", 0.0))
-        row |= {
-            "score": score if score == score else None,  # NaN is not equal to itself
-            "seconds": round(row["seconds"] + seconds, 3),
-            "parameters": result.get("parameters"),
-            "macs_tick": result.get("macs_tick"),
-        }
-        if record.message:
-            row["message"] = record.message
-        phase = self.phases[row["phase"]]
-        phase["seconds"] = round(phase["seconds"] + seconds, 3)
+        row = replace(
+            row,
+            score=score if score == score else None,  # NaN is not equal to itself
+            seconds=round(row.seconds + seconds, 3),
+            parameters=result.get("parameters"),
+            macs_tick=result.get("macs_tick"),
+            message=record.message or row.message,
+        )
+        phase = self.phases[row.phase]
+        self.phases[row.phase] = replace(phase, seconds=round(phase.seconds + seconds, 3))
         if trained:
             self._now.add(which)
             self._seconds += seconds
-        if order.until is None or outcome.status != "done":
+        paused = order.until is not None and outcome.status == "done"
+        if paused and row.status == "waiting":
+            self._paused[which] = None
+            row = replace(row, rung=order.until)
+        self.rows[which] = row
+        if not paused:
             self._paused.pop(which, None)
             self._end_row(which, outcome.status)
-        elif row["status"] == "waiting":
-            self._paused[which] = None
-            row["rung"] = order.until
         self.write()
 
     def _end_row(self, which: str, status: str) -> None:
         """A training is over; one that was pruned may be asked for again, and trained to its end."""
         row = self.rows[which]
-        phase = self.phases[row["phase"]]
-        if row["status"] == "pruned":
-            phase["pruned"] -= 1
-        else:
-            phase["trained"] += 1
-        phase["pruned"] += status == "pruned"
-        phase["failed"] += status not in ("done", "pruned")
-        row["status"] = status
-        if status == "pruned":
-            row["score"] = None  # that of a rung is not to be held against those of whole trainings
-        else:
-            row.pop("rung", None)
+        phase = self.phases[row.phase]
+        again, pruned = row.status == "pruned", status == "pruned"
+        self.phases[row.phase] = replace(
+            phase,
+            pruned=phase.pruned - again + pruned,
+            trained=phase.trained + (not again),
+            failed=phase.failed + (status not in ("done", "pruned")),
+        )
+        # The score of a rung is not to be held against those of whole trainings.
+        self.rows[which] = replace(
+            row, status=status, score=None if pruned else row.score, rung=row.rung if pruned else None
+        )
         if which in self._now:
             self._now.discard(which)
             self.trained += 1
@@ -157,12 +151,13 @@ class StudyLog:
 
     def on_decision(self, decision: Decision) -> None:
         """A phase ends."""
-        phase, earlier = self._phase, self._before.get(decision.phase, {})
+        earlier = self._before.get(decision.phase)
         self._end_paused(())
-        spent = time.monotonic() - self._phase_began
-        # A search that was stopped has spent time before; the longer figure is closer to the truth.
-        phase["wall_s"] = round(max(spent, float(earlier.get("wall_s", 0.0))), 1)
-        phase["ended"] = earlier.get("ended") or _now()
+        spent, ended = round(time.monotonic() - self._phase_began, 1), _now()
+        if earlier is not None:
+            # A search that was stopped has spent time before; the longer figure is closer to the truth.
+            spent, ended = max(spent, earlier.wall_s), earlier.ended or ended
+        self.phases[decision.phase] = replace(self.phases[decision.phase], wall_s=spent, ended=ended)
         self.decisions.append(decision)
         self.write(force=True)
 
@@ -171,69 +166,86 @@ class StudyLog:
         self.state = state
         self.write(force=True)
 
-    def counts(self) -> dict[str, int]:
+    def counts(self) -> TrainingCounts:
         """Trainings that are done, that were asked for, and that there will be in all at most."""
-        done = sum(row["status"] != "waiting" for row in self.rows.values())
-        ahead = sum(self._expected[name] for name in PHASES if name not in self.phases)
-        current = 0
-        if self.phases:
-            phase = self._phase
-            if phase["ended"] is None:
-                current = max(0, self._expected[phase["name"]] - phase["trainings"])
-        return {"done": done, "asked": len(self.rows), "total": len(self.rows) + current + ahead}
+        done = sum(row.status != "waiting" for row in self.rows.values())
+        # A phase that has ended asks for no more.
+        ahead = sum(
+            max(0, self._expected[name] - self.phases[name].trainings) if name in self.phases else self._expected[name]
+            for name in PHASES
+            if name not in self.phases or self.phases[name].ended is None
+        )
+        return TrainingCounts(done, len(self.rows), len(self.rows) + ahead)
 
-    def seconds_left(self) -> float | None:
-        """From the trainings of this sitting, or else of earlier ones; None before the first."""
+    def report(self, progress: Progress) -> None:
+        """Report how far the search is, with the time left.
+
+        Args:
+            progress: stage whose units are trainings.
+        """
         counts = self.counts()
-        if self.trained:
-            each = self._seconds / self.trained
-        elif counts["done"]:
-            each = sum(row.get("seconds") or 0.0 for row in self.rows.values()) / counts["done"]
-        else:
-            return None
-        return (counts["total"] - counts["done"]) * each / self.workers
-
-    def to_json(self) -> Table:
-        """The whole, plain."""
-        return {
-            "schema": SCHEMA,
-            "state": self.state,
-            **self.facts,
-            "modules": {name: title_of(name) for name in (*MODULES, *self.facts["spec"]["toggles"])},
-            "decisions": [decision.to_json() for decision in self.decisions],
-            "phases": list(self.phases.values()),
-            "history": list(self.rows.values()),
-            "openings": [vars(one) | {"judged": list(one.judged)} for one in self.openings],
-            "counts": self.counts(),
-            "updated": _now(),
-        }
+        values = {"share": counts.done / max(1, counts.total), "trained": self.trained, "workers": self.workers}
+        # From the trainings of this sitting, or else of earlier ones.
+        spent, number = self._seconds, self.trained
+        if not number:
+            spent, number = sum(row.seconds for row in self.rows.values()), counts.done
+        if number:
+            values["seconds_left"] = (counts.total - counts.done) * spent / number / self.workers
+        progress.step(counts.done, **values)
 
     def write(self, force: bool = False) -> None:
         """Write it, unless that was done a moment ago."""
         now = time.monotonic()
         if force or now - self._written >= EVERY_S:
-            write_json(self.file, self.to_json())
+            toggles = self.study.spec["toggles"]
+            study = replace(
+                self.study,
+                state=self.state,
+                modules={name: title_of(name) for name in (*MODULES, *toggles)},
+                decisions=tuple(self.decisions),
+                phases=tuple(self.phases.values()),
+                history=tuple(self.rows.values()),
+                openings=tuple(self.openings),
+                counts=self.counts(),
+                updated=_now(),
+            )
+            write_json(self.file, study.to_json())
             self._written = time.monotonic()
 
-    @property
-    def _phase(self) -> dict[str, Any]:
-        return list(self.phases.values())[-1]
+
+@dataclass(frozen=True)
+class StudyStatus:
+    """What a study has written down, and who works on it.
+
+    Attributes:
+        study: with its true state.
+        holder: process that coordinates it; None for nobody.
+        running: trainings under way.
+    """
+
+    study: StudyFile
+    holder: str | None
+    running: int
+
+    def to_json(self) -> Table:
+        """Return plain values."""
+        return self.study.to_json() | {"holder": self.holder, "running": self.running}
 
 
-def look_at(folder: str | Path) -> Table:
-    """What a study has written down, and who works on it: ``holder`` (process, None for nobody), ``running``.
+def look_at(folder: str | Path) -> StudyStatus:
+    """Return what a study has written down, and who works on it.
 
     Raises:
-        StorageError: as `edp.storage.study_file.read_study`.
+        StorageError: as `edp.evaluation.study.read_study`.
     """
-    study = dict(read_study(folder))
+    study = read_study(folder)
     ledger = Path(folder, "ledger")
     holder = held_by(ledger / ".lock")
     # Claims of a dead coordinator are stale.
     claims = entries_of(ledger / "claims", "*.lock") if holder else []
-    if study["state"] == "running" and holder is None:
-        study["state"] = "killed"
-    return study | {"holder": holder, "running": len(claims)}
+    if study.state == "running" and holder is None:
+        study = replace(study, state="killed")
+    return StudyStatus(study, holder, len(claims))
 
 
 def label_of(settings: Table) -> str:
@@ -252,16 +264,6 @@ def label_of(settings: Table) -> str:
     activation = model.get("activation", {}).get("kind", "identity")
     extra += [] if activation == "identity" else [activation]
     return " + ".join([f"{backbone['kind']} {features}", *extra])
-
-
-def _held_before(file: Path) -> Table:
-    """What an earlier sitting wrote; what cannot be read is written anew, since the ledger holds all that counts."""
-    try:
-        # The log is for viewers; the ledger holds all that counts.
-        content = read_json(file)
-    except StorageError:
-        return {}
-    return content if isinstance(content, dict) and content.get("schema") == SCHEMA else {}
 
 
 def _now() -> str:

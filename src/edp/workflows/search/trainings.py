@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any
+
+import numpy as np
 
 from edp.config.experiment import Experiment, Table, build, plain_tree
 from edp.data.prepared import Prepared, prepare
@@ -23,6 +25,7 @@ from edp.networks.predictor import build_model
 from edp.networks.running import window_predictions
 from edp.recording import Recording
 from edp.settings.bounds import MOST_EPOCHS, MOST_UPDATES, SEED, check_bounds, integer
+from edp.storage.ledger import Record
 from edp.training.bundle import blank_scaler
 from edp.training.parts import fit_part
 
@@ -54,7 +57,7 @@ class TrainingRequest:
     """
 
     settings: Table
-    source: Mapping[str, Any]
+    source: Table
     train: tuple[str, ...]
     judged: tuple[str, ...]
     seed: int
@@ -102,7 +105,7 @@ class TrainingRequest:
         """The training that this is a part of."""
         return replace(self, until=None, stops=())
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Table:
         """Plain values, from which `from_json` makes the same order."""
         return {
             "settings": self.settings,
@@ -116,32 +119,56 @@ class TrainingRequest:
             **({} if self.recipe is None else {"recipe": self.recipe}),
         } | self.several()
 
-    def several(self) -> dict[str, Any]:
+    def several(self) -> Table:
         """What is said of a training of several epochs, plain; nothing of one epoch, whose keys stay what they were."""
         if self.epochs == 1:
             return {}
         return {"epochs": self.epochs, "patience": self.patience, "validation": list(self.validation)}
 
     @staticmethod
-    def from_json(plain: Mapping[str, Any]) -> TrainingRequest:
-        """The order that `to_json` gave."""
-        return TrainingRequest(
-            plain["settings"],
-            plain["source"],
-            tuple(plain["train"]),
-            tuple(plain["judged"]),
-            plain["seed"],
-            plain["updates"],
-            plain.get("until"),
-            tuple(plain.get("stops", ())),
-            plain.get("epochs", 1),
-            plain.get("patience", 0),
-            tuple(plain.get("validation", ())),
-            plain.get("recipe"),
-        )
+    def from_json(plain: Table) -> TrainingRequest:
+        """The order that `to_json` gave; other keys are left aside.
+
+        Raises:
+            ConfigError: a value that is missing or of another kind.
+        """
+        names = [part.name for part in fields(TrainingRequest) if part.name in plain]
+        return build(TrainingRequest, {name: plain[name] for name in names}, "of an order")
 
 
-def train_order(plain: Mapping[str, Any]) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Outcome:
+    """What became of an order.
+
+    Attributes:
+        order: what was to be trained.
+        status: ``done``, or how it ended.
+        result: of `edp.workflows.search.trainings.train_order`, where it is done.
+        message: what went wrong.
+    """
+
+    order: TrainingRequest
+    status: str
+    result: Mapping[str, Any] | None = None
+    message: str = ""
+
+    @staticmethod
+    def of(order: TrainingRequest, record: Record) -> Outcome:
+        """The outcome of an order, from the ledger's record of it."""
+        return Outcome(order, str(record.status), record.result, record.message)
+
+    def score(self, session: str, horizon: int, name: str = "composite") -> float:
+        """A score on one session; NaN where the training did not end well, which counts as the worst."""
+        if self.result is None:
+            return float("nan")
+        return float(self.result["sessions"][session][str(horizon)][name])
+
+    def mean(self, horizon: int, name: str = "composite") -> float:
+        """A score, mean over the judging sessions; NaN where the training did not end well."""
+        return float(np.mean([self.score(session, horizon, name) for session in self.order.judged]))
+
+
+def train_order(plain: Table) -> Table:
     """Train and judge an order given as plain values; see `train_part`.
 
     Returns:
@@ -151,7 +178,7 @@ def train_order(plain: Mapping[str, Any]) -> dict[str, Any]:
     return train_part(plain)[0]
 
 
-def train_part(plain: Mapping[str, Any], start: bytes | None = None) -> tuple[dict[str, Any], bytes | None]:
+def train_part(plain: Table, start: bytes | None = None) -> tuple[Table, bytes | None]:
     """Train and judge an order, which may be a part of a training.
 
     Args:
@@ -274,7 +301,7 @@ class _Named:
         return Split(*(tuple(whole[name] for name in part) for part in parts))
 
 
-def _frozen(source: Mapping[str, Any]) -> str:
+def _frozen(source: Table) -> str:
     # Text as a key: `lru_cache` needs something that can be hashed.
     return json.dumps(source, sort_keys=True)
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from edp.config.experiment import load_experiment
-from edp.workflows.search.context import Outcome, SearchContext
+from edp.workflows.search.context import SearchContext
+from edp.workflows.search.engine import run_phases
 from edp.workflows.search.modules import MODULES
 from edp.workflows.search.phases import PHASES
-from edp.workflows.search.run_phases import run_phases
 from edp.workflows.search.settings import SearchSpec
 from edp.workflows.search.smaller import Recipe
 from edp.workflows.search.space import Choice, Real
 from edp.workflows.search.study import SamplerSpec
-from edp.workflows.search.trainings import SCORES, costs_of, settings_of
+from edp.workflows.search.trainings import SCORES, Outcome, costs_of, settings_of
 
 SESSIONS = tuple(f"s{number:02d}" for number in range(12))
 SPEC = SearchSpec(

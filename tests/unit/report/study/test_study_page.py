@@ -10,15 +10,14 @@ from browser import check_page
 from page_text import check_text
 
 from edp.errors import EdpError, StorageError
+from edp.evaluation.study import NUMBERS, parse_study, read_study
 from edp.report import write_study_page
 from edp.report.common.interactive import plots
 from edp.report.search.charts import study_charts
-from edp.report.search.facts import NUMBERS, facts_of
 from edp.report.search.page import build_study_page, study_text
 from edp.report.search.tables import identifiers, study_tables
 from edp.report.search.views import PointView, arm_views, forests, front, point_views, top_of, tracks
 from edp.report.search.words import caveats, decided, headline, missing, tiles, verdict
-from edp.storage.study_file import read_study
 from edp.workflows.search.modules import MODULES
 
 PHASES = (
@@ -38,7 +37,7 @@ def plots_of(facts):
 
 
 def page_of(study):
-    facts = facts_of(study)
+    facts = parse_study(study)
     return build_study_page(facts, study_tables(facts)).html()
 
 
@@ -47,7 +46,7 @@ def figures_of(text):
 
 
 def test_everything_is_written_and_loads_nothing(sound, tmp_path):
-    made = write_study_page(sound, tmp_path / "report")
+    made = write_study_page(parse_study(sound), tmp_path / "report")
     text = made.page.read_text(encoding="utf-8")
     assert "default-src 'none'" in text
     assert "://" not in text.split("<script>")[0]
@@ -71,13 +70,13 @@ def test_everything_is_written_and_loads_nothing(sound, tmp_path):
         rows = list(csv.DictReader(stream))
     assert len(rows) == len(MODULES)
     assert all(None not in row and None not in row.values() for row in rows)
-    again = write_study_page(sound, tmp_path / "again", pictures=False)
+    again = write_study_page(parse_study(sound), tmp_path / "again", pictures=False)
     assert again.pictures == ()
     assert [again.page.read_bytes(), again.text.read_bytes()] == [made.page.read_bytes(), made.text.read_bytes()]
 
 
 def test_the_tables_hold_what_the_phases_found(sound):
-    tables = study_tables(facts_of(sound))
+    tables = study_tables(parse_study(sound))
     facts = {held["phase"]: held["facts"] for held in sound["decisions"]}
     arm = facts["isolation"]["arms"]["hybrid FG2"]
     row = next(row for row in tables["variance"].rows if row[:2] == ("Hybrid", "FG2"))
@@ -89,7 +88,7 @@ def test_the_tables_hold_what_the_phases_found(sound):
     assert modules["Squeeze-Excitation"][-1] == "confirmed"
     assert modules["Zoneout"][3:] == (None, None, None, None, None, "stopped")
     assert [row[0] for row in tables["modules"].rows][:2] == ["Cyl Gate Diagonal", "Temporal Diff"]
-    short = identifiers(facts_of(sound))
+    short = identifiers(parse_study(sound))
     active = tables["holdout"].rows[0]
     assert active[1] == "none"
     assert active[2] == ", ".join(short[name] for name in facts["synthesis"]["modules"])
@@ -101,7 +100,7 @@ def test_the_tables_hold_what_the_phases_found(sound):
 
 
 def test_the_thesis_mode_has_its_own_figures(thesis, tmp_path):
-    facts = facts_of(thesis)
+    facts = parse_study(thesis)
     shown = {view.key: view for view in forests(facts)}
     assert set(shown) == {*(f"confirmation_{metric}" for metric in ("mae", "rmse", "p95", "p99")), "screening"}
     decision = next(held for held in thesis["decisions"] if held["phase"] == "confirmation")
@@ -121,11 +120,11 @@ def test_the_thesis_mode_has_its_own_figures(thesis, tmp_path):
 @pytest.mark.parametrize("mode", ["sound", "thesis"])
 def test_a_study_that_is_only_partly_done(request, unfinished, mode, last):
     study = unfinished(request.getfixturevalue(mode), last)
-    facts = facts_of(study)
+    facts = parse_study(study)
     text = page_of(study)
     place = PHASES.index(last)
     for name, lines in zip(PHASES, decided(facts), strict=True):
-        known = name in facts.facts
+        known = name in facts.decided
         assert known == (PHASES.index(name) < place)
         assert known or lines[1][0].startswith(("Under way: ", "Has not begun."))
     assert ("variance" in plots_of(facts)) == (place > 0)
@@ -133,7 +132,7 @@ def test_a_study_that_is_only_partly_done(request, unfinished, mode, last):
     assert f"{place} of 8 phases are decided" in headline(facts) or place > 5
     assert f"The search is running in phase {NUMBERS[last]}" in " ".join(verdict(facts))
     ended = sum(held["status"] != "waiting" for held in study["history"])
-    assert ended == len(facts.history) < len(study["history"]) or last == "planning"
+    assert ended == len(facts.ended) < len(study["history"]) or last == "planning"
     assert "not decided yet" in missing(facts, last)
     assert "not decided yet" in text.split("<script>")[0] or last == "planning"
     assert study_text(facts, study_tables(facts)).startswith("# Model search on m22.toml")
@@ -142,42 +141,42 @@ def test_a_study_that_is_only_partly_done(request, unfinished, mode, last):
 def test_an_empty_study_is_a_report_too(unfinished, sound, tmp_path):
     study = unfinished(sound, "isolation")
     study |= {"history": [], "phases": []}
-    made = write_study_page(study, tmp_path)
+    made = write_study_page(parse_study(study), tmp_path)
     assert made.pictures == ()
     assert "No training has a score yet." in made.page.read_text(encoding="utf-8")
-    assert "was killed: 0 of 8" in headline(facts_of(study | {"state": "killed"}))
+    assert "was killed: 0 of 8" in headline(parse_study(study | {"state": "killed"}))
 
 
 def test_the_headline_says_what_the_test_sessions_say(sound):
     facts = next(held["facts"] for held in sound["decisions"] if held["phase"] == "synthesis")
-    assert "below the baseline's" in headline(facts_of(sound))
+    assert "below the baseline's" in headline(parse_study(sound))
     facts["test_gain"] = {"change": -0.05, "low": -0.08, "high": -0.02, "p": 0.001}
-    assert "chance" not in verdict(facts_of(sound))[0]
+    assert "chance" not in verdict(parse_study(sound))[0]
     facts["test_gain"] = {"change": -0.05, "low": -0.12, "high": 0.02, "p": 0.08}
-    assert "so chance alone may have done it" in verdict(facts_of(sound))[0]
+    assert "so chance alone may have done it" in verdict(parse_study(sound))[0]
     facts["test"]["synthesis"]["composite"] = 99.0
-    assert headline(facts_of(sound)).startswith("Nothing better than the baseline was found")
+    assert headline(parse_study(sound)).startswith("Nothing better than the baseline was found")
     facts["test"]["synthesis"] = dict.fromkeys(facts["test"]["synthesis"])
     facts["test_gain"] = None
-    assert "failed" in headline(facts_of(sound))
+    assert "failed" in headline(parse_study(sound))
     page_of(sound)
 
 
 def test_words_follow_the_settings(sound):
-    text = " ".join(caveats(facts_of(sound)))
+    text = " ".join(caveats(parse_study(sound)))
     assert "400 updates" in text
     assert "2,000 updates" in text
     assert "9 that train and judge in turn, 2 set apart, 1 more for phase 6" in text
     assert "6 more questions in phase 4, 12 in phase 5" in text
     sound["spec"]["final_updates"] = 400
-    assert "no longer (400 updates)" in " ".join(caveats(facts_of(sound)))
-    sentences = dict(decided(facts_of(sound)))["Phase 3: confirmation"]
+    assert "no longer (400 updates)" in " ".join(caveats(parse_study(sound)))
+    sentences = dict(decided(parse_study(sound)))["Phase 3: confirmation"]
     assert len(sentences) < len(MODULES)
     assert any(line.count(", ") > 5 and "stopped by the screening" in line for line in sentences)
 
 
 def test_the_front_is_what_nothing_betters(sound):
-    points = point_views(facts_of(sound))
+    points = point_views(parse_study(sound))
     best = front(points, "parameters")
     for point in points:
         beaten = any(
@@ -195,17 +194,17 @@ def test_the_front_is_what_nothing_betters(sound):
 
 def test_the_history_keeps_failures_apart(sound):
     sound["history"][5]["score"] = 400.0
-    views = tracks(facts_of(sound))
+    views = tracks(parse_study(sound))
     assert sum(len(view.places) for view in views) == len(sound["history"])
     top = top_of(score for view in views for score in view.scores)
     assert top < 20
-    named = {trace.name: trace for trace in plots_of(facts_of(sound))["history"].figure.data}
+    named = {trace.name: trace for trace in plots_of(parse_study(sound))["history"].figure.data}
     assert len(named["failed"].x) == sum(held["score"] is None for held in sound["history"])
     assert len(named["above the scale"].x) == 1
     assert [len(view.places) for view in views if view.heading == "Phase 4, test sessions"] == [4]
     assert top_of([]) is None
     assert top_of([2.0]) > 2.0
-    assert len(arm_views(facts_of(sound))) == 4
+    assert len(arm_views(parse_study(sound))) == 4
 
 
 def test_what_was_pruned_is_no_failure(sound, tmp_path):
@@ -215,7 +214,7 @@ def test_what_was_pruned_is_no_failure(sound, tmp_path):
     )
     sound["history"][place] |= {"status": "pruned", "score": None, "rung": 50}
     sound["phases"][1]["pruned"] = 1
-    facts = facts_of(sound)
+    facts = parse_study(sound)
     named = {trace.name: trace for trace in plots_of(facts)["history"].figure.data}
     assert named["pruned"].x == (place + 1,)
     assert len(named["failed"].x) == failed
@@ -223,7 +222,7 @@ def test_what_was_pruned_is_no_failure(sound, tmp_path):
     sheet = study_tables(facts)["phases"]
     assert [column.heading for column in sheet.columns].index("Pruned") == 3
     assert [row[3] for row in sheet.rows] == [0, 1, 0, 0, 0, 0, 0, 0, 1]
-    assert write_study_page(sound, tmp_path).pictures
+    assert write_study_page(parse_study(sound), tmp_path).pictures
 
 
 def test_names_that_mean_something_elsewhere(sound, tmp_path):
@@ -231,7 +230,7 @@ def test_names_that_mean_something_elsewhere(sound, tmp_path):
     sound["modules"]["squeeze_excitation"] = odd
     sound["data"]["path"] = f"/{odd}"
     sound["history"][0]["label"] = odd
-    made = write_study_page(sound, tmp_path, pictures=False)
+    made = write_study_page(parse_study(sound), tmp_path, pictures=False)
     assert "<script>|" not in made.page.read_text(encoding="utf-8")
     assert "\\|$x\\_1$" in made.text.read_text(encoding="utf-8")
 
@@ -257,18 +256,18 @@ def test_what_is_no_study_is_refused(tmp_path, content, message):
 
 def test_a_study_is_read_as_it_was_written(tmp_path, sound):
     (tmp_path / "study.json").write_text(json.dumps(sound), encoding="utf-8")
-    assert read_study(tmp_path) == read_study(tmp_path / "study.json") == sound
+    assert read_study(tmp_path) == read_study(tmp_path / "study.json") == parse_study(sound)
 
 
 def test_a_missing_part_is_named(sound):
     del sound["history"]
-    with pytest.raises(StorageError, match="it lacks 'history'"):
+    with pytest.raises(StorageError, match="'history' is missing"):
         page_of(sound)
 
 
 def test_missing_facts_name_their_phase(sound):
     del sound["decisions"][2]["facts"]["modules"]["zoneout"]["change"]
-    with pytest.raises(StorageError, match="phase 'screening': it lacks 'change'"):
+    with pytest.raises(StorageError, match=r"phase 'screening': 1 problem\n  - 'modules.zoneout.change' is missing"):
         page_of(sound)
 
 
@@ -282,7 +281,7 @@ def test_whatever_is_broken_gives_a_report_or_one_clear_error(request, mode, cou
         study = copy.deepcopy(whole)
         damage(study, rng)
         try:
-            write_study_page(study, tmp_path, pictures=False)
+            write_study_page(parse_study(study), tmp_path, pictures=False)
         except EdpError as error:
             messages.append(str(error))
     assert 1 < len(messages) < count
@@ -316,4 +315,4 @@ def test_the_text_of_the_page_of_an_unfinished_study(sound, unfinished):
 
 @pytest.mark.processes
 def test_the_page_in_a_browser(browser, sound, tmp_path):
-    check_page(browser, write_study_page(sound, tmp_path, pictures=False).page, "model search")
+    check_page(browser, write_study_page(parse_study(sound), tmp_path, pictures=False).page, "model search")

@@ -3,31 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
 from edp.config.experiment import Table
 from edp.errors import DataError
+from edp.evaluation.study import Decision
+from edp.evaluation.study_facts import CalibratedBackbone, CalibrationFacts, FinalRound, IsolationFacts, TrialRow
 from edp.stats.efficiency import SizeScore, most_efficient
 from edp.stats.paired import fill_worst
 from edp.stats.pareto import pareto
 from edp.wording import behind, percent, percent_interval, typed
-from edp.workflows.search.context import Decision, Outcome, SearchContext
+from edp.workflows.search.context import SearchContext
 from edp.workflows.search.phases.base import (
     PHASES,
-    AnsweredQuestion,
     Course,
     Quest,
     answer_all,
     best,
-    mean_of,
     new_study,
     possible,
     said_of_pruned,
+    scored,
 )
 from edp.workflows.search.phases.isolation import arm_settings, lowest_against_others
 from edp.workflows.search.space import Choice, Space, applicable, apply
+from edp.workflows.search.study import Trial
+from edp.workflows.search.trainings import Outcome
 
 
 class Calibration:
@@ -43,7 +46,7 @@ class Calibration:
 
     def run(self, context: SearchContext) -> Course:
         """All backbones side by side: every size in turn, then what the sampler asks; the best of each on all folds."""
-        features = context.spec.feature_sets[context.decided["isolation"].facts["features"]]
+        features = context.spec.feature_sets[context.facts(IsolationFacts).features]
         arms = {backbone: arm_settings(context.base, backbone, features) for backbone in context.spec.backbones}
         # Only values that make a network of this arm are asked for.
         spaces = {name: possible(context, applicable(context.spec.space, arm), arm) for name, arm in arms.items()}
@@ -63,20 +66,22 @@ class Calibration:
     def decide(
         self,
         context: SearchContext,
-        answers: dict[str, list[AnsweredQuestion]],
-        chosen: dict[str, AnsweredQuestion],
+        answers: dict[str, list[Trial]],
+        chosen: dict[str, Trial],
         final: Sequence[Outcome],
         notes: list[str],
     ) -> Decision:
         """Of each backbone the smallest size that no larger one repays; of these the lowest score in the final."""
-        facts: dict[str, Any] = {"backbones": {}}
+        horizon = context.spec.horizon
+        backbones = {}
         sentences = list(notes)
         for backbone, own in answers.items():
             picked = chosen.get(backbone)
             if picked is None:
                 sentences.append(f"{backbone}: no training of {len(own)} ended well; it is left out.")
                 continue
-            facts["backbones"][backbone] = _plain(context, picked) | {"trials": [_plain(context, item) for item in own]}
+            trials = tuple(_row(trial, horizon) for trial in own)
+            backbones[backbone] = CalibratedBackbone(**vars(_row(picked, horizon)), trials=trials)
             lowest = best(own)
             size = f"{picked.costs['parameters']:,.0f}"
             text = (
@@ -93,22 +98,29 @@ class Calibration:
                 "learning rates of the space or loosen the limits"
             )
         scores = {name: picked.score or 0.0 for name, picked in chosen.items()}
-        if final:
-            facts["final"] = _final(context, list(chosen), final)
-            scores = facts["final"]["scores"]
+        final_round = _final(context, list(chosen), final) if final else None
+        if final_round is not None:
+            scores = dict(final_round.scores)
             listed = ", ".join(f"{name} {typed(score, 3)}" for name, score in scores.items())
             against = "".join(
-                f"; {item['best']} against {name} {percent(item['change'], signed=True)} "
-                f"({percent_interval(item['low'], item['high'])})"
-                for name, item in facts["final"]["against"].items()
+                f"; {item.best} against {name} {percent(item.change, signed=True)} "
+                f"({percent_interval(item.low, item.high)})"
+                for name, item in final_round.against.items()
             )
             sentences.append(f"Each on all {context.spec.folds} folds: {listed}{behind(context.unit)}{against}.")
         winner = min(scores, key=lambda name: scores[name])
-        facts |= {"backbone": winner, "baseline": dict(chosen[winner].trial.values)}
-        facts["settings"] = chosen[winner].settings
         sentences.append(f"The baseline of all later phases is {winner}.")
+        front = None
         if context.spec.cost != "none":
-            facts["front"] = {name: _front(context, own) for name, own in answers.items()}
+            front = {name: _front(context, own) for name, own in answers.items()}
+        facts = CalibrationFacts(
+            backbones=backbones,
+            final=final_round,
+            backbone=winner,
+            baseline=dict(chosen[winner].values),
+            settings=chosen[winner].settings,
+            front=front,
+        )
         return Decision("calibration", facts, tuple(sentences))
 
 
@@ -123,7 +135,7 @@ def _quest(context: SearchContext, backbone: str, arm: Table, space: Space) -> Q
     return Quest(study, lambda trial: context.shaped(apply(arm, trial.values)), spec.trials)
 
 
-def _final(context: SearchContext, backbones: list[str], outcomes: Sequence[Outcome]) -> dict[str, Any]:
+def _final(context: SearchContext, backbones: list[str], outcomes: Sequence[Outcome]) -> FinalRound:
     """Mean score of each backbone over the folds, and the lowest against each of the others."""
     mask = context.folds(context.spec.folds)
     parts = np.split(np.arange(len(outcomes)), len(backbones))
@@ -131,47 +143,35 @@ def _final(context: SearchContext, backbones: list[str], outcomes: Sequence[Outc
     # Failed cells count as the worst of all backbones: a failure must not win by its absence.
     tables = dict(zip(backbones, fill_worst(raw, mask), strict=True))
     scores = {name: float(table[mask].mean()) for name, table in tables.items()}
-    return {"runs": context.spec.folds, "scores": scores, "against": lowest_against_others(tables, mask)}
+    return FinalRound(context.spec.folds, scores, lowest_against_others(tables, mask))
 
 
-def _efficient(answers: list[AnsweredQuestion]) -> AnsweredQuestion | None:
-    """The best answer of the size that the efficiency rule chooses (`edp.stats.efficiency`)."""
-    by_size: dict[float, AnsweredQuestion] = {}
-    for answer in answers:
-        if answer.score is None:
-            continue
-        # Of each size its best question stands for it.
-        best_of_size = by_size.get(answer.costs["parameters"])
-        if best_of_size is None or best_of_size.score is None or answer.score < best_of_size.score:
-            by_size[answer.costs["parameters"]] = answer
+def _efficient(trials: list[Trial]) -> Trial | None:
+    """The best trial of the size that the efficiency rule chooses (`edp.stats.efficiency`)."""
+    by_size: dict[float, Trial] = {}
+    # Of each size its best question stands for it.
+    for _, trial in sorted(scored(trials), key=lambda pair: pair[0]):
+        by_size.setdefault(trial.costs["parameters"], trial)
     if not by_size:
         return None
-    candidates = [SizeScore(f"{size:,.0f}", size, answer.score or 0.0) for size, answer in by_size.items()]
+    candidates = [SizeScore(f"{size:,.0f}", size, trial.score or 0.0) for size, trial in by_size.items()]
     return by_size[most_efficient(candidates).parameters]
 
 
-def _front(context: SearchContext, answers: list[AnsweredQuestion]) -> list[dict[str, Any]]:
-    done = [answer for answer in answers if answer.score is not None]
-    front_indices = pareto([(answer.score or 0.0, answer.costs[context.spec.cost]) for answer in done])
-    return [_plain(context, done[index]) for index in front_indices]
+def _front(context: SearchContext, trials: list[Trial]) -> tuple[TrialRow, ...]:
+    done = scored(trials)
+    indices = pareto([(score, trial.costs[context.spec.cost]) for score, trial in done])
+    return tuple(_row(done[index][1], context.spec.horizon) for index in indices)
 
 
-def _plain(context: SearchContext, answer: AnsweredQuestion) -> dict[str, Any]:
-    return {
-        "number": answer.trial.number,
-        "values": dict(answer.trial.values),
-        "score": answer.score,
-        "mae": None if answer.pruned else mean_of(context, answer.outcomes, "mae"),
-        **answer.costs,
-        "statuses": [outcome.status for outcome in answer.outcomes],
-        **answer.course(),
-    }
+def _row(trial: Trial, horizon: int) -> TrialRow:
+    return replace(trial.row(horizon), statuses=tuple(outcome.status for outcome in trial.outcomes))
 
 
-def _values(answer: AnsweredQuestion) -> str:
+def _values(trial: Trial) -> str:
     return ", ".join(
         f"{name} {typed(value, 3)}" if isinstance(value, float) else f"{name} {value}"
-        for name, value in answer.trial.values.items()
+        for name, value in trial.values.items()
     )
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from statistics import fmean
 
 from edp.config.experiment import Experiment, Table, build
 from edp.errors import ConfigError
 from edp.evaluation.compression import CompressedRow
+from edp.evaluation.study import Decision
+from edp.evaluation.study_facts import ComparingSessions, ExplorationFacts, SecondTest, SmallerFacts, SmallerNetwork
 from edp.networks.narrow import width_of
 from edp.networks.predictor import build_model
 from edp.training.bundle import blank_scaler
@@ -16,10 +18,10 @@ from edp.wording import percent
 from edp.workflows.compression import FORMATS, CompressionRequest
 from edp.workflows.compression.pipeline import TEACHER, NetworkResult, choose, relative_error, rows_of
 from edp.workflows.compression.planning import CompressionPlan, make_plan
-from edp.workflows.search.context import Decision, Outcome, SearchContext
+from edp.workflows.search.context import SearchContext
 from edp.workflows.search.phases.base import PHASES, Course
 from edp.workflows.search.smaller import Recipe
-from edp.workflows.search.trainings import TrainingRequest
+from edp.workflows.search.trainings import Outcome, TrainingRequest
 
 NAME = "compression"
 
@@ -46,7 +48,7 @@ class CompressionPhase:
         """Teacher; students of each width; the better of each with rounded numbers; the choice on the test set."""
         if not context.spec.compression.on:
             yield from ()
-            return Decision(NAME, {"on": False}, ("Left out: search.compression.on is false.",))
+            return Decision(NAME, SmallerFacts(on=False), ("Left out: search.compression.on is false.",))
         settings = teacher_settings(context)
         # The teacher first: all others are made of it.
         (first,) = yield [order_of(context, settings, recipe_of(context))]
@@ -68,12 +70,15 @@ class CompressionPhase:
         networks: list[tuple[CompressionRequest | None, NetworkResult]] = [(None, teacher), *results.items()]
         rows = [(order, row) for order, result in networks for row in rows_of(order, result, teacher.plain)]
         front, chosen = choose([row for _, row in rows])
-        facts = _facts(context, tuple(plan.notes)) | {
-            "sessions": {"train": list(context.training), "validation": list(context.validation)},
-            "rows": [_row_table(order, row) for order, row in rows],
-            "front": front,
-            "chosen": chosen,
-        }
+        facts = SmallerFacts(
+            budget=context.spec.compression.budget,
+            sessions=ComparingSessions(context.training, context.validation),
+            second=context.second,
+            rows=tuple(_network(order, row) for order, row in rows),
+            front=tuple(front),
+            chosen=chosen,
+            notes=tuple(plan.notes),
+        )
         sentences = [f"{len(rows)} networks and formats were compared on {', '.join(context.validation)}."]
         budget = context.spec.compression.budget
         if chosen is None:
@@ -106,7 +111,7 @@ class CompressionPhase:
             f"On the second test set ({', '.join(context.second)}), opened for these two alone: "
             f"{percent(ratio - 1, signed=True)} against the teacher's error."
         )
-        return Decision(NAME, facts | {"held_out_test": {"scores": scores, "error": ratio}}, tuple(sentences))
+        return Decision(NAME, replace(facts, held_out_test=SecondTest(scores, ratio)), tuple(sentences))
 
 
 def _make(
@@ -121,19 +126,25 @@ def _make(
     }
 
 
-def _row_table(order: CompressionRequest | None, row: CompressedRow) -> Table:
-    table = {name: getattr(row, name) for name in ("name", "recipe", "over", "scores", "before", "error")}
-    table |= {"format": row.number_format, "resource_usage": vars(row.resource_usage)}
-    if order is None:
-        return table | {"units": None, "pruned": False, "rounded": False}
-    pruned = order.pruned if order.of is None else order.of.pruned
-    return table | {"units": order.units, "pruned": pruned, "rounded": order.rounding is not None}
+def _network(order: CompressionRequest | None, row: CompressedRow) -> SmallerNetwork:
+    return SmallerNetwork(
+        name=row.name,
+        recipe=row.recipe,
+        units=None if order is None else order.units,
+        pruned=order is not None and order.begins_pruned,
+        rounded=order is not None and order.rounding is not None,
+        format=row.number_format,
+        resource_usage=row.resource_usage,
+        over=row.over,
+        scores=row.scores,
+        before=row.before,
+        error=row.error,
+    )
 
 
 def teacher_settings(context: SearchContext) -> Table:
     """Settings of the winner of the search."""
-    settings: Table = context.decided["exploration"].facts["teacher_settings"]
-    return settings
+    return context.facts(ExplorationFacts).teacher_settings
 
 
 def recipe_of(context: SearchContext, order: CompressionRequest | None = None) -> Recipe:
@@ -143,8 +154,7 @@ def recipe_of(context: SearchContext, order: CompressionRequest | None = None) -
     recipe = Recipe(steps, spec.formats or tuple(FORMATS), spec.budget, context.validation)
     if order is None:
         return recipe
-    pruned = order.pruned if order.of is None else order.of.pruned
-    return replace(recipe, units=order.units, pruned=pruned, rounded=order.rounding is not None)
+    return replace(recipe, units=order.units, pruned=order.begins_pruned, rounded=order.rounding is not None)
 
 
 def order_of(context: SearchContext, settings: Table, recipe: Recipe, judged: Sequence[str] = ()) -> TrainingRequest:
@@ -176,13 +186,9 @@ def plan_of(context: SearchContext, settings: Table) -> CompressionPlan:
     return make_plan(network, spec.budget, units, spec.formats, shares=spec.shares)
 
 
-def _facts(context: SearchContext, notes: tuple[str, ...]) -> Table:
-    facts = {"on": True, "rows": [], "front": [], "chosen": None, "notes": list(notes), "held_out_test": None}
-    return facts | {"second": list(context.second), "budget": asdict(context.spec.compression.budget)}
-
-
 def _nothing(context: SearchContext, why: str) -> Decision:
-    return Decision(NAME, _facts(context, (why,)), (why, "The second test set stays closed."))
+    facts = SmallerFacts(budget=context.spec.compression.budget, second=context.second, notes=(why,))
+    return Decision(NAME, facts, (why, "The second test set stays closed."))
 
 
 PHASES.register(NAME)(CompressionPhase())

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
-from typing import Any
 
 import numpy as np
 
 from edp.config.experiment import Table
+from edp.evaluation.study import Decision, facts_of_kind
+from edp.evaluation.study_facts import PlanningFacts, ScreeningFacts, SoundConfirmation, ThesisConfirmation
 from edp.stats.checks import Mask
 from edp.stats.clustered import clustered_t
-from edp.stats.confirm import ModuleEvidence, Rule, confirm
+from edp.stats.confirm import Rule, confirm
 from edp.stats.paired import fill_worst
 from edp.stats.race import INTERIM_ANALYSES, InterimAnalysis
 from edp.stats.thesis_confirm import ThesisEvidence, thesis_confirm
 from edp.wording import percent, typed
-from edp.workflows.search.context import Array, Decision, Outcome, SearchContext
+from edp.workflows.search.context import Array, SearchContext
 from edp.workflows.search.modules import MODULES
 from edp.workflows.search.phases.base import PHASES, Course
 from edp.workflows.search.phases.screening import baseline_of
+from edp.workflows.search.trainings import Outcome
 
 METRICS = ("mae", "rmse", "p95", "p99")
 
@@ -31,18 +32,22 @@ class Confirmation:
 
     def trainings(self, context: SearchContext) -> int:
         """Were nothing dropped at an interim analysis; before the screening, with half of the modules."""
-        spec, decided = context.spec, context.decided
+        spec, decisions = context.spec, list(context.decided.values())
+        screening, planning = facts_of_kind(decisions, ScreeningFacts), facts_of_kind(decisions, PlanningFacts)
         half = len(spec.modules or MODULES) // 2
-        arms = len(decided["screening"].facts["passed"]) if "screening" in decided else half
-        runs = int(decided["planning"].facts["runs"]) if "planning" in decided else spec.most_runs
+        arms = half if screening is None else len(screening.passed)
+        runs = spec.most_runs if planning is None else planning.runs
         return (1 + arms) * runs * (spec.run_seeds if spec.mode == "thesis" else 1) if arms else 0
 
     def run(self, context: SearchContext) -> Course:
         """Trainings of the mode, and what is confirmed."""
-        passed = list(context.decided["screening"].facts["passed"])
+        passed = list(context.facts(ScreeningFacts).passed)
         if not passed:
             yield from ()
-            return Decision("confirmation", {"confirmed": [], "evidence": []}, ("No module passed the screening.",))
+            facts = (ThesisConfirmation if context.spec.mode == "thesis" else SoundConfirmation)(
+                confirmed=(), evidence=()
+            )
+            return Decision("confirmation", facts, ("No module passed the screening.",))
         base = baseline_of(context)[0]
         arms = [base, *(context.network(base, [name]) for name in passed)]
         return (yield from (_thesis if context.spec.mode == "thesis" else _sound)(context, passed, arms))
@@ -50,7 +55,7 @@ class Confirmation:
 
 def _sound(context: SearchContext, passed: list[str], arms: list[Table]) -> Course:
     """One interim analysis after the other; a dropped module is not trained any more."""
-    runs = int(context.decided["planning"].facts["runs"])
+    runs = context.facts(PlanningFacts).runs
     interim_analyses = tuple(analysis for analysis in INTERIM_ANALYSES if analysis.runs < runs)
     mask = context.folds(runs)
     scores = np.full((len(arms), runs, len(context.development)), np.nan)
@@ -74,15 +79,14 @@ def _sound(context: SearchContext, passed: list[str], arms: list[Table]) -> Cour
         scores[:, :start],
         passed,
         # All modules that were screened count for the adjustment, not only those that passed.
-        context.decided["screening"].facts["registered"],
+        context.facts(ScreeningFacts).registered,
         mask[:start],
         Rule(alpha=context.spec.alpha, least_gain=context.spec.least_gain, interim_analyses=interim_analyses),
     )
-    return _decision(
-        [_plain(module_evidence) for module_evidence in evidence],
-        [module_evidence.module for module_evidence in evidence if module_evidence.confirmed],
-        _texts(evidence),
-    )
+    confirmed = tuple(entry.module for entry in evidence if entry.confirmed)
+    texts = (f"{MODULES[entry.module].title}: {entry.reason}." for entry in evidence)
+    facts = SoundConfirmation(confirmed=confirmed, evidence=tuple(evidence))
+    return Decision("confirmation", facts, (_headline(confirmed), *texts))
 
 
 def _hopeless(filled: Array, mask: Mask, stop: int, interim_analyses: Sequence[InterimAnalysis]) -> list[bool]:
@@ -95,15 +99,16 @@ def _hopeless(filled: Array, mask: Mask, stop: int, interim_analyses: Sequence[I
 
 
 def _thesis(context: SearchContext, passed: list[str], arms: list[Table]) -> Course:
-    runs, seeds = int(context.decided["planning"].facts["runs"]), context.spec.run_seeds
+    runs, seeds = context.facts(PlanningFacts).runs, context.spec.run_seeds
     outcomes = yield [
         order for arm in arms for seed in range(seeds) for order in context.orders(arm, range(runs), seed=seed)
     ]
     scores = _by_metric(context, outcomes, len(arms), seeds, runs)
     evidence = thesis_confirm(scores, passed, METRICS, context.spec.alpha)
-    confirmed = [name for name in passed if any(entry.confirmed for entry in evidence if entry.module == name)]
-    texts = [_thesis_text(name, [entry for entry in evidence if entry.module == name]) for name in passed]
-    return _decision([asdict(entry) for entry in evidence], confirmed, texts)
+    confirmed = tuple(name for name in passed if any(entry.confirmed for entry in evidence if entry.module == name))
+    texts = (_thesis_text(name, [entry for entry in evidence if entry.module == name]) for name in passed)
+    facts = ThesisConfirmation(confirmed=confirmed, evidence=tuple(evidence))
+    return Decision("confirmation", facts, (_headline(confirmed), *texts))
 
 
 def _by_metric(context: SearchContext, outcomes: Sequence[Outcome], arms: int, seeds: int, runs: int) -> Array:
@@ -116,17 +121,8 @@ def _by_metric(context: SearchContext, outcomes: Sequence[Outcome], arms: int, s
     return scores
 
 
-def _decision(evidence: list[dict[str, Any]], confirmed: list[str], texts: list[str]) -> Decision:
-    head = f"Confirmed: {', '.join(MODULES[name].title for name in confirmed) or 'no module'}."
-    return Decision("confirmation", {"confirmed": confirmed, "evidence": evidence}, (head, *texts))
-
-
-def _plain(evidence: ModuleEvidence) -> dict[str, Any]:
-    return asdict(evidence)
-
-
-def _texts(evidence: Sequence[ModuleEvidence]) -> list[str]:
-    return [f"{MODULES[entry.module].title}: {entry.reason}." for entry in evidence]
+def _headline(confirmed: Sequence[str]) -> str:
+    return f"Confirmed: {', '.join(MODULES[name].title for name in confirmed) or 'no module'}."
 
 
 def _thesis_text(name: str, evidence: Sequence[ThesisEvidence]) -> str:

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from edp.errors import count_of
+from edp.evaluation.study import Decision
+from edp.evaluation.study_facts import ExplorationFacts, JointFacts, SynthesisFacts
 from edp.stats.clustered import clustered_t
 from edp.stats.paired import fill_worst
 from edp.wording import percent, typed
-from edp.workflows.search.context import Decision, Outcome, SearchContext
+from edp.workflows.search.context import SearchContext
 from edp.workflows.search.modules import fitting, options_of, title_of
-from edp.workflows.search.phases.base import PHASES, Course, changed
+from edp.workflows.search.phases.base import PHASES, Course, relative_change
 from edp.workflows.search.phases.joint import JointStart, ask_together, winner_of
 from edp.workflows.search.phases.screening import baseline_of
+from edp.workflows.search.space import Value
+from edp.workflows.search.trainings import Outcome
 
 
 class Exploration:
@@ -32,22 +35,27 @@ class Exploration:
         spec = context.spec
         base = baseline_of(context)[0]
         free = fitting(base, context.channels, spec.modules)
-        earlier = context.decided["synthesis"].facts
+        earlier = context.facts(SynthesisFacts)
         # The winner of phase 4 is the warm start: phase 5 is to find at least that.
-        starts = [JointStart(earlier["values"], earlier["modules"])]
+        starts = [JointStart(earlier.values, earlier.modules)]
         options = {name: options_of(base, name, context.shaped) for name in free}
         switches = [*free, *spec.toggles]
         answers = yield from ask_together(context, "exploration", switches, spec.free_trials, starts, options)
-        facts = winner_of(context, "exploration", switches, answers)
-        facts["options"] = {key: list(choice.options) for own in options.values() for key, choice in own.items()}
+        winner = winner_of(context, "exploration", switches, answers)
         runs = fresh_runs(context)
-        arms = (earlier["settings"], facts["settings"])
+        arms = (earlier.settings, winner.settings)
         outcomes = yield [order for settings in arms for order in context.orders(settings, runs)]
-        return self.decide(context, facts, outcomes)
+        searched = {key: tuple(choice.options) for own in options.values() for key, choice in own.items()}
+        return self.decide(context, winner, searched, outcomes)
 
-    def decide(self, context: SearchContext, facts: dict[str, Any], outcomes: Sequence[Outcome]) -> Decision:
+    def decide(
+        self,
+        context: SearchContext,
+        winner: JointFacts,
+        options: Mapping[str, tuple[Value, ...]],
+        outcomes: Sequence[Outcome],
+    ) -> Decision:
         """The teacher: the winner of phase 5 where fresh folds bear it out, else that of phase 4."""
-        earlier = context.decided["synthesis"].facts
         size = len(outcomes) // 2
         # The last rows of the mask are the fresh runs.
         mask = context.folds(fresh_runs(context)[-1] + 1)[-size:]
@@ -56,23 +64,25 @@ class Exploration:
         filled = fill_worst(scores, mask[:, seen])
         test = clustered_t(filled[1] - filled[0], mask[:, seen])
         fresh = [float(own[mask[:, seen]].mean()) for own in filled]
-        comparison = changed(test, fresh[0])
+        comparison = relative_change(test, fresh[0])
         # Both: a gain, and one that chance hardly makes.
-        better = comparison["change"] < 0 and comparison["p"] < context.spec.alpha
-        names = ", ".join(map(title_of, facts["modules"])) or "no module"
-        facts |= {
-            **comparison,
-            "fresh": {"synthesis": fresh[0], "exploration": fresh[1]},
-            "runs": size,
-            "teacher": "exploration" if better else "synthesis",
-        }
-        facts["teacher_settings"] = facts["settings"] if better else earlier["settings"]
+        better = comparison.change < 0 and comparison.p < context.spec.alpha
+        names = ", ".join(map(title_of, winner.modules)) or "no module"
+        facts = ExplorationFacts(
+            **vars(winner),
+            **vars(comparison),
+            options=options,
+            fresh={"synthesis": fresh[0], "exploration": fresh[1]},
+            runs=size,
+            teacher="exploration" if better else "synthesis",
+            teacher_settings=winner.settings if better else context.facts(SynthesisFacts).settings,
+        )
         verdict = "it is the teacher" if better else "the winner of phase 4 stays the teacher"
         sentences = (
-            f"Best of {len(facts['trials'])} questions about all modules: {names}.",
+            f"Best of {len(winner.trials)} questions about all modules: {names}.",
             f"Against the winner of phase 4 on {count_of(size, 'fresh run')}: "
-            f"{percent(comparison['change'], signed=True)} (one-sided p {typed(comparison['p'], 2)}); {verdict}.",
-            *facts["said_of_pruned"],
+            f"{percent(comparison.change, signed=True)} (one-sided p {typed(comparison.p, 2)}); {verdict}.",
+            *winner.said_of_pruned,
         )
         return Decision("exploration", facts, sentences)
 

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.config.experiment import Table
 from edp.errors import DataError, count_of
+from edp.evaluation.study import Decision
+from edp.evaluation.study_facts import ArmComparison, ArmFacts, FeatureComparison, IsolationFacts
 from edp.stats.clustered import clustered_t
 from edp.stats.paired import fill_worst
-from edp.stats.variance import SplitVariance, paired_variance, split_variance, thesis_variance
+from edp.stats.variance import PairedVariance, paired_variance, split_variance, thesis_variance
 from edp.wording import behind, percent, percent_interval, typed
-from edp.workflows.search.context import Array, Decision, Outcome, SearchContext
-from edp.workflows.search.phases.base import PHASES, Course, changed
+from edp.workflows.search.context import Array, SearchContext
+from edp.workflows.search.phases.base import PHASES, Course, relative_change
+from edp.workflows.search.trainings import Outcome
 
 DEFAULT_BACKBONE: dict[str, Table] = {
     "lstm": {"kind": "lstm", "units": 64},
@@ -25,7 +27,7 @@ DEFAULT_BACKBONE: dict[str, Table] = {
 }
 
 
-def arm_settings(base: Table, backbone: str, features: Any) -> Table:
+def arm_settings(base: Table, backbone: str, features: str | Table) -> Table:
     """The base with another backbone of like size, and another feature set (a name, or a plain table)."""
     base_backbone = base["model"]["backbone"]
     if base_backbone["kind"] == backbone:
@@ -78,14 +80,15 @@ class Isolation:
         spec, arms = context.spec, self.arms(context)
         tables = _tables(context, outcomes, len(arms))
         errors = _tables(context, outcomes, len(arms), "mae")
-        facts: dict[str, Any] = {"arms": {}, "runs": spec.variance_runs, "seeds": spec.variance_seeds}
         estimate = thesis_variance if spec.mode == "thesis" else split_variance
+        arm_facts = {}
         for (backbone, features), scores, mae in zip(arms, tables, errors, strict=True):
             by_run = np.nanmean(scores, axis=2).T  # (run, seed)
-            facts["arms"][f"{backbone} {features}"] = _plain(estimate(by_run)) | {
-                "by_run": by_run.tolist(),
-                "mae": _plain(estimate(np.nanmean(mae, axis=2).T)),
-            }
+            arm_facts[f"{backbone} {features}"] = ArmFacts(
+                **vars(estimate(by_run)),
+                by_run=tuple(map(tuple, by_run.tolist())),
+                mae=estimate(np.nanmean(mae, axis=2).T),
+            )
         # Table 4.3 compares feature sets by their mean absolute error.
         what, judging = ("MAE", errors) if spec.mode == "thesis" else ("composite score", tables)
         means = {
@@ -94,29 +97,36 @@ class Isolation:
             for features in spec.feature_sets
         }
         chosen = min(means, key=lambda name: means[name])
-        facts |= {"features": chosen, "mean_scores": means, "comparisons": self._comparisons(context, tables, chosen)}
         own = {name: arm_table.mean(axis=0) for (name, f), arm_table in zip(arms, tables, strict=True) if f == chosen}
-        facts["backbones"] = lowest_against_others(own, _judged(context)[0])
-        facts["variance"] = _proxy(context, tables, arms)
+        facts = IsolationFacts(
+            arms=arm_facts,
+            runs=spec.variance_runs,
+            seeds=spec.variance_seeds,
+            features=chosen,
+            mean_scores=means,
+            comparisons=self._comparisons(context, tables, chosen),
+            backbones=lowest_against_others(own, _judged(context)[0]),
+            variance=_proxy(context, tables, arms),
+        )
         sentences = [
             f"Feature set {chosen} goes on: mean {what} "
             + ", ".join(f"{name} {typed(value, 3)}" for name, value in means.items())
             + f"{behind(context.unit)} over all backbones."
         ]
-        for backbone, comparison in facts["comparisons"].items():
+        for backbone, comparison in facts.comparisons.items():
             sentences.append(
-                f"{backbone}: {chosen} against {comparison['reference']} {percent(comparison['change'], signed=True)} "
-                f"(one-sided p {typed(comparison['p'], 2)}, two-way clustered t over "
+                f"{backbone}: {chosen} against {comparison.reference} {percent(comparison.change, signed=True)} "
+                f"(one-sided p {typed(comparison.p, 2)}, two-way clustered t over "
                 f"{count_of(spec.variance_runs, 'run')})."
             )
-        for backbone, comparison in facts["backbones"].items():
+        for backbone, against in facts.backbones.items():
             sentences.append(
-                f"With {chosen}, {comparison['best']} against {backbone} {percent(comparison['change'], signed=True)} "
-                f"({percent_interval(comparison['low'], comparison['high'])}); phase 1 tunes each before one is chosen."
+                f"With {chosen}, {against.best} against {backbone} {percent(against.change, signed=True)} "
+                f"({percent_interval(against.low, against.high)}); phase 1 tunes each before one is chosen."
             )
         return Decision("isolation", facts, tuple(sentences))
 
-    def _comparisons(self, context: SearchContext, tables: list[Array], chosen: str) -> dict[str, Any]:
+    def _comparisons(self, context: SearchContext, tables: list[Array], chosen: str) -> dict[str, FeatureComparison]:
         """The chosen feature set against the next best one, for each backbone."""
         spec = context.spec
         references = [name for name in spec.feature_sets if name != chosen]
@@ -129,11 +139,12 @@ class Isolation:
             first, second = (own[name].mean(axis=0) for name in (chosen, reference))
             mask, _ = _judged(context)
             test = clustered_t(np.where(mask, first - second, 0.0), mask)
-            comparisons[backbone] = {"reference": reference, **changed(test, float(np.nanmean(second)))}
+            change = relative_change(test, float(np.nanmean(second)))
+            comparisons[backbone] = FeatureComparison(**vars(change), reference=reference)
         return comparisons
 
 
-def lowest_against_others(tables: Mapping[str, Array], mask: NDArray[np.bool_]) -> dict[str, Any]:
+def lowest_against_others(tables: Mapping[str, Array], mask: NDArray[np.bool_]) -> dict[str, ArmComparison]:
     """The arm with the lowest mean score against each of the others.
 
     Args:
@@ -142,11 +153,12 @@ def lowest_against_others(tables: Mapping[str, Array], mask: NDArray[np.bool_]) 
     """
     means = {name: float(arm_table[mask].mean()) for name, arm_table in tables.items()}
     best = min(means, key=lambda name: means[name])
-    return {
-        name: {"best": best, **changed(clustered_t(np.where(mask, tables[best] - arm_table, 0.0), mask), means[name])}
-        for name, arm_table in tables.items()
-        if name != best
-    }
+    comparisons = {}
+    for name, arm_table in tables.items():
+        if name != best:
+            test = clustered_t(np.where(mask, tables[best] - arm_table, 0.0), mask)
+            comparisons[name] = ArmComparison(**vars(relative_change(test, means[name])), best=best)
+    return comparisons
 
 
 def _tables(context: SearchContext, outcomes: Sequence[Outcome], arms: int, name: str = "composite") -> list[Array]:
@@ -168,7 +180,7 @@ def _judged(context: SearchContext) -> tuple[NDArray[np.bool_], NDArray[np.bool_
     return mask[:, seen], seen
 
 
-def _proxy(context: SearchContext, tables: list[Array], arms: list[tuple[str, str]]) -> dict[str, float]:
+def _proxy(context: SearchContext, tables: list[Array], arms: list[tuple[str, str]]) -> PairedVariance:
     """The variance of paired differences that planning takes for that of a module's effect.
 
     Before a module was ever trained the variance of its effect is not known. That between the feature sets of one
@@ -184,18 +196,7 @@ def _proxy(context: SearchContext, tables: list[Array], arms: list[tuple[str, st
         raise DataError("one backbone, one feature set and one seed show no variance; set variance_seeds = 2 or more")
     variances = [paired_variance(np.where(mask, difference, 0.0), mask) for difference in differences]
     # The largest variance: planning should not promise too much.
-    largest = max(variances, key=lambda variance: variance.session + variance.run + variance.cell)
-    return {"session": largest.session, "run": largest.run, "cell": largest.cell}
-
-
-def _plain(variance: SplitVariance) -> dict[str, Any]:
-    return {
-        "mean": variance.mean,
-        "split": variance.split,
-        "seed": variance.seed,
-        "split_interval": variance.split_interval,
-        "seed_interval": variance.seed_interval,
-    }
+    return max(variances, key=lambda variance: variance.session + variance.run + variance.cell)
 
 
 PHASES.register("isolation")(Isolation())

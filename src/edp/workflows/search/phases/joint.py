@@ -3,29 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 from edp.config.experiment import Table
 from edp.errors import DataError, count_of
+from edp.evaluation.study_facts import JointFacts
 from edp.stats.pareto import pareto
-from edp.workflows.search.context import Outcome, SearchContext
+from edp.workflows.search.context import SearchContext
 from edp.workflows.search.modules import contradicting, present_options
-from edp.workflows.search.phases.base import (
-    AnsweredQuestion,
-    Quest,
-    answer_all,
-    best,
-    mean_of,
-    new_study,
-    said_of_pruned,
-)
+from edp.workflows.search.phases.base import Quest, answer_all, best, new_study, said_of_pruned, scored
 from edp.workflows.search.phases.screening import baseline_of
-from edp.workflows.search.space import Candidate, Choice, Real, Space, apply
+from edp.workflows.search.space import Candidate, Choice, Real, Space, Value, apply
 from edp.workflows.search.study import Trial
-from edp.workflows.search.trainings import TrainingRequest
+from edp.workflows.search.trainings import Outcome, TrainingRequest
 
-Asked = Generator[list[TrainingRequest], list[Outcome], list[AnsweredQuestion]]
+Asked = Generator[list[TrainingRequest], list[Outcome], list[Trial]]
 
 
 @dataclass(frozen=True)
@@ -65,7 +57,7 @@ def ask_together(
         study.suggest(_inside(space, start.values), start.modules, present)
 
     def settings(trial: Trial) -> Table:
-        return context.network(apply(base, trial.values), trial.flags, trial.options)
+        return context.network(apply(base, trial.values), trial.modules, trial.options)
 
     # The thesis prunes in phase 1 only (3.3.2).
     stops = () if context.spec.mode == "thesis" else context.spec.stops
@@ -73,51 +65,39 @@ def ask_together(
     return answers
 
 
-def winner_of(
-    context: SearchContext, name: str, modules: Sequence[str], answers: list[AnsweredQuestion]
-) -> dict[str, Any]:
-    """The best answer, how often each module was on, and the front where a cost counts.
+def winner_of(context: SearchContext, name: str, modules: Sequence[str], trials: list[Trial]) -> JointFacts:
+    """The best trial, how often each module was on, and the front where a cost counts.
 
     Raises:
         DataError: no training ended well.
     """
-    winner = best(answers)
-    if winner is None:
+    winner = best(trials)
+    if winner is None or winner.score is None:
         raise DataError(
-            f"{name}: none of {count_of(len(answers), 'training')} ended well; see their messages in the ledger"
+            f"{name}: none of {count_of(len(trials), 'training')} ended well; see their messages in the ledger"
         )
-    done = [answer for answer in answers if answer.score is not None]
-    facts: dict[str, Any] = {
-        "settings": winner.settings,
-        "values": {**winner.trial.values, **winner.trial.options},
-        "modules": list(winner.trial.flags),
-        "score": winner.score,
-        "costs": winner.costs,
-        "on": {module: sum(module in answer.trial.flags for answer in done) / len(done) for module in modules},
-        "trials": [
-            {
-                "number": answer.trial.number,
-                "values": {**answer.trial.values, **answer.trial.options},
-                "modules": list(answer.trial.flags),
-                "score": answer.score,
-                "mae": None if answer.pruned else mean_of(context, answer.outcomes, "mae"),
-                **answer.costs,
-                **answer.course(),
-            }
-            for answer in answers
-        ],
-    }
-    facts["said_of_pruned"] = said_of_pruned(context, answers)
+    done = scored(trials)
+    front = None
     if context.spec.cost != "none":
-        points = [(answer.score or 0.0, answer.costs[context.spec.cost]) for answer in done]
-        facts["front"] = [done[index].trial.number for index in pareto(points)]
-    return facts
+        indices = pareto([(score, trial.costs[context.spec.cost]) for score, trial in done])
+        front = tuple(done[index][1].number for index in indices)
+    return JointFacts(
+        settings=winner.settings,
+        values={**winner.values, **winner.options},
+        modules=winner.modules,
+        score=winner.score,
+        costs=winner.costs,
+        on={module: sum(module in trial.modules for _, trial in done) / len(done) for module in modules},
+        trials=tuple(replace(trial.row(context.spec.horizon), modules=trial.modules) for trial in trials),
+        said_of_pruned=tuple(said_of_pruned(context, trials)),
+        front=front,
+    )
 
 
-def _inside(window: Space, values: Candidate) -> dict[str, Any]:
+def _inside(window: Space, values: Candidate) -> dict[str, Value]:
     """Values of the window's dimensions, brought into it."""
     # Values from outside of the window would be refused as a warm start.
-    clipped: dict[str, Any] = {}
+    clipped: dict[str, Value] = {}
     for name, dimension in window.items():
         if name in values:
             clipped[name] = (

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.config.experiment import Table
 from edp.errors import count_of
+from edp.evaluation.study import Decision
+from edp.evaluation.study_facts import CalibrationFacts, ModuleEffect, ModuleGain, SoundScreening, ThesisScreening
 from edp.stats.factorial import Factorial, least_runs, two_level_design
 from edp.stats.importance import main_effects
 from edp.wording import behind, typed
-from edp.workflows.search.context import Decision, Outcome, SearchContext
+from edp.workflows.search.context import SearchContext
 from edp.workflows.search.modules import MODULES, contradicting, fitting
-from edp.workflows.search.phases.base import PHASES, AnsweredQuestion, Course, Quest, answer_all, new_study
+from edp.workflows.search.phases.base import PHASES, Course, Quest, answer_all, new_study, scored
 from edp.workflows.search.space import Candidate, Choice, Space, apply, elastic, names
+from edp.workflows.search.study import Trial
+from edp.workflows.search.trainings import Outcome
 
 
 class ModuleScreening:
@@ -38,10 +42,10 @@ class ModuleScreening:
 
 def baseline_of(context: SearchContext) -> tuple[Table, Candidate, Space]:
     """Settings of the baseline, its values, and the window around them in which candidates are tuned."""
-    facts = context.decided["calibration"].facts
+    facts = context.facts(CalibrationFacts)
     space = {name: dimension for name, dimension in context.spec.space.items() if name in context.spec.elastic}
     beyond = context.spec.mode == "thesis"
-    return facts["settings"], facts["baseline"], elastic(space, facts["baseline"], context.spec.elastic, beyond)
+    return facts.settings, facts.baseline, elastic(space, facts.baseline, context.spec.elastic, beyond)
 
 
 def _sound(context: SearchContext) -> Course:
@@ -116,13 +120,13 @@ def _passed_by_design(
     effects = main_effects(levels, design.factors, scores, covariates if covariates.size else None)
     mean = float(scores.mean())
     passed = [effect.factor for effect in effects if effect.passed]
-    table = {effect.factor: asdict(effect) | {"change": effect.effect / mean} for effect in effects}
+    table = {effect.factor: ModuleEffect(**vars(effect), change=effect.effect / mean) for effect in effects}
     sentences = [
         f"{len(passed)} of {len(effects)} modules show a sign of an improvement and go on: "
         f"{', '.join(MODULES[name].title for name in passed) or 'none'}; {count_of(len(rows), 'training')}, "
         f"{failed} failed."
     ]
-    facts = {"passed": passed, "registered": list(design.factors), "modules": table, "alias": design.alias}
+    facts = SoundScreening(passed=tuple(passed), registered=tuple(design.factors), modules=table, alias=design.alias)
     return Decision("screening", facts, tuple(sentences))
 
 
@@ -137,14 +141,15 @@ def _thesis(context: SearchContext) -> Course:
     quests = [_quest(context, base, name, window) for name in free]
     answers = yield from answer_all(context, quests)
     table = {name: _gain(own, reference) for name, own in zip(free, answers, strict=True)}
-    passed = [name for name, row in table.items() if row["gain"] is not None and row["gain"] > 0]
+    passed = tuple(name for name, row in table.items() if row.gain is not None and row.gain > 0)
     sentences = (
         f"{len(passed)} of {len(free)} modules have a trial below the baseline's median of {typed(reference, 3)}"
         f"{behind(context.unit)} and go on; by chance alone most do, since the best of {spec.module_trials} is "
         "compared with a "
         "median.",
     )
-    return Decision("screening", {"passed": passed, "registered": list(free), "modules": table}, sentences)
+    facts = ThesisScreening(passed=passed, registered=tuple(free), modules=table)
+    return Decision("screening", facts, sentences)
 
 
 def _quest(context: SearchContext, base: Table, module: str, window: Space) -> Quest:
@@ -153,9 +158,9 @@ def _quest(context: SearchContext, base: Table, module: str, window: Space) -> Q
     return Quest(study, lambda trial: apply(settings, trial.values), context.spec.module_trials)
 
 
-def _gain(answers: list[AnsweredQuestion], reference: float) -> dict[str, float | None]:
-    scores = [answer.score for answer in answers if answer.score is not None]
-    return {"best": min(scores), "gain": reference - min(scores)} if scores else {"best": None, "gain": None}
+def _gain(trials: list[Trial], reference: float) -> ModuleGain:
+    scores = [score for score, _ in scored(trials)]
+    return ModuleGain(min(scores), reference - min(scores)) if scores else ModuleGain(None, None)
 
 
 PHASES.register("screening")(ModuleScreening())

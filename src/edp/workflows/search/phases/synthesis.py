@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from edp.config.experiment import Table
+from edp.evaluation.study import Decision
+from edp.evaluation.study_facts import ConfirmationFacts, RelativeChange, SynthesisFacts
 from edp.stats.clustered import clustered_t
 from edp.wording import behind, percent, typed
-from edp.workflows.search.context import Decision, Outcome, SearchContext
+from edp.workflows.search.context import SearchContext
 from edp.workflows.search.modules import title_of
-from edp.workflows.search.phases.base import PHASES, Course, changed
+from edp.workflows.search.phases.base import PHASES, Course, relative_change
 from edp.workflows.search.phases.joint import JointStart, ask_together, winner_of
 from edp.workflows.search.phases.screening import baseline_of
-from edp.workflows.search.trainings import SCORES, TrainingRequest
+from edp.workflows.search.trainings import SCORES, Outcome, TrainingRequest
 
 
 class Synthesis:
@@ -29,7 +30,7 @@ class Synthesis:
 
     def run(self, context: SearchContext) -> Course:
         """Tune modules and rates together; then train the best and the baseline at length and judge both once."""
-        confirmed = list(context.decided["confirmation"].facts["confirmed"])
+        confirmed = list(context.facts(ConfirmationFacts).confirmed)
         switches = [*confirmed, *context.spec.toggles]
         base, values, _ = baseline_of(context)
         # All confirmed modules, and none of them: the sampler begins with both ends.
@@ -37,28 +38,28 @@ class Synthesis:
         if context.spec.mode == "thesis":  # whose phase 4 has no warm start (3.3.5)
             starts = []
         answers = yield from ask_together(context, "synthesis", switches, context.spec.joint_trials, starts)
-        facts = winner_of(context, "synthesis", switches, answers)
-        arms = {"synthesis": facts["settings"], "baseline": base}
+        winner = winner_of(context, "synthesis", switches, answers)
+        arms = {"synthesis": winner.settings, "baseline": base}
         outcomes = yield [order for settings in arms.values() for order in final_orders(context, settings)]
-        facts["test"] = judged(context, list(arms), outcomes)
-        facts["test_gain"] = gained(context, outcomes)
-        return self.decide(context, confirmed, facts)
+        facts = SynthesisFacts(
+            **vars(winner),
+            test=judged(context, list(arms), outcomes),
+            test_gain=gained(context, outcomes),
+            antagonistic=tuple(name for name in confirmed if name not in winner.modules),
+        )
+        return self.decide(context, facts)
 
-    def decide(self, context: SearchContext, confirmed: Sequence[str], facts: dict[str, Any]) -> Decision:
+    def decide(self, context: SearchContext, facts: SynthesisFacts) -> Decision:
         """What stays, what works against the others, and what the test sessions say."""
-        facts["antagonistic"] = [name for name in confirmed if name not in facts["modules"]]
-        names = ", ".join(map(title_of, facts["modules"])) or "no module"
-        sentences = [
-            f"Best together: {names}; {typed(facts['score'], 3)}{behind(context.unit)} on development sessions."
-        ]
-        sentences += facts["said_of_pruned"]
-        if facts["antagonistic"]:
-            left = ", ".join(map(title_of, facts["antagonistic"]))
+        names = ", ".join(map(title_of, facts.modules)) or "no module"
+        sentences = [f"Best together: {names}; {typed(facts.score, 3)}{behind(context.unit)} on development sessions."]
+        sentences += facts.said_of_pruned
+        if facts.antagonistic:
+            left = ", ".join(map(title_of, facts.antagonistic))
             sentences.append(f"Confirmed alone, but not wanted together: {left}.")
-        test = facts["test"]
-        ours, base = (_shown(test[arm]["composite"], context.unit) for arm in ("synthesis", "baseline"))
-        gain = facts["test_gain"]
-        interval = "" if gain is None else f"; {percent(gain['change'], signed=True)}, p {typed(gain['p'], 2)}"
+        ours, base = (_shown(facts.test[arm]["composite"], context.unit) for arm in ("synthesis", "baseline"))
+        gain = facts.test_gain
+        interval = "" if gain is None else f"; {percent(gain.change, signed=True)}, p {typed(gain.p, 2)}"
         sentences.append(
             f"On {len(context.test)} test sessions, opened once: {ours}, the baseline {base} (composite score, mean of "
             f"{context.spec.run_seeds} seeds{interval})."
@@ -105,7 +106,7 @@ def judged(
     return arm_scores
 
 
-def gained(context: SearchContext, outcomes: Sequence[Outcome]) -> dict[str, float] | None:
+def gained(context: SearchContext, outcomes: Sequence[Outcome]) -> RelativeChange | None:
     """The first arm against the second on the test sessions, clustered by session and seed.
 
     None with one test session, one seed, or a training that did not end well.
@@ -115,7 +116,7 @@ def gained(context: SearchContext, outcomes: Sequence[Outcome]) -> dict[str, flo
     # A clustered test needs two sessions and two seeds.
     if min(arms.shape[1:]) < 2 or not np.isfinite(arms).all():
         return None
-    return changed(clustered_t(arms[0] - arms[1]), float(arms[1].mean()))
+    return relative_change(clustered_t(arms[0] - arms[1]), float(arms[1].mean()))
 
 
 def _shown(score: float | None, unit: str) -> str:

@@ -1,9 +1,10 @@
-"""What a number format says of a network, and a network in one."""
+"""Number formats in which a smaller network can run, and what a network takes of a controller in one."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar, Protocol
 
 import numpy as np
@@ -12,8 +13,11 @@ from numpy.typing import NDArray
 from edp.data.series import Series
 from edp.evaluation.controller import Budget, Estimate, ResourceUsage
 from edp.evaluation.footprint import footprint
+from edp.networks.integer import integer_predictor
 from edp.networks.predictor import Predictor
+from edp.networks.running import stream_predictions
 from edp.registry import Registry
+from edp.training.compression.int8 import dynamic_int8
 
 Predict = Callable[[Sequence[Series]], list[NDArray[np.float32]]]
 """Predictions ``(time, horizon, target)`` in SI units for each series, as the format computes them."""
@@ -42,6 +46,64 @@ class Format(Protocol):
 
 
 FORMATS: Registry[type[Format]] = Registry("number format")
+
+
+@FORMATS.register("dynamic_int8")
+class DynamicInt8:
+    """8-bit weights in linear layers, whose inputs are rounded anew at every tick; the rest in single precision.
+
+    Most multiply-accumulates stay in float, so the cycles are taken to be those of single precision.
+    """
+
+    label: ClassVar[str] = "INT8"
+    # No code is exported in this format; cycles of single precision stand for it.
+    estimated: ClassVar[str] = "float32"
+    rounded: ClassVar[bool] = False
+
+    def parameter_bytes(self, predictor: Predictor, estimate: Estimate) -> int:
+        """One byte for each weight of a linear layer, four for the others, as in Table 4.9; no code is exported."""
+        return dynamic_int8(predictor).weight_bytes
+
+    def predictions(self, predictor: Predictor, training_series: Sequence[Series]) -> Predict:
+        """A copy that computes with the rounded numbers."""
+        return partial(stream_predictions, dynamic_int8(predictor).predictor)
+
+
+@FORMATS.register("float32")
+class Float32:
+    """Everything in single precision; gains of weight norm are folded."""
+
+    label: ClassVar[str] = "FP32"
+    estimated: ClassVar[str] = "float32"
+    rounded: ClassVar[bool] = False
+
+    def parameter_bytes(self, predictor: Predictor, estimate: Estimate) -> int:
+        """All constants of the exported C code."""
+        return estimate.parameter_bytes
+
+    def predictions(self, predictor: Predictor, training_series: Sequence[Series]) -> Predict:
+        """The network as it is."""
+        return partial(stream_predictions, predictor)
+
+
+@FORMATS.register("w8a16")
+class W8A16:
+    """Static quantisation of the whole network, judged in integer arithmetic (`edp.ir.w8a16`).
+
+    A network that has no integer form is refused by name.
+    """
+
+    label: ClassVar[str] = "W8A16"
+    estimated: ClassVar[str] = "w8a16"
+    rounded: ClassVar[bool] = True
+
+    def parameter_bytes(self, predictor: Predictor, estimate: Estimate) -> int:
+        """All constants of the exported C code."""
+        return estimate.parameter_bytes
+
+    def predictions(self, predictor: Predictor, training_series: Sequence[Series]) -> Predict:
+        """Ranges and weights are chosen on `training_series`."""
+        return partial(stream_predictions, integer_predictor(predictor, training_series))
 
 
 def resource_usage(

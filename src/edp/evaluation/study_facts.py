@@ -1,0 +1,368 @@
+"""What the phases of a model search find: one class for each phase, written into ``study.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from edp.evaluation.compression import Scores
+from edp.evaluation.controller import Budget, ResourceUsage
+from edp.settings.tree import Table
+from edp.stats.confirm import ModuleEvidence
+from edp.stats.importance import MainEffect
+from edp.stats.power import ConfirmationPlan
+from edp.stats.thesis_confirm import ThesisEvidence
+from edp.stats.variance import PairedVariance, SplitVariance
+
+Scalar = float | int | str | bool
+OPTIONAL = {"optional": True}
+"""Metadata of fields that the file leaves out where they are None."""
+
+
+@dataclass(frozen=True)
+class RelativeChange:
+    """Difference of two arms as a fraction of the reference: its 95 % interval and one-sided p-value."""
+
+    change: float
+    low: float
+    high: float
+    p: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureComparison(RelativeChange):
+    """The chosen feature set against the next best one, `reference`."""
+
+    reference: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmComparison(RelativeChange):
+    """The best arm against another one."""
+
+    best: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmFacts(SplitVariance):
+    """Variance components of an arm of phase 0, its scores by run and seed, and the components of its MAE."""
+
+    by_run: tuple[tuple[float, ...], ...]
+    mae: SplitVariance
+
+
+@dataclass(frozen=True, kw_only=True)
+class IsolationFacts:
+    """Phase 0.
+
+    Attributes:
+        arms: by backbone and feature set.
+        runs, seeds: number of runs, and of seeds for each.
+        features: the chosen feature set.
+        mean_scores: of each feature set over all backbones.
+        comparisons: of feature sets, by backbone.
+        backbones: comparisons of the best backbone with the others, both with the chosen feature set.
+        variance: of paired differences, for planning.
+    """
+
+    arms: Mapping[str, ArmFacts]
+    runs: int
+    seeds: int
+    features: str
+    mean_scores: Mapping[str, float]
+    comparisons: Mapping[str, FeatureComparison]
+    backbones: Mapping[str, ArmComparison]
+    variance: PairedVariance
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialRow:
+    """A trial of phase 1, 4 or 5.
+
+    Attributes:
+        number: from 0 in the order of asking.
+        values: of its dimensions, and of the options of its modules.
+        score: mean over runs; None if it was not trained to its end.
+        mae: the same of the mean absolute error.
+        modules: that were on; None in phase 1.
+        parameters, macs_tick: of its network; None if the values make no network.
+        statuses: how its trainings ended; phase 1 only.
+        rungs: steps and scores before the end; None without rungs.
+        pruned: whether it was ended at the last rung.
+    """
+
+    number: int
+    values: Mapping[str, Scalar]
+    score: float | None
+    mae: float | None
+    modules: tuple[str, ...] | None = field(default=None, metadata=OPTIONAL)
+    parameters: float | None = field(default=None, metadata=OPTIONAL)
+    macs_tick: float | None = field(default=None, metadata=OPTIONAL)
+    statuses: tuple[str, ...] | None = field(default=None, metadata=OPTIONAL)
+    rungs: tuple[tuple[int, float], ...] | None = field(default=None, metadata=OPTIONAL)
+    pruned: bool | None = field(default=None, metadata=OPTIONAL)
+
+    @property
+    def costs(self) -> dict[str, float]:
+        """The costs that are known, by name."""
+        costs = {"parameters": self.parameters, "macs_tick": self.macs_tick}
+        return {name: cost for name, cost in costs.items() if cost is not None}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibratedBackbone(TrialRow):
+    """The trial that the efficiency rule takes of a backbone, and all trials of the backbone."""
+
+    trials: tuple[TrialRow, ...]
+
+
+@dataclass(frozen=True)
+class FinalRound:
+    """Mean scores of the best trials of the backbones on all folds, and the lowest against the others."""
+
+    runs: int
+    scores: Mapping[str, float]
+    against: Mapping[str, ArmComparison]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationFacts:
+    """Phase 1.
+
+    Attributes:
+        backbones: by name.
+        final: of several backbones in the sound mode.
+        backbone: of the baseline; `baseline`: its values; `settings`: its experiment.
+        front: trials of each backbone that no other surpasses in score and cost; None without a cost.
+    """
+
+    backbones: Mapping[str, CalibratedBackbone]
+    final: FinalRound | None = field(default=None, metadata=OPTIONAL)
+    backbone: str
+    baseline: Mapping[str, Scalar]
+    settings: Table
+    front: Mapping[str, tuple[TrialRow, ...]] | None = field(default=None, metadata=OPTIONAL)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModuleEffect(MainEffect):
+    """Main effect of a module, and the same as a fraction of the mean score."""
+
+    change: float
+
+
+@dataclass(frozen=True)
+class ModuleGain:
+    """Lowest score of a module's trials, and the baseline's median minus that; None if no training ended well."""
+
+    best: float | None
+    gain: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScreeningFacts:
+    """Phase 2: modules that were screened, and those that go to confirmation."""
+
+    passed: tuple[str, ...]
+    registered: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SoundScreening(ScreeningFacts):
+    """Phase 2, sound: effects by module, and the largest alias between effects of the design."""
+
+    modules: Mapping[str, ModuleEffect]
+    alias: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThesisScreening(ScreeningFacts):
+    """Phase 2, thesis: gains by module."""
+
+    modules: Mapping[str, ModuleGain]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanningFacts:
+    """Phase 2.5: training runs of each arm."""
+
+    runs: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class SoundPlanning(PlanningFacts):
+    """Phase 2.5, sound: see `ConfirmationPlan`; `enough` runs reach the power, None if no number does."""
+
+    power: float
+    limit: float
+    sessions_needed: int | None
+    reason: str
+    enough: int | None
+
+    @staticmethod
+    def from_plan(plan: ConfirmationPlan, runs: int) -> SoundPlanning:
+        """Return the facts of a plan of which `runs` are made."""
+        return SoundPlanning(**{**vars(plan), "runs": runs, "enough": plan.runs})
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThesisPlanning(PlanningFacts):
+    """Phase 2.5, thesis: see `edp.stats.thesis_power.ThesisPlan`; MAE and its deviation between seeds behind it."""
+
+    splits: int
+    simulated: int | None
+    analytical: float
+    mae: float
+    sigma_seed: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConfirmationFacts:
+    """Phase 3: modules that were confirmed."""
+
+    confirmed: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SoundConfirmation(ConfirmationFacts):
+    """Phase 3, sound: evidence on every module that was screened."""
+
+    evidence: tuple[ModuleEvidence, ...]
+
+    def by_module(self) -> dict[str, ModuleEvidence]:
+        """Return the evidence by module."""
+        return {entry.module: entry for entry in self.evidence}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThesisConfirmation(ConfirmationFacts):
+    """Phase 3, thesis: evidence on every module that was tested, by metric."""
+
+    evidence: tuple[ThesisEvidence, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointFacts:
+    """What phases 4 and 5 share: the best trial, and how often each module was on.
+
+    Attributes:
+        settings: of the best trial; its `values`, `modules`, `score` and `costs`.
+        on: fraction of the trials with each module.
+        trials: all of them.
+        said_of_pruned: a sentence on trials that were ended at a rung, if any were.
+        front: numbers of the trials that no other surpasses in score and cost; None without a cost.
+    """
+
+    settings: Table
+    values: Mapping[str, Scalar]
+    modules: tuple[str, ...]
+    score: float
+    costs: Mapping[str, float]
+    on: Mapping[str, float]
+    trials: tuple[TrialRow, ...]
+    said_of_pruned: tuple[str, ...]
+    front: tuple[int, ...] | None = field(default=None, metadata=OPTIONAL)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SynthesisFacts(JointFacts):
+    """Phase 4.
+
+    Attributes:
+        test: scores of ``synthesis`` and ``baseline`` on the test sessions; None if a training did not end well.
+        test_gain: change by the winner there; None if it cannot be tested.
+        antagonistic: confirmed modules that the winner does without.
+    """
+
+    test: Mapping[str, Mapping[str, float | None]]
+    test_gain: RelativeChange | None
+    antagonistic: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExplorationFacts(JointFacts):
+    """Phase 5.
+
+    Attributes:
+        options: values that were searched, by option of a module.
+        change, low, high, p: of its winner against that of phase 4 on fresh folds (`RelativeChange`).
+        fresh: scores of both there; `runs`: how many.
+        teacher: the phase whose winner is the teacher, and its experiment.
+    """
+
+    options: Mapping[str, tuple[Scalar, ...]]
+    change: float
+    low: float
+    high: float
+    p: float
+    fresh: Mapping[str, float]
+    runs: int
+    teacher: str
+    teacher_settings: Table
+
+
+@dataclass(frozen=True, kw_only=True)
+class SmallerNetwork:
+    """A network of phase 6 in one number format; see `edp.evaluation.compression.CompressedRow`."""
+
+    name: str
+    recipe: str
+    units: int | None
+    pruned: bool
+    rounded: bool
+    format: str
+    resource_usage: ResourceUsage
+    over: Mapping[str, tuple[int, int]]
+    scores: Scores
+    before: Scores
+    error: float
+
+
+@dataclass(frozen=True)
+class ComparingSessions:
+    """Sessions that train, and those that compare networks."""
+
+    train: tuple[str, ...]
+    validation: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class SecondTest:
+    """Scores of ``teacher`` and ``chosen`` on the second test set, and the error of one divided by the other's."""
+
+    scores: Mapping[str, Scores]
+    error: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class SmallerFacts:
+    """Phase 6; see `edp.evaluation.compression.CompressionResult`. Without the phase `on` is false.
+
+    Attributes:
+        sessions: None if no network was made.
+        second: sessions of the second test set.
+    """
+
+    on: bool = True
+    budget: Budget | None = field(default=None, metadata=OPTIONAL)
+    sessions: ComparingSessions | None = field(default=None, metadata=OPTIONAL)
+    second: tuple[str, ...] = ()
+    rows: tuple[SmallerNetwork, ...] = ()
+    front: tuple[int, ...] = ()
+    chosen: int | None = None
+    notes: tuple[str, ...] = ()
+    held_out_test: SecondTest | None = None
+
+
+_COMMON: dict[str, type] = {
+    "isolation": IsolationFacts,
+    "calibration": CalibrationFacts,
+    "synthesis": SynthesisFacts,
+    "exploration": ExplorationFacts,
+    "compression": SmallerFacts,
+}
+FACTS: Mapping[str, Mapping[str, type]] = {
+    "sound": _COMMON | {"screening": SoundScreening, "planning": SoundPlanning, "confirmation": SoundConfirmation},
+    "thesis": _COMMON | {"screening": ThesisScreening, "planning": ThesisPlanning, "confirmation": ThesisConfirmation},
+}
+"""Class of the facts, by mode and phase."""
