@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError, closest
+from edp.settings.tree import Table
 from edp.signals import Channel
-from edp.storage.reading import Table
 
 FloatArray = NDArray[np.float32]
 MACHINE = "machine"

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-OPEN_DICTIONARIES = 221
+OPEN_DICTIONARIES = 129
 WIDE_FUNCTIONS = 46
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 
@@ -43,7 +43,8 @@ def test_rooms_are_few_and_imports_go_down(house):
     # 185 before workflows, and rooms with long computations below them, reported to `edp.progress`.
     # 190 before `edp.table`, which cli, workflows and report import.
     # 190 before logs, simulator and training divided their loops among workers of `edp.jobs`.
-    assert house.arrows <= 198
+    # 198 before report read the provenance of results in `edp.settings`.
+    assert house.arrows <= 199
     assert house.circles == []
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from edp.errors import ConfigError
 from edp.settings.bounds import check_bounds, integer, span
-from edp.storage.reading import Table
+from edp.settings.tree import Table
 
 Array = NDArray[np.float32]
 FEATURE_LIMIT = 6.0
