@@ -95,15 +95,10 @@ class CompressionResult:
     """Content of ``compression.json``.
 
     Attributes:
-        budget: what the controller grants.
-        task: of the teacher.
         unit: of the scores.
-        recordings: number of recordings.
-        teacher: the teacher in float32.
-        rows: all networks in all formats.
+        teacher: the teacher in float32; `rows`: all networks in all formats.
         front: indices of the rows that no other one surpasses in error, cycles and bytes of parameters.
         chosen: index of the row that fits with the smallest error; None if none fits.
-        held_out_test: scores of teacher and chosen network on recordings that took part in no choice.
         notes: what was left out, and why.
     """
 
