@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, emit, out, table
+from edp.cli.console import JsonFlag, emit, out, print_table
 from edp.storage.paths import full_path
 
 TABLES = 4
@@ -35,8 +35,7 @@ def compare(
         for remark in comparison.remarks:
             out.print(remark)
         for measure in comparison.measures[:TABLES]:
-            sheet = error_table(comparison, measure)
-            table(sheet.caption, sheet.heads(), sheet.texts())
+            print_table(error_table(comparison, measure))
         if len(comparison.measures) > TABLES:
             out.print(f"and {len(comparison.measures) - TABLES} more errors on the page")
         out.print(f"page: {full_path(page)}")

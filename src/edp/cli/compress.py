@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from edp.cli.console import JsonFlag, emit, out, table
+from edp.cli.console import JsonFlag, emit, out, print_table
 from edp.cli.options import DataOption, MapOption, RepairOption, SettingsOption, source_if_given
 from edp.cli.progress import shown_progress
 
@@ -80,11 +80,9 @@ def _tables(facts: CompressionFacts) -> None:
     from edp.report.compression import facts as words
 
     for horizon in facts.horizons:
-        sheet = words.front_table(facts, horizon)
-        marked = [("* " if row in sheet.marked else "  ") + cells[0] for row, cells in enumerate(sheet.texts())]
-        rows = [[name, *cells[2:]] for name, cells in zip(marked, sheet.texts(), strict=True)]
-        first, _, *others = sheet.heads()
-        table(f"{sheet.caption}; * on the front", [first, *others], rows)
+        table = words.front_table(facts, horizon)
+        rows = tuple((f"{'* ' if i in table.marked else '  '}{row[0]}", *row[1:]) for i, row in enumerate(table.rows))
+        print_table(replace(table, caption=f"{table.caption}; * on the front", rows=rows))
         out.print()
     out.print(words.headline(facts))
     for line in words.verdict(facts):

@@ -18,12 +18,13 @@ from typing import Annotated, Any, cast
 import typer
 from rich.console import Console, ConsoleDimensions
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TaskProgressColumn
-from rich.table import Table
+from rich.table import Table as RichTable
 from rich.text import Text
 
 from edp.cli.options import check_belonging, setting_of
 from edp.cli.process import memory_message, out_of_memory, stopped_code
 from edp.errors import ConfigError, EdpError
+from edp.table import Column, Table
 
 UNFOLDED_COLUMNS = 100_000
 """Width of output that is not a terminal."""
@@ -121,33 +122,52 @@ def emit(as_json: bool, facts: dict[str, Any], show: Callable[[], None]) -> None
         show()
 
 
-def table(title: str, headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Print a table; the first column is text, the others are aligned right.
+def print_table(table: Table) -> None:
+    """Print a table; columns of words are aligned left and folded, figures are aligned right, marked rows are bold.
 
-    Columns that do not fit beside each other stand below each other, each block with the first column.
+    Figures that do not fit beside each other stand below each other, each block with the first column.
     """
-    texts = [[_cell(cell) for cell in row] for row in rows]
-    widths = _widths(headings, texts)
-    for i, block in enumerate(_blocks(widths, out.width)):
-        printed_table = _table(title if not i else "")
+    table = table.without_empty_columns()
+    headings, rows = table.heads(), [[_shown(cell) for cell in row] for row in table.texts()]
+    widths = _widths(headings, rows)
+    has_words = any(column.is_text for column in table.columns[1:])
+    for i, block in enumerate([list(range(len(widths)))] if has_words else _blocks(widths, out.width)):
+        printed_table = RichTable(
+            title=_shown(table.caption) if table.caption and not i else None,
+            title_justify="left",
+            title_style="bold",
+            header_style="bold",
+            box=None,
+            pad_edge=False,
+        )
         for column in block:
-            first = not printed_table.columns
             # Names are folded, never cut: six rows of a table once all read CylPress... A text that is wider than what
             # the names leave stands alone beside them, and would be cut, too, if it could not go on in the next row.
             wide = len(block) == 2 and sum(widths[other] + _GAP for other in block) > out.width
+            folded = column == 0 or wide or table.columns[column].is_text
             printed_table.add_column(
-                _shown(headings[column]),
-                justify="left" if first or wide else "right",
-                overflow="fold",
-                no_wrap=not first and not wide,
+                _shown(headings[column]), justify="left" if folded else "right", overflow="fold", no_wrap=not folded
             )
-        for row in texts:
-            printed_table.add_row(*(row[column] for column in block if column < len(row)))
+        for row, cells in enumerate(rows):
+            printed_table.add_row(
+                *(cells[j] for j in block if j < len(cells)), style="bold" if row in table.marked else None
+            )
         out.print(printed_table)
 
 
-def _cell(value: Any) -> Text:
-    return _shown(f"{value:,}" if isinstance(value, int) else str(value))
+def table(title: str, headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Print rows of figures, the first column as text; see `print_table`."""
+    print_table(Table(title, tuple(Column(heading, show=_cell) for heading in headings), tuple(map(tuple, rows))))
+
+
+def listing(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print rows of text, everything to the left and folded where it is wide."""
+    columns = tuple(Column(heading, show=str, is_text=True) for heading in headings)
+    print_table(Table(title, columns, tuple(map(tuple, rows))))
+
+
+def _cell(value: Any) -> str:
+    return f"{value:,}" if isinstance(value, int) else str(value)
 
 
 def _widths(headings: Sequence[str], rows: Sequence[Sequence[Text]]) -> list[int]:
@@ -170,27 +190,6 @@ def _blocks(widths: Sequence[int], width: int) -> list[list[int]]:
         else:
             blocks[-1].append(column)
     return blocks or [list(range(len(widths)))]
-
-
-def listing(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print rows of text, everything to the left and folded where it is wide."""
-    printed_table = _table(title)
-    for heading in headings:
-        printed_table.add_column(_shown(heading), overflow="fold")
-    for row in rows:
-        printed_table.add_row(*map(_shown, row))
-    out.print(printed_table)
-
-
-def _table(title: str) -> Table:
-    return Table(
-        title=_shown(title) if title else None,
-        title_justify="left",
-        title_style="bold",
-        header_style="bold",
-        box=None,
-        pad_edge=False,
-    )
 
 
 class Words(ProgressColumn):

@@ -10,7 +10,7 @@ import typer
 
 from edp.cli.consent import ask_for_fmus
 from edp.cli.console import JsonFlag, emit, out, table
-from edp.cli.options import MOST_LOOPS
+from edp.cli.options import MOST_LOOPS, ClusterOption, OpenOption, WorkersOption, workers_of
 from edp.cli.progress import shown_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.storage.paths import full_path
@@ -55,6 +55,9 @@ def control(
     config: ConfigOption = None,
     changes: ChangesOption = [],  # noqa: B006
     yes: YesOption = False,
+    workers: WorkersOption = 1,
+    cluster: ClusterOption = "",
+    open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Run a controller in closed loop; write scores, recordings and a page with paths, errors and levers.
@@ -75,7 +78,9 @@ def control(
         guard = monitor_guard(monitor)
     experiment = load_control_experiment(config, changes, _options(task, machine, controller, seeds))
     with shown_progress("control", as_json, "loops run") as progress:
-        run = control_loops(experiment, folder, ControlSources(plant, twin, predictor, trusted=True), progress, guard)
+        sources = ControlSources(plant, twin, predictor, trusted=True)
+        divided = workers_of(workers, cluster, open_cluster)
+        run = control_loops(experiment, folder, sources, progress, guard, divided)
 
     def show() -> None:
         out.print(run.content["sentence"])
@@ -103,6 +108,9 @@ def tune(
     config: ConfigOption = None,
     changes: ChangesOption = [],  # noqa: B006
     yes: YesOption = False,
+    workers: WorkersOption = 1,
+    cluster: ClusterOption = "",
+    open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Tune a controller's gains on the simulator (with --on: on a twin or FMU) and evaluate them on the plant.
@@ -120,7 +128,8 @@ def tune(
     experiment = load_control_experiment(config, changes, _options(task, machine, controller, seeds))
     with shown_progress("tune", as_json, "trials run") as progress:
         tuned_on, judged_on = (ControlSources(where, twin, predictor, trusted=True) for where in (on, plant))
-        tuning = tune_gains(experiment, folder, tuned_on, judged_on, TuningSpec(trials=trials, loops=loops), progress)
+        tuning_spec, divided = TuningSpec(trials=trials, loops=loops), workers_of(workers, cluster, open_cluster)
+        tuning = tune_gains(experiment, folder, tuned_on, judged_on, tuning_spec, progress, divided)
     judged = tuning.content["judged_mm"]
     verdict = tuning_verdict(judged)
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from edp.cli.console import JsonFlag, emit, out, table
+from edp.cli.console import JsonFlag, emit, out, print_table, table
 from edp.cli.options import (
     ClusterOption,
     MapOption,
@@ -149,8 +149,8 @@ def _tables(facts: Transfer) -> None:
     from edp.report.transfer import facts as words
 
     for horizon in facts.horizons:
-        for sheet in words.transfer_tables(facts, horizon):
-            table(sheet.caption, sheet.heads(), sheet.texts())
+        for one in words.transfer_tables(facts, horizon):
+            print_table(one)
             out.print()
     out.print(words.headline(facts))
     for line in words.verdict(facts):

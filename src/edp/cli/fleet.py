@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from edp.cli.console import JsonFlag, emit, out, table
+from edp.cli.console import JsonFlag, emit, out, print_table
 from edp.cli.options import ClusterOption, OpenOption, WorkersOption, workers_of
 from edp.cli.progress import shown_progress
 from edp.storage.paths import full_path
@@ -47,8 +47,8 @@ def report(
     page = full_path(folder / PAGE)
 
     def show() -> None:
-        for sheet in (worst_table(facts), machine_table(facts)) if facts.rows else ():
-            table(sheet.caption, sheet.heads(), sheet.texts())
+        for table in (worst_table(facts), machine_table(facts)) if facts.rows else ():
+            print_table(table)
             out.print()
         for name, why in facts.failed:
             out.print(f"'{name}' could not be judged: {why}")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, emit, err, out, table
+from edp.cli.console import JsonFlag, emit, err, out, print_table, table
 from edp.cli.options import ClusterOption, LogsArgument, MapOption, OpenOption, WorkersOption, workers_of
 from edp.cli.progress import shown_progress
 from edp.cli.quality import AtMostOption, show_between, show_lines, show_report, verdict_text
@@ -152,7 +152,7 @@ def _coverage(source: DataSource, split: str, inputs: tuple[str, ...], asked: bo
 
 def show_coverage(coverage: Coverage, whole: bool = True) -> None:
     """Print the coverage of a data set; only figures with a target unless `whole`."""
-    from edp.data.coverage_targets import wanted
+    from edp.report.coverage.page import activity_table, events_table, joints_table, together_table, wanted_table
 
     rows: list[tuple[Any, ...]] = []
     if coverage.singular:
@@ -183,20 +183,13 @@ def show_coverage(coverage: Coverage, whole: bool = True) -> None:
         rows,
     )
     out.print()
-    judged = [
-        (
-            w.name,
-            f"{figure(w.value, 3)} {w.unit}",
-            f"{'>=' if w.at_least else '<='} {figure(w.bound)} {w.unit}",
-            _verdict(w.met),
-        )
-        for w in wanted(coverage)
-    ]
-    if judged:
-        table("wanted of data to learn a machine from", ["", "here", "wanted", "verdict"], judged)
-        out.print()
+    tables = [wanted_table(coverage)]
     if whole:
-        _show_all_coverage(coverage)
+        tables += [make(coverage) for make in (activity_table, together_table, events_table, joints_table)]
+    for one in tables:
+        if one.rows:
+            print_table(one)
+            out.print()
     for warning in coverage.contradictions:
         out.print(f"  warning: {warning}")
     for note in coverage.absent:
@@ -204,36 +197,5 @@ def show_coverage(coverage: Coverage, whole: bool = True) -> None:
     out.print()
 
 
-def _show_all_coverage(coverage: Coverage) -> None:
-    """Print commands, events and joint histograms."""
-    moves = [(a.axis, *(_count(v) for v in (a.reversals, a.crossings)), _share(a.active)) for a in coverage.activity]
-    together = [(name, _share(share)) for name, share in coverage.together.items()]
-    # Where nothing is counted, a table of what could be would tell nothing of this log.
-    counts = coverage.events if any(e.count is not None for e in coverage.events) or moves else ()
-    counted = [(e.name, _count(e.count), _share(e.share), e.note) for e in counts]
-    pairs = [
-        (f"{j.group}: {j.x}", j.y, _share(j.filled), number(j.correlation, 2), number(j.information, 2))
-        for j in coverage.joints
-    ]
-    tables: list[tuple[str, list[str], Any]] = [
-        ("commands", ["axis", "reversals", "dead-band crossings", "time active"], moves),
-        ("in use at once", ["", "time"], together),
-        ("events", ["", "count", "time", "note"], counted),
-        ("joint histograms", ["", "with", "bins filled", "correlation", "mutual information, nat"], pairs),
-    ]
-    for title, headings, rows in tables:
-        if rows:
-            table(title, headings, rows)
-            out.print()
-
-
-def _verdict(met: bool) -> str:
-    return "met" if met else "not met"
-
-
 def _share(value: float | None) -> str:
     return "-" if value is None else percent(value)
-
-
-def _count(value: int | None) -> str:
-    return "-" if value is None else f"{value:,}"

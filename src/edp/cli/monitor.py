@@ -158,6 +158,9 @@ def run(
     mdf: Annotated[
         Path | None, typer.Option("--mdf", help="Folder for the logs as MDF 4, with the alarms as events.")
     ] = None,
+    workers: WorkersOption = 1,
+    cluster: ClusterOption = "",
+    open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Watch logs: every alarm with when, since when, and what deviates; exit code 5 where there was one.
@@ -169,8 +172,9 @@ def run(
     """
     from edp.workflows.monitor import run_monitor
 
+    divided = workers_of(workers, cluster, open_cluster)
     with shown_progress("monitor", as_json, "recordings watched") as progress:
-        watched = run_monitor(folder, source_of(logs, signal_map, repair), target, progress)
+        watched = run_monitor(folder, source_of(logs, signal_map, repair), target, progress, divided)
 
     if mdf is not None:
         from edp.workflows.monitor.event_files import write_event_files

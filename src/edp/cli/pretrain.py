@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, emit, out, table
+from edp.cli.console import JsonFlag, emit, out, print_table
 from edp.cli.options import (
     ClusterOption,
     LogsArgument,
@@ -77,6 +77,6 @@ def _tables(result: dict[str, Any]) -> None:
     """Machines of each part, and the errors on those that test."""
     from edp.report.run.sheets import contexts_table, parts_table
 
-    for sheet in (parts_table(result), contexts_table(result)):
-        table(sheet.caption, sheet.heads(), sheet.texts())
+    for table in (parts_table(result), contexts_table(result)):
+        print_table(table)
         out.print()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, count_text, emit, left_text, listing, out, progress, table
+from edp.cli.console import JsonFlag, Steps, count_text, emit, left_text, out, print_table, progress
 from edp.cli.options import (
     TRIAL_TABLES,
     ClusterOption,
@@ -27,7 +27,7 @@ from edp.cli.options import (
 from edp.cli.progress import Display, StageDisplay
 from edp.cli.quality import AtMostOption, show_between, verdict_text
 from edp.errors import count_of
-from edp.wording import figure, number, percent
+from edp.wording import figure, percent
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bars
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from edp.config.experiment import FeatureSettings
     from edp.jobs import Workers
     from edp.settings.tree import Change
+    from edp.table import Table
     from edp.training import TrainingProgress
     from edp.workflows.feature_selection.select import Selection, SelectionOrder
 
@@ -175,23 +176,15 @@ class ScreeningDisplay:
 
 def show_selection(selection: Selection) -> None:
     """Print the proposal, the flags and where everything is."""
-    screening = selection.screening
-    rows = [(c.channel, number(c.score, 2), c.reason) for c in screening.proposal.choices if c.keep]
-    listing(
-        f"keep: {len(rows)} of {count_of(len(screening.channels), 'channel')}",
-        ["channel", "score", "why"],
-        rows[:SHOWN],
-    )
-    if len(rows) > SHOWN:
-        out.print(f"  ... and {len(rows) - SHOWN} more in {selection.files['page']}")
+    from edp.report.screening import tables
+
+    screening, page = selection.screening, selection.files["page"]
+    kept, flags = tables.kept_table(screening), tables.flags_table(screening)
+    _print_first(kept, f"keep: {len(kept.rows)} of {count_of(len(screening.channels), 'channel')}", SHOWN, page)
+    if flags.rows:
+        _print_first(flags, f"flags: {len(flags.rows)}", SHOWN_FLAGS, page)
+    print_table(tables.ranges_table(screening))
     out.print()
-    if screening.flags:
-        flags = [(flag.channel, str(flag.kind), flag.evidence) for flag in screening.flags]
-        listing(f"flags: {len(flags)}", ["channel", "what", "evidence"], flags[:SHOWN_FLAGS])
-        if len(flags) > SHOWN_FLAGS:
-            out.print(f"  ... and {len(flags) - SHOWN_FLAGS} more in {selection.files['page']}")
-        out.print()
-    _show_lags(selection)
     window = screening.proposal.window
     out.print(
         f"memory: W = {window} samples ({figure(1e3 * window / screening.rate_hz)} ms): "
@@ -200,34 +193,20 @@ def show_selection(selection: Selection) -> None:
     for note in (*screening.proposal.notes, *selection.notes):
         out.print(f"note: {note}")
     if selection.trials is not None:
-        _show_trials(selection)
-    out.print(f"page: {selection.files['page']}")
+        out.print()
+        print_table(tables.trials_table(selection.trials.to_json()))
+        for note in selection.trials.notes:
+            out.print(f"note: {note}")
+        out.print()
+    out.print(f"page: {page}")
     out.print(f"feature sets: {selection.files['sets']}")
 
 
-def _show_lags(selection: Selection) -> None:
-    from edp.report.screening.views import lag_ranges
-
-    rows = [
-        (row.group, "-" if row.low is None else f"{row.low} to {row.high}", f"{row.certain} of {row.curves}")
-        for row in lag_ranges(selection.screening)
-    ]
-    table("best lags, samples; negative: the channel leads", ["kind of signal", "range", "certain"], rows)
-    out.print()
-
-
-def _show_trials(selection: Selection) -> None:
-    trials = selection.trials
-    if trials is None:
-        return
-    ahead = list(trials.persistence)
-    rows = [(t.name, len(t.channels), t.parameters, *(number(t.error[h], 3) for h in ahead)) for t in trials.trials]
-    rows.append(("persistence", "-", "-", *(number(trials.persistence[h], 3) for h in ahead)))
-    headings = ["feature set", "channels", "parameters", *(f"MAE {h} ahead, {trials.unit}" for h in ahead)]
-    out.print()
-    table("held-out error of one network on each set", headings, rows)
-    for note in trials.notes:
-        out.print(f"note: {note}")
+def _print_first(table: Table, caption: str, most: int, page: Path) -> None:
+    """Print the first rows of a table, and where the others are."""
+    print_table(replace(table, caption=caption, rows=table.rows[:most]))
+    if len(table.rows) > most:
+        out.print(f"  ... and {len(table.rows) - most} more in {page}")
     out.print()
 
 

@@ -54,25 +54,18 @@ def fitted(healthy, tmp_path_factory):
     return folder
 
 
-def test_fit_says_what_is_watched_and_what_is_promised(edp, healthy, tmp_path):
+def test_fit_says_what_is_watched_and_promised_and_two_workers_give_the_same_monitor(edp, healthy, fitted, tmp_path):
     folder = tmp_path / "monitor"
-    options = ("--hours-per-false-alarm", 0.06, "--minutes", 0.05, "--json")
+    options = ("--hours-per-false-alarm", 0.06, "--minutes", 0.05, "--workers", 2, "--json")
     ended = edp("monitor", "fit", healthy, "--out", folder, *options)
     assert ended.code == 0, ended.err
     facts = ended.json
+    assert facts["workers"] == 2
     assert (folder / "monitor.json").is_file()
     assert (folder / "config.toml").is_file()
     assert "virtual:CylVels_1" in facts["residuals"]
     assert "asked for one in 0.06 h" in facts["promise"]
     assert facts["doubtful"] == []
-
-
-def test_processes_side_by_side_give_the_same_monitor(edp, healthy, fitted, tmp_path):
-    folder = tmp_path / "monitor"
-    options = ("--hours-per-false-alarm", 0.06, "--minutes", 0.05, "--workers", 2, "--json")
-    ended = edp("monitor", "fit", healthy, "--out", folder, *options)
-    assert ended.code == 0, ended.err
-    assert ended.json["workers"] == 2
     one, two = load_monitor(fitted), load_monitor(folder)
     assert one.limit == two.limit
     for before, after in zip(one.chain.watches, two.chain.watches, strict=True):

@@ -126,7 +126,7 @@ def test_screen_tries_the_sets_and_draws(edp, logs, tmp_path, monkeypatch):
     assert lines[0] == "trials: proposed, training 1 of 5, 0.0 %"
     assert any(line.startswith("trials: random 1, training 5 of 5, epoch 1/1, 100 %") for line in lines)
     assert not [line for line in lines if line.endswith(" 0.0 %, 0 s left")]
-    assert "MAE 10 ahead, mm/s" in first.out
+    assert "MAE, 10 ahead [mm/s]" in first.out
     table = [
         line.split()[0] for line in first.out.splitlines() if line.startswith(("proposed ", "mine ", "persistence "))
     ]

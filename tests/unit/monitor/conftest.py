@@ -8,7 +8,7 @@ from edp.workflows.monitor import FittedMonitor, fit_to_recordings
 
 TICKS = 3000
 SESSIONS = 24
-EXPERIMENT = load_monitor_experiment(None, (), {"hours_per_false_alarm": 0.11, "minutes": 0.1})
+EXPERIMENT = load_monitor_experiment(None, (), {"hours_per_false_alarm": 0.11, "minutes": 0.05})
 
 
 @pytest.fixture(scope="session")

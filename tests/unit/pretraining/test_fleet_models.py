@@ -11,7 +11,7 @@ from edp.errors import BundleError, ConfigError, DataError, EdpError, StorageErr
 from edp.jobs import Workers
 from edp.logs.source import DataSource
 from edp.report.fleet.facts import fleet_facts, headline, machine_table, verdict, worst_table
-from edp.report.fleet.page import render
+from edp.report.fleet.page import build_fleet_page
 from edp.storage import write_json
 from edp.training import load_bundle
 from edp.training.bundle import weights_digest
@@ -174,7 +174,7 @@ def test_reasons_are_what_departs_from_the_fleet(content):
     assert "1 of 12 machines drift" in verdict(facts)[0]
     assert len(worst_table(facts).rows) == 10
     assert machine_table(facts).marked
-    page = render(facts)
+    page = build_fleet_page(facts).html()
     assert "<b>m4</b>" not in page
     assert "too short" in page
 
@@ -183,7 +183,7 @@ def test_a_fleet_of_which_no_machine_could_be_judged_has_a_page(content):
     content["machines"] = [{"machine": "m", "minutes": 1.0, "failed": "too short"}]
     facts = fleet_facts(content, "fleet")
     assert headline(facts) == "None of 1 machines could be judged."
-    assert "too short" in render(facts)
+    assert "too short" in build_fleet_page(facts).html()
 
 
 def test_drift_is_told_from_chance():

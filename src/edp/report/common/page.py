@@ -72,14 +72,14 @@ class Fold:
 
 
 @dataclass(frozen=True)
-class Block:
+class Subsection:
     """Parts of a section that belong together, under a heading of their own if `title` is not empty."""
 
     parts: Sequence[Part | None]
     title: str = ""
 
 
-Part = str | Markup | Paragraph | Points | Terms | Fold | Block | Table | Chart
+Part = str | Markup | Paragraph | Points | Terms | Fold | Subsection | Table | Chart
 """Plain text explains what follows, `Markup` is HTML of its own."""
 
 
@@ -164,7 +164,7 @@ class Page:
 
 def has_content(part: Part | Section | None) -> bool:
     """Return whether a part of a page shows more than an explanation of what follows."""
-    if isinstance(part, Section | Fold | Block):
+    if isinstance(part, Section | Fold | Subsection):
         return any(map(has_content, part.parts))
     if isinstance(part, Table | Terms):
         return bool(part.rows)
@@ -177,10 +177,10 @@ def _shown(parts: Sequence[Part | None]) -> list[Part]:
     return [part for part in parts if part is not None and (isinstance(part, str | Paragraph) or has_content(part))]
 
 
-def _parts_within(part: Section | Fold | Block) -> Iterator[Part]:
+def _parts_within(part: Section | Fold | Subsection) -> Iterator[Part]:
     """Yield all parts, those of folds and groups, too."""
     for inner in part.parts:
-        if isinstance(inner, Fold | Block):
+        if isinstance(inner, Fold | Subsection):
             yield from _parts_within(inner)
         elif inner is not None:
             yield inner

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from edp.errors import count_of
-from edp.report.common.page import Block, Fold, Page, Section
+from edp.report.common.page import Fold, Page, Section, Subsection
 from edp.report.compare.charts import compare_charts
 from edp.report.compare.paired import Comparison
 from edp.report.compare.runs import Measure
@@ -74,7 +74,7 @@ def build_compare_page(comparison: Comparison, title: str = "") -> Page:
                 "models",
                 "Size and cost",
                 [
-                    Block(
+                    Subsection(
                         [
                             "Below and to the left is better: less error with less work. Cycles are estimates for the "
                             "budget's core.",

@@ -9,7 +9,7 @@ from edp.data.coverage_targets import BEYOND, OCCUPANCY, wanted
 from edp.data.spectrum import FLAT_DB
 from edp.errors import count_of
 from edp.logs import DataQuality
-from edp.report.common.page import Block, Fold, Page, Paragraph, Part, Points, Section
+from edp.report.common.page import Fold, Page, Paragraph, Part, Points, Section, Subsection
 from edp.report.coverage.charts import coverage_charts
 from edp.report.coverage.quality import quality_section
 from edp.table import Column, Table
@@ -39,7 +39,7 @@ def build_coverage_page(coverage: Coverage, title: str, quality: DataQuality | N
     charts = {chart.name: chart for chart in coverage_charts(coverage)}
     constant = f"Constant, and left out: {', '.join(coverage.constant)}."
     commands: list[Part | None] = [
-        Block(
+        Subsection(
             [
                 "Power spectral density of each command; what lies far below the shaded band is hardly ever asked for, "
                 "so a model cannot learn the answer to it.",
@@ -47,7 +47,7 @@ def build_coverage_page(coverage: Coverage, title: str, quality: DataQuality | N
             ],
             "Spectrum",
         ),
-        Block(
+        Subsection(
             [
                 "Smallest singular value of the Hankel matrix of the inputs, each brought to deviation 1: the weakest "
                 "direction in which the last so many samples of all inputs differ. At zero, models that differ in that "
@@ -83,7 +83,7 @@ def build_coverage_page(coverage: Coverage, title: str, quality: DataQuality | N
                     "Share of the samples in each bin, on a logarithmic scale; a model is at home where there is "
                     "colour. Pearson's correlation and the mutual information at the same instant stand above each "
                     "map.",
-                    *(Block([charts.get(name)], heading) for name, heading in JOINTS.items()),
+                    *(Subsection([charts.get(name)], heading) for name, heading in JOINTS.items()),
                     Fold("The same in figures", [joints_table(coverage)]),
                 ],
             ),

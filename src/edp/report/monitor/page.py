@@ -10,7 +10,7 @@ from markupsafe import Markup
 from edp.errors import count_of
 from edp.monitor.alarms import episodes
 from edp.monitor.diagnosis.sentences import clock
-from edp.report.common.page import Block, Page, Paragraph, Part, Section
+from edp.report.common.page import Page, Paragraph, Part, Section, Subsection
 from edp.report.common.templates import template
 from edp.report.monitor import facts as words
 from edp.report.monitor.drawing import LEVEL_TEXTS, MARKS, SHADES_OF_LEVELS, evidence, overview, timeline
@@ -63,10 +63,10 @@ def _time_lines(facts: MonitorFacts) -> list[Part]:
     return [
         "Each detector's statistic over its limit, alarms from their estimated onset to the moment they were raised, "
         "and below them the level of each group of residuals.",
-        *(Block([_html("draw", timeline(trace, facts))], trace.name) for trace in shown),
+        *(Subsection([_html("draw", timeline(trace, facts))], trace.name) for trace in shown),
         *([f"In the overview only: {count_of(left_out, 'more recording')} with alarms."] if left_out > 0 else []),
         _html("legend", list(zip(LEVEL_TEXTS, SHADES_OF_LEVELS, strict=True))),
-        Block(
+        Subsection(
             [
                 "A row a recording; darker where a statistic comes near its limit, marks where an alarm was raised.",
                 _html("draw", overview(facts)),

@@ -8,7 +8,7 @@ from pathlib import Path
 from markupsafe import Markup
 
 from edp.report.common.chart import Chart
-from edp.report.common.page import Block, Fold, Page, Paragraph, Part, Section, Terms
+from edp.report.common.page import Fold, Page, Paragraph, Part, Section, Subsection, Terms
 from edp.report.common.provenance import provenance_rows
 from edp.report.run import facts as run
 from edp.report.run import tables
@@ -116,7 +116,7 @@ def build_run_page(facts: run.Facts, title: str | None = None) -> Page:
                         "Residuals can be drawn once scores.json says what the horizons and outputs of the predictions "
                         "are.",
                     ),
-                    Block(
+                    Subsection(
                         [
                             "Correlation of the network's residuals with themselves some samples earlier. Up to the "
                             "horizon residuals overlap and must correlate; what stays outside the dashed bounds beyond "
@@ -215,14 +215,14 @@ def _errors(facts: run.Facts, charts: Mapping[str, Chart]) -> list[Part | None]:
     )
     horizon, worst = run.main_horizon(facts), tables.worst_recordings_table(facts)
     return [
-        Block(
+        Subsection(
             [
                 f"{how}the gap to the baselines is what the network adds.",
                 charts.get("horizon") or _missing(facts, "scores.json", "scores.json holds no errors by horizon."),
             ],
             "By horizon",
         ),
-        Block(
+        Subsection(
             [
                 "Error while the machine moves slowly or fast; the grey bars say how much of the test data each band "
                 "holds.",
@@ -230,7 +230,7 @@ def _errors(facts: run.Facts, charts: Mapping[str, Chart]) -> list[Part | None]:
             ],
             "By speed",
         ),
-        Block(
+        Subsection(
             [
                 "What the axis did, told from measured channels; but for the last a tick may stand in several rows. "
                 "Shares are means over the axes.",
@@ -238,7 +238,7 @@ def _errors(facts: run.Facts, charts: Mapping[str, Chart]) -> list[Part | None]:
             ],
             "By situation",
         ),
-        Block(
+        Subsection(
             [
                 " ".join(filter(None, (by_recording, run.spread_text(facts)))),
                 charts.get("recordings") or _missing(facts, "scores.json", "scores.json holds no errors by recording."),
@@ -262,7 +262,7 @@ def _footprint(facts: run.Facts) -> list[Part | None]:
     return [
         Paragraph(Markup("What one prediction costs on a controller{}{}.").format(", " if budget else "; ", against)),
         checks,
-        Block([Terms(rows, in_columns=True)], "Size and work"),
+        Subsection([Terms(rows, in_columns=True)], "Size and work"),
         Fold("Parameters and work by part", [tables.part_table(facts)]),
         _missing(facts, "footprint.json", "footprint.json is empty.") if missing else None,
     ]

@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from edp.errors import count_of
 from edp.logs import DataQuality
-from edp.report.common.page import Block, Fold, Page, Paragraph, Section, Terms
+from edp.report.common.page import Fold, Page, Paragraph, Section, Subsection, Terms
 from edp.report.common.picture import write_pictures
 from edp.report.coverage.quality import quality_section
 from edp.report.screening import tables
@@ -121,7 +121,7 @@ def build_screening_page(
                     "collinear channels is shuffled together, as a share of the target's variance, with its 95 % "
                     "interval.",
                     charts.get("importance"),
-                    Block(
+                    Subsection(
                         [
                             "Share of the remaining squared error that the channel's past takes away from a linear "
                             "prediction which has the pasts of all other usable channels, on held-out stretches, with "

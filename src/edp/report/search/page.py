@@ -8,7 +8,7 @@ from pathlib import Path
 
 from edp.evaluation.study import StudyFile
 from edp.report.common.chart import Chart
-from edp.report.common.page import Block, Fold, Page, Paragraph, Part, Points, Section, Terms
+from edp.report.common.page import Fold, Page, Paragraph, Part, Points, Section, Subsection, Terms
 from edp.report.common.picture import write_pictures
 from edp.report.search import words
 from edp.report.search.charts import study_charts
@@ -171,8 +171,8 @@ def build_study_page(study: StudyFile, tables: Mapping[str, Table]) -> Page:
                 [
                     missing("synthesis", "exploration", "compression"),
                     get("holdout"),
-                    Block([COMPRESSION, get("compression")], "For the controller"),
-                    Block(
+                    Subsection([COMPRESSION, get("compression")], "For the controller"),
+                    Subsection(
                         [
                             "How often a sampler turned a module on says what it tried, not what helps: effects are "
                             "above.",
@@ -213,9 +213,9 @@ def build_study_page(study: StudyFile, tables: Mapping[str, Table]) -> Page:
     )
 
 
-def _figure(charts: Mapping[str, Chart], name: str, text: str, title: str = "") -> Block | None:
+def _figure(charts: Mapping[str, Chart], name: str, text: str, title: str = "") -> Subsection | None:
     """Return a figure with its explanation; None if there are no data for it."""
-    return Block([text, charts[name]], title) if name in charts else None
+    return Subsection([text, charts[name]], title) if name in charts else None
 
 
 def _sentences(lines: Sequence[str]) -> str | Points:

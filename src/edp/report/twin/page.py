@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from edp.report.common.page import Block, Page, Section
+from edp.report.common.page import Page, Section, Subsection
 from edp.report.common.provenance import provenance_rows
 from edp.report.twin import facts as words
 from edp.report.twin.charts import twin_charts
@@ -48,7 +48,7 @@ def build_twin_page(facts: FreeRunFacts, title: str | None = None) -> Page:
                 [
                     "Measured up to the left edge, on the commands alone from there on. The band is the interval of "
                     "each answer, calibrated on free runs that the fit had not seen; it grows with the horizon.",
-                    *(Block([chart(f"runs_{part}")], part.capitalize()) for part in words.PARTS),
+                    *(Subsection([chart(f"runs_{part}")], part.capitalize()) for part in words.PARTS),
                 ],
             ),
             Section(

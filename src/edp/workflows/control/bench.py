@@ -20,8 +20,12 @@ from edp.control.plants import plant_of, twin_of
 from edp.control.tasks import draw_task
 from edp.control.valve_map import RUN_S, ValveMap, check_levers, measure_valve_map
 from edp.errors import ConfigError
+from edp.jobs import IN_PROCESS, Workers
+from edp.jobs.packing import pack, unpack
+from edp.jobs.workers import WorkUnit
 from edp.progress import SILENT, Progress
 from edp.storage.headers import model_digest
+from edp.storage.ledger import TrainingIdentity, WithState
 from edp.storage.paths import is_folder_at
 from edp.training.bundle import load_bundle
 from edp.wording import setting_text, typed
@@ -80,7 +84,7 @@ class ControlBench:
         options: Mapping[str, Any] | None = None,
     ) -> None:
         _check_used(experiment, sources)
-        self.experiment, self._options = experiment, options
+        self.experiment, self.sources, self._options = experiment, sources, options
         rate = experiment.rate_hz
         probe = plant_of(experiment.machine, RUN_S + 1.0, rate, sources.plant, sources.trusted)
         geometry = interface_of(probe).geometry
@@ -106,26 +110,57 @@ class ControlBench:
         spec: ControllerSpec | None = None,
         progress: Progress = SILENT,
         guard: LoopGuard | None = None,
+        divided: DividedLoops | None = None,
     ) -> list[LoopResult]:
-        """Every loop with a controller; that of the experiment by default.
+        """Run every loop with a controller; that of the experiment by default.
 
         Args:
             spec: of the controller.
             progress: receiver of the progress; its units are loops.
             guard: of every loop; begins anew with each.
+            divided: who runs the loops, and where results are kept; this process keeps none by default.
 
         Raises:
             ConfigError: plant and controller, or plant and guard, do not fit.
         """
-        chosen = spec or self.experiment.controller
-        results, loops = [], progress.stage("loop", len(self.tasks))
-        for number, task in enumerate(self.tasks):
-            loops.note(f"{task.name} {task.seed}")
-            controller = chosen.build(self.plant, task.limits, self.models)
-            late = 1e-3 * self.experiment.deadline_ms
-            results.append(run_loop(self._env, controller, task, task.seed, self._options, guard, late))
-            loops.step(number + 1)
-        return results
+        shared = divided or DividedLoops()
+        units = self._units(spec or self.experiment.controller, guard, "run_loop_unit", shared)
+        loops = progress.stage("loop", len(units))
+        results = shared.workers.map_in_order(units, loops, shared.folder)
+        return [unpack(result.content or b"", LoopResult) for result in results]
+
+    def run(self, number: int, spec: ControllerSpec, guard: LoopGuard | None = None) -> LoopResult:
+        """Run one loop.
+
+        Args:
+            number: of the task.
+            spec: of the controller.
+            guard: of the loop.
+
+        Raises:
+            ConfigError: see `results`.
+        """
+        task = self.tasks[number]
+        controller = spec.build(self.plant, task.limits, self.models)
+        late = 1e-3 * self.experiment.deadline_ms
+        return run_loop(self._env, controller, task, task.seed, self._options, guard, late)
+
+    def _units(
+        self, spec: ControllerSpec, guard: LoopGuard | None, function: str, divided: DividedLoops
+    ) -> list[WorkUnit]:
+        where: dict[str, Any] = {"spec": spec, "guard": guard}
+        if divided.workers.are_alone:
+            where["bench"] = self
+        else:
+            where["parts"] = (self.experiment, self.sources, self.models, self._options)
+        arguments = {"run": divided.key, "controller": repr(spec)}
+        return [
+            WorkUnit(
+                f"{__name__}:{function}", f"{task.name} {task.seed}", {**arguments, "task": number}, divided.key,
+                {**where, "task": number},
+            )
+            for number, task in enumerate(self.tasks)
+        ]  # fmt: skip
 
     def check(self) -> None:
         """Build the controller of the experiment and hold its limits to references and plant, for a refusal only.
@@ -152,14 +187,57 @@ class ControlBench:
         if np.isfinite(measured).all():
             controller.check(measured)
 
-    def cost(self, spec: ControllerSpec) -> float:
-        """Position error of the tip, rms, mean over the loops, mm."""
-        return float(np.mean(list(self.costs(spec).values())))
+    def cost(self, spec: ControllerSpec, divided: DividedLoops | None = None) -> float:
+        """Return the position error of the tip, rms, mean over the loops, mm."""
+        return float(np.mean(list(self.costs(spec, divided).values())))
 
-    def costs(self, spec: ControllerSpec) -> dict[str, float]:
+    def costs(self, spec: ControllerSpec, divided: DividedLoops | None = None) -> dict[str, float]:
         """Return the position error of the tip, rms, mm, of each reference by its name."""
-        errors = [result.score.position_rms_mm for result in self.results(spec)]
-        return {f"{task.name} {task.seed}": float(error) for task, error in zip(self.tasks, errors, strict=True)}
+        shared = divided or DividedLoops()
+        units = self._units(spec, None, "find_cost_unit", shared)
+        results = shared.workers.map_in_order(units, folder=shared.folder)
+        return {unit.label: float(result.values["cost_mm"]) for unit, result in zip(units, results, strict=True)}
+
+
+@dataclass(frozen=True)
+class DividedLoops:
+    """Who runs the loops of a run.
+
+    Attributes:
+        workers: who runs them; nodes see plants and models under the same paths.
+        folder: of the results of loops; None keeps none.
+        key: of the run, with the bench among several.
+    """
+
+    workers: Workers = IN_PROCESS
+    folder: Path | None = None
+    key: str = ""
+
+
+def run_loop_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState:
+    """Run the loop of a unit."""
+    return WithState({}, pack(_bench(identity.data, where).run(where["task"], where["spec"], where["guard"])))
+
+
+def find_cost_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str, str]:
+    """Return the position error of the loop of a unit."""
+    result = _bench(identity.data, where).run(where["task"], where["spec"])
+    # As text: plain values of a unit are finite.
+    return {"cost_mm": repr(float(result.score.position_rms_mm))}
+
+
+_benches: dict[str, ControlBench] = {}
+"""Bench of the last units of this process, by its key: plants and models take seconds to load."""
+
+
+def _bench(key: str, where: Mapping[str, Any]) -> ControlBench:
+    if "bench" in where:
+        bench: ControlBench = where["bench"]
+        return bench
+    if key not in _benches:
+        _benches.clear()
+        _benches[key] = ControlBench(*where["parts"])
+    return _benches[key]
 
 
 def _check_used(experiment: ControlExperiment, sources: ControlSources) -> None:

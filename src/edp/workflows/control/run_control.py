@@ -16,6 +16,8 @@ from edp.control.controllers import CONTROLLERS
 from edp.control.guard import LoopGuard
 from edp.control.loop import LoopResult
 from edp.control.tasks import TASKS, ControlTask
+from edp.jobs import IN_PROCESS, Workers
+from edp.jobs.workers import UNITS, forget_units
 from edp.logs import write_recording
 from edp.progress import SILENT, Progress
 from edp.report import ControlFacts, build_control_page
@@ -24,7 +26,7 @@ from edp.report.common.provenance import provenance_rows
 from edp.storage import make_folder, write_json
 from edp.storage.provenance import PROVENANCE, new_provenance
 from edp.storage.runs import Run, check_claimable, check_free, run_key
-from edp.workflows.control.bench import ControlBench, ControlSources
+from edp.workflows.control.bench import ControlBench, ControlSources, DividedLoops
 from edp.workflows.control.kept import keep_controller
 
 RESULTS, PAGE, LOOPS = "results.json", "control.html", "loops"
@@ -51,6 +53,7 @@ def control_loops(
     sources: ControlSources | None = None,
     progress: Progress = SILENT,
     guard: LoopGuard | None = None,
+    workers: Workers = IN_PROCESS,
 ) -> ControlRun:
     """Run loops and write a run folder: ``results.json``, ``loops/NAME.parquet``, ``control.html``, ``controller``.
 
@@ -60,6 +63,8 @@ def control_loops(
         sources: models and plant.
         progress: receiver of the progress; its units are loops.
         guard: what the controller may rely on, such as a monitor.
+        workers: who runs the loops; nodes see models and run folder under the same paths. A stopped call continues
+            after the loops that are done.
 
     Raises:
         EdpError: settings, models, guard or folder cannot be used.
@@ -75,7 +80,8 @@ def control_loops(
     models = {"sources": chosen.digests(), "guard": None if guard is None else repr(guard)}
     key = run_key(CONTROL_SETTINGS.plain(experiment) | models, "")
     with Run.create(out, "control", key, control_toml(experiment)) as run:
-        results = bench.results(progress=progress, guard=guard)
+        units = run.file(UNITS)
+        results = bench.results(progress=progress, guard=guard, divided=DividedLoops(workers, units, key))
         folder = make_folder(run.file(LOOPS))
         for result in results:
             write_recording(result.recording, folder / f"{result.recording.name}.parquet")
@@ -91,6 +97,7 @@ def control_loops(
         }
         write_json(run.file(PROVENANCE), provenance)
         page = build_control_page(_facts(run.path.name, content, results, provenance)).write(run.file(PAGE))
+    forget_units(units)
     return ControlRun(content, results, page)
 
 

@@ -12,20 +12,21 @@ import numpy as np
 from edp.config.control import CONTROL_SETTINGS, ControlExperiment, control_toml
 from edp.control.controllers import CONTROLLERS, ControllerSpec
 from edp.errors import ConfigError
+from edp.jobs import IN_PROCESS, Workers
+from edp.jobs.workers import UNITS, forget_units
 from edp.progress import SILENT, Progress
 from edp.settings.bounds import check_bounds, integer
 from edp.storage import read_object, write_bytes, write_json
 from edp.storage.arrays import numbers_in
-from edp.storage.paths import is_file_at
 from edp.storage.reading import object_with
 from edp.storage.runs import Run, check_claimable, check_free, run_key
-from edp.workflows.control.bench import ControlBench, ControlSources
+from edp.workflows.control.bench import ControlBench, ControlSources, DividedLoops
 from edp.workflows.search.space import Real
 from edp.workflows.search.study import SamplerSpec, Study
 
 TUNING_SEED = 1_000_000
 """First seed of the references that gains are tuned on; those that judge begin at 0 and never come so far."""
-TUNED, RESULTS, TRIALS = "tuned.toml", "tuning.json", "trials.json"
+TUNED, RESULTS = "tuned.toml", "tuning.json"
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,7 @@ def tune_gains(
     judged_on: ControlSources,
     tuning: TuningSpec | None = None,
     progress: Progress = SILENT,
+    workers: Workers = IN_PROCESS,
 ) -> Tuning:
     """Tune a controller and write a run folder: ``tuning.json``, and ``tuned.toml`` for ``edp control --config``.
 
@@ -78,6 +80,7 @@ def tune_gains(
         judged_on: plant and models of the judgement.
         tuning: how.
         progress: receiver of the progress; its units are trials.
+        workers: who runs the loops of a trial; nodes see models and run folder under the same paths.
 
     Raises:
         EdpError: settings, models or folder cannot be used.
@@ -100,7 +103,7 @@ def tune_gains(
     judge.check()
     sources = {"tuned_on": tuned_on.digests(), "judged_on": judged_on.digests()}
     key = run_key(CONTROL_SETTINGS.plain(experiment) | sources | {"tuning": asdict(chosen)}, "")
-    with Run.create(out, "tuning", key, control_toml(experiment)) as run:
+    with Run.create(out, "tuning", key, control_toml(experiment)) as run, workers.stay() as staying:
         if run.is_finished:
             content = read_object(run.file(RESULTS), ("gains", "controller", "trials", "judged_mm"))
             where = f"'{run.file(RESULTS)}', gains,"
@@ -112,20 +115,20 @@ def tune_gains(
         )
         study.suggest({name: _within(getattr(experiment.controller, name), ends) for name, ends in space.items()})
         rows: list[dict[str, Any]] = []
-        earlier = _earlier_costs(run)
+        units = run.file(UNITS)
+        tuned = DividedLoops(staying, units, f"{key} tuned on")
         best, trials = experiment.controller, progress.stage("trial", chosen.trials)
         for number in range(chosen.trials):
             trials.note(f"trial {number + 1}")
             trial = study.ask(1)[0]
             spec = with_gains(experiment.controller, trial.values)
-            cost = earlier[number] if number < len(earlier) else bench.cost(spec)
+            cost = bench.cost(spec, tuned)
             study.tell(trial.number, [cost])
             best = spec if not rows or cost < min(row["cost_mm"] for row in rows) else best
             rows.append({"gains": dict(trial.values), "cost_mm": cost})
-            if number >= len(earlier):
-                write_json(run.file(TRIALS), {"costs_mm": [row["cost_mm"] for row in rows]})
             trials.step(number + 1)
-        before, after = judge.costs(experiment.controller), judge.costs(best)
+        judged = DividedLoops(staying, units, f"{key} judged on")
+        before, after = judge.costs(experiment.controller, judged), judge.costs(best, judged)
         content = {
             "schema": 1,
             "controller": CONTROLLERS.name_of(best),
@@ -140,16 +143,8 @@ def tune_gains(
         }
         write_json(run.file(RESULTS), content)
         write_bytes(run.file(TUNED), control_toml(replace(experiment, controller=best)).encode())
+    forget_units(units)
     return Tuning(best, content)
-
-
-def _earlier_costs(run: Run) -> list[float]:
-    """Return the costs (mm) of the trials that a stopped tuning made; its trials are the same in each call."""
-    file = run.file(TRIALS)
-    if not is_file_at(file):
-        return []
-    costs = numbers_in(read_object(file, ("costs_mm",))["costs_mm"], f"'{file}', costs_mm,")
-    return [float(cost) for cost in costs.ravel()]
 
 
 def with_gains(spec: ControllerSpec, gains: Mapping[str, Any]) -> ControllerSpec:

@@ -6,13 +6,17 @@ import csv
 import io
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from edp.jobs import IN_PROCESS, Workers
+from edp.jobs.packing import pack, unpack
+from edp.jobs.workers import UNITS, WorkUnit, forget_units
 from edp.logs.source import DataSource
 from edp.monitor.alarms import MonitorAlarm, episodes
 from edp.monitor.detectable import found_sizes, outside_line, unseen_line
@@ -24,6 +28,8 @@ from edp.recording import Recording
 from edp.report.monitor.facts import start_time
 from edp.storage import write_bytes, write_json
 from edp.storage.headers import FILES, digests_of, model_digest
+from edp.storage.ledger import TrainingIdentity, WithState
+from edp.storage.paths import full_path
 from edp.storage.provenance import PROVENANCE, new_provenance
 from edp.storage.runs import Run, check_claimable, run_key
 
@@ -91,11 +97,33 @@ class MonitorRun:
         }
 
 
+@dataclass(frozen=True, eq=False)
+class WatchedRecording:
+    """What a monitor found in one recording.
+
+    Attributes:
+        alarms: in the order of time.
+        silent: channels that the recording lacks.
+        unlearned: why residuals are silent.
+        unlike: why the recording is not one of the machine of the monitor; empty if it is.
+        outside: why a missing alarm says nothing; empty if it does.
+        trace: what the page shows.
+    """
+
+    alarms: tuple[MonitorAlarm, ...]
+    silent: tuple[str, ...]
+    unlearned: tuple[str, ...]
+    unlike: str
+    outside: str
+    trace: RecordingTrace
+
+
 def run_monitor(
     folder: str | Path,
     source: DataSource,
     out: str | Path | None = None,
     progress: Progress = SILENT,
+    workers: Workers = IN_PROCESS,
 ) -> MonitorRun:
     """Watch logs.
 
@@ -104,55 +132,97 @@ def run_monitor(
         source: the logs.
         out: run folder for the alarm log as JSON lines and as CSV, and for what `edp monitor report` shows.
         progress: receiver of the progress; its units are recordings.
+        workers: who watches; nodes see monitor and run folder under the same paths. With a run folder a stopped call
+            continues after the recordings that are done.
 
     Raises:
         EdpError: monitor or logs that cannot be used, or a file that cannot be written.
     """
-    monitor, hours = load_monitor(folder), 0.0
-    alarms: list[MonitorAlarm] = []
-    silent: dict[str, tuple[str, ...]] = {}
-    unlearned: dict[str, tuple[str, ...]] = {}
-    unlike: dict[str, str] = {}
-    outside: dict[str, str] = {}
-    traces: list[RecordingTrace] = []
+    monitor = load_monitor(folder)
     if out is not None:
         check_claimable(out, "monitor run")
-    groups = groups_of(monitor)
     recordings = source.read()
-    watching = progress.stage("recording", len(recordings))
-    for number, recording in enumerate(recordings):
-        watching.note(recording.name)
-        lacking = monitor.check(recording)
-        if lacking:
-            silent[recording.name] = lacking
-        reasons = monitor.unlearned(recording)
-        if reasons:
-            unlearned[recording.name] = reasons
-        start = str(recording.meta.get(START, ""))
-        watched = monitor.watch(recording, start_time(start))
-        reason = monitor.unlike(watched)
-        if reason:
-            unlike[recording.name] = reason
-        beyond = "" if watched.alarms else outside_line(monitor, watched.rows.astype(np.float64))
-        if beyond:
-            outside[recording.name] = beyond
-        alarms += watched.alarms
-        traces.append(trace_of(monitor, recording, watched, groups, start))
-        hours += recording.duration_s / 3600.0
-        watching.step(number + 1)
-    detectors = tuple(f"{name} {n + 1}" for n, name in enumerate(_detectors(monitor)))
-    names = tuple(recording.name for recording in recordings)
-    run = MonitorRun(
-        monitor, tuple(alarms), hours, names, silent,
-        RunTraces(monitor.block_s, detectors, tuple(groups), tuple(traces)), unlearned, unlike, outside,
-    )  # fmt: skip
-    if out is not None:
-        origin = source.origin(recordings)
-        key = run_key({"monitor": model_digest(folder)}, origin["digest"])
-        with Run.create(out, "monitor run", key) as opened:
-            write_json(opened.file(PROVENANCE), new_provenance(origin) | {"monitor": str(folder)})
-            _write(run, opened.path, str(folder))
+    for recording in recordings:
+        monitor.check(recording)  # what is refused must not keep a corrected command out of the folder
+    if out is None:
+        return _watch_all(monitor, folder, recordings, None, progress, workers)
+    origin = source.origin(recordings)
+    key = run_key({"monitor": model_digest(folder)}, origin["digest"])
+    with Run.create(out, "monitor run", key) as opened:
+        run = _watch_all(monitor, folder, recordings, opened.file(UNITS), progress, workers)
+        write_json(opened.file(PROVENANCE), new_provenance(origin) | {"monitor": str(folder)})
+        _write(run, opened.path, str(folder))
+    forget_units(opened.file(UNITS))
     return run
+
+
+def _watch_all(
+    monitor: Monitor,
+    folder: str | Path,
+    recordings: Sequence[Recording],
+    units_folder: Path | None,
+    progress: Progress,
+    workers: Workers,
+) -> MonitorRun:
+    """Watch each recording as a unit of work."""
+    digest = model_digest(folder)
+    here = {"monitor": monitor} if workers.are_alone else {"folder": str(full_path(Path(folder)))}
+    units = [
+        WorkUnit(
+            f"{__name__}:watch_unit", recording.name, {"monitor": digest, "name": recording.name}, recording.digest,
+            {**here, "recording": recording},
+        )
+        for recording in recordings
+    ]  # fmt: skip
+    watching = progress.stage("recording", len(units))
+    results = workers.map_in_order(units, watching, units_folder)
+    watched = [unpack(result.content or b"", WatchedRecording) for result in results]
+    names = tuple(recording.name for recording in recordings)
+    pairs = list(zip(names, watched, strict=True))
+    detectors = tuple(f"{name} {n + 1}" for n, name in enumerate(_detectors(monitor)))
+    traces = RunTraces(monitor.block_s, detectors, tuple(groups_of(monitor)), tuple(one.trace for one in watched))
+    hours = 0.0
+    for recording in recordings:
+        hours += recording.duration_s / 3600.0
+    return MonitorRun(
+        monitor,
+        tuple(alarm for one in watched for alarm in one.alarms),
+        hours,
+        names,
+        {name: one.silent for name, one in pairs if one.silent},
+        traces,
+        {name: one.unlearned for name, one in pairs if one.unlearned},
+        {name: one.unlike for name, one in pairs if one.unlike},
+        {name: one.outside for name, one in pairs if one.outside},
+    )
+
+
+def watch_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState:
+    """Watch the recording of a unit."""
+    monitor = where["monitor"] if "monitor" in where else _open_monitor(where["folder"], identity.config["monitor"])
+    return WithState({}, pack(watch_recording(monitor, where["recording"])))
+
+
+@lru_cache(maxsize=1)
+def _open_monitor(folder: str, digest: str) -> Monitor:
+    """Return a monitor, loaded once for all units of a process; `digest` is that of its content."""
+    return load_monitor(folder)
+
+
+def watch_recording(monitor: Monitor, recording: Recording) -> WatchedRecording:
+    """Run a monitor along a recording from its start."""
+    silent = monitor.check(recording)
+    start = str(recording.meta.get(START, ""))
+    watched = monitor.watch(recording, start_time(start))
+    outside = "" if watched.alarms else outside_line(monitor, watched.rows.astype(np.float64))
+    return WatchedRecording(
+        tuple(watched.alarms),
+        silent,
+        monitor.unlearned(recording),
+        monitor.unlike(watched),
+        outside,
+        trace_of(monitor, recording, watched, groups_of(monitor), start),
+    )
 
 
 def _detectors(monitor: Monitor) -> list[str]:

@@ -1,0 +1,291 @@
+"""Long commands divide their loops among workers: the same results for any number of them, and after a kill."""
+
+import inspect as source_of
+import json
+import shutil
+import signal
+from dataclasses import dataclass
+
+import pytest
+from typer.main import get_command
+
+from edp.cli import app
+from edp.logs import write_recording
+from edp.recording import Recording
+from edp.signals import VOCABULARY
+from edp.testing.monitor import rig_sessions
+from edp.testing.twins import sample_actuators
+
+pytestmark = [pytest.mark.training, pytest.mark.processes]
+LINE = ("--set", "task.length_m=[0.4,0.5]", "--set", "task.hold_s=0.2")
+RIG = ("BmUp", "CylVels_1", "CylStroke_1", "CylPressures_1", "CylPressures_5")
+TRIALS = ("trials.random=1", "training.epochs=1", "training.updates=2", "screen.max_lag=4", "screen.trees=5")
+TWIN = (
+    *("twin.kind=recurrent", "twin.units=4", "twin.members=3", "twin.prefix_ticks=20", "training.lanes=4"),
+    *("training.lengths_s=[0.2]", "training.updates=[6]", "training.validate_every=3", "judge.seconds=4"),
+    *("judge.starts=2", "judge.at_s=[1, 4]"),
+)
+AUTO = (
+    "auto.candidates=['linear','recurrent']",
+    "task.targets=['CylVels_1']",
+    "task.horizons=[5]",
+    "judge.baselines=[]",
+)
+LIMIT = ("limit.moments=4", "limit.branches=4")
+FLEET = ("finetune.rounds=2", "finetune.batch=4", "finetune.check_signs=false")
+
+
+def settings(values):
+    """Return values as options."""
+    return [word for value in values for word in ("--set", value)]
+
+
+@dataclass(frozen=True)
+class Divided:
+    """A command whose loop is divided.
+
+    Attributes:
+        words: after the name of the command; ``{out}`` is the folder of the result.
+        is_slow: takes seconds more than the others.
+        kept: files of the result folder that say that a part of the loop is done, for a kill.
+    """
+
+    words: tuple[str, ...]
+    is_slow: bool = False
+    kept: str = "units/records/*.json"
+
+
+LONG_COMMANDS = {
+    "simulate": Divided(
+        (
+            "{out}",
+            "--minutes",
+            "0.4",
+            "--recordings",
+            "4",
+            "--limit",
+            *settings(LIMIT),
+        ),
+        kept="*.parquet",
+    ),
+    "store build": Divided(("{logs}", "--out", "{out}"), kept="rows/*.json"),
+    "inspect": Divided(("{logs}", "--json"), kept=""),
+    "screen": Divided(
+        ("{logs}", "--out", "{out}", "--no-pictures", "--trials", *settings(TRIALS)), True, kept="trials/*/bundle"
+    ),
+    "evaluate": Divided(("{run}", "--baselines", "persistence,ridge_arx,small_mlp")),
+    "finetune": Divided(
+        ("{run}", "{log}", "--out", "{out}", "--baselines", "low_rank", *settings(FLEET)), True, "**/checkpoint*"
+    ),
+    "fleet report": Divided(("{run}", "{fleet}", "--out", "{out}")),
+    "train": Divided(("{logs}", "--out", "{out}", "--minutes", "0.02", *settings(AUTO)), True),
+    "twin": Divided(("{actuators}", "--out", "{out}", *settings(TWIN)), True, "parts/*/checkpoint*"),
+    "monitor fit": Divided(("{rig}", "--out", "{out}", "--hours-per-false-alarm", "0.06", "--minutes", "0.05"), True),
+    "monitor run": Divided(("{monitor}", "{rig}", "--out", "{out}")),
+    "control": Divided(("{out}", "--task", "grade", "--controller", "pi", "--seeds", "3", *LINE)),
+    "tune": Divided(("{out}", "--controller", "pi", "--seeds", "2", "--trials", "3", "--loops", "2", *LINE), True),
+}
+"""Commands with a loop that is divided."""
+WHOLE = {
+    "pretrain": "one training: a node of a cluster does it, several processes would have nothing to do",
+    "distil": "one training",
+    "compress": "each stage begins with what the stage before chose",
+    "identify": "stages of one fit, each of which begins where the one before ended",
+    "adapt": "one recursive fit along the logs, in their order",
+    "replay": "one pass along the logs, in their order",
+    "rollout": "one pass along a log",
+    "forecast": "one pass along a log",
+    "init": "reads heads of logs, which takes seconds",
+    "search run": "trainings, which `tests/unit/search` divides and kills",
+    "search report": "writes a page",
+    "monitor report": "writes a page",
+    "fleet network": "writes one bundle",
+    "store check": "reads samples as fast as the disk gives them",
+}
+"""Commands that report progress, or stand beside one that does, and why their loop is not divided here."""
+TIMES = {
+    *(
+        "seconds",
+        "wall_s",
+        "time",
+        "created",
+        "finished",
+        "started",
+        "processor_s",
+        "found_effort",
+        "blake2b",
+        "command",
+    ),
+    *(
+        "targets_per_s",
+        "solve_us",
+        "solve_us_median",
+        "solve_us_p95",
+        "solve_us_max",
+        "missed",
+        "written_ns",
+        "changed_ns",
+        "run",
+    ),
+    *("key", "folder", "path", "store", "workers", "environment", "sources", "command"),
+}
+"""Keys of results that differ from call to call, or name the folder."""
+
+
+def leaves(node=None, words=()):
+    """Yield each command with its words."""
+    node = node or get_command(app)
+    below = getattr(node, "commands", None)
+    if below is None:
+        yield " ".join(words), node
+        return
+    for name, inner in below.items():
+        yield from leaves(inner, (*words, name))
+
+
+def test_every_command_with_progress_is_divided_or_says_why_not():
+    modules = {name: source_of.getsource(source_of.getmodule(node.callback)) for name, node in leaves()}
+    long = {name for name, text in modules.items() if "shown_progress(" in text}
+    long |= {"screen", "search run"}  # displays of their own
+    assert long <= {*LONG_COMMANDS, *WHOLE}
+    assert not LONG_COMMANDS.keys() & WHOLE.keys()
+    for name, node in leaves():
+        options = {option for parameter in node.params for option in parameter.opts}
+        if name in LONG_COMMANDS:
+            assert {"--workers", "--cluster", "--open-cluster"} <= options, name
+        elif name not in ("pretrain", "search run"):
+            assert not {"--workers", "--cluster"} & options, name
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory, logs, _trained):
+    """Inputs of the commands, made once."""
+    from edp.config.monitor import load_monitor_experiment
+    from edp.logs.source import DataSource
+    from edp.workflows.monitor import fit_monitor
+
+    top = tmp_path_factory.mktemp("long")
+    for name in ("actuators", "rig"):
+        (top / name).mkdir()
+    for seed in range(6):
+        write_recording(sample_actuators(seed=seed), top / "actuators" / f"log_{seed}.parquet")
+    channels = tuple(VOCABULARY[name] for name in RIG)
+    for session in rig_sessions(18, 2000, seed=4, first=0):
+        recording = Recording(session.name, channels, session.values, session.rate_hz)
+        write_recording(recording, top / "rig" / f"{session.name}.parquet")
+    experiment = load_monitor_experiment(None, (), {"hours_per_false_alarm": 0.06, "minutes": 0.05})
+    fit_monitor([], DataSource.of(top / "rig"), experiment, top / "monitor")
+    entries = "".join(
+        f'[[recordings]]\npath = "{log}"\nmachine = "digger {number // 2}"\n'
+        for number, log in enumerate(sorted(logs.iterdir()))
+    )
+    (top / "fleet.toml").write_text(entries)
+    DataSource.of(top / "fleet.toml").store(top / "fleet")
+    return {
+        "logs": logs, "log": sorted(logs.iterdir())[0], "run": _trained, "monitor": top / "monitor",
+        "fleet": top / "fleet", "actuators": top / "actuators", "rig": top / "rig",
+    }  # fmt: skip
+
+
+def words_of(command, places, out):
+    """Return a command line, with a copy of the run that it writes into."""
+    named = dict(places, out=out)
+    if command == "evaluate":
+        named["run"] = out if out.exists() else shutil.copytree(places["run"], out)
+    return [*command.split(), *(word.format(**named) for word in LONG_COMMANDS[command].words)]
+
+
+def without_times(value):
+    """Return a table without what differs from call to call."""
+    if isinstance(value, dict):
+        return {key: without_times(part) for key, part in value.items() if key not in TIMES}
+    return [without_times(part) for part in value] if isinstance(value, list) else value
+
+
+def results_in(folder):
+    """Return the content of the result files of a folder by name."""
+    found = {}
+    for file in sorted(folder.rglob("*")):
+        name = str(file.relative_to(folder))
+        if not file.is_file() or file.name in ("status.json", "run.json", "provenance.json", ".lock", "progress.json"):
+            continue
+        if file.suffix == ".json":
+            found[name] = without_times(json.loads(file.read_text()))
+        elif file.suffix in (".parquet", ".safetensors", ".csv", ".f32", ".toml") and "checkpoint" not in name:
+            found[name] = file.read_bytes()
+    return found
+
+
+def assert_same(command, found, usual):
+    """Compare results, and name the file that differs."""
+    names = [{name for name in one if "networks/" not in name} for one in (found, usual)]
+    assert names[0] == names[1], command
+    for name in sorted(names[0]):
+        assert found[name] == usual[name], f"{command}: {name}"
+
+
+@pytest.fixture(scope="module")
+def usual(places, tmp_path_factory):
+    """Results of each command in one process, found once."""
+    found = {}
+
+    def find(command, run):
+        if command not in found:
+            out = tmp_path_factory.mktemp("usual") / "out"
+            text = run(*words_of(command, places, out), "--workers", 1)
+            found[command] = text if LONG_COMMANDS[command].kept == "" else results_in(out)
+        return found[command]
+
+    return find
+
+
+@pytest.fixture
+def run(edp):
+    """Run a command that must succeed, also with a verdict or an alarm; returns what it printed."""
+
+    def call(*words):
+        ended = edp(*words)
+        assert ended.code in (0, 3, 5, 6), ended.err
+        return ended.out
+
+    return call
+
+
+FAST = ("inspect", "control", "evaluate")
+
+
+@pytest.mark.parametrize(
+    ("command", "workers"),
+    [
+        pytest.param(command, workers, marks=() if command in FAST and workers == 2 else pytest.mark.slow)
+        for command in LONG_COMMANDS
+        for workers in (2, 4)
+    ],
+)
+def test_any_number_of_workers_gives_the_same_results(run, places, usual, tmp_path, command, workers):
+    out = tmp_path / "out"
+    said = run(*words_of(command, places, out), "--workers", workers)
+    if LONG_COMMANDS[command].kept == "":
+        assert without_times(json.loads(said)) == without_times(json.loads(usual(command, run)))
+    else:
+        assert_same(command, results_in(out), usual(command, run))
+        assert not (out / "units").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "done"),
+    [
+        pytest.param(command, done, marks=() if command == "monitor run" and done == 2 else pytest.mark.slow)
+        for command, divided in LONG_COMMANDS.items()
+        if divided.kept
+        for done in (1, 2, 3)
+    ],
+)
+def test_a_killed_command_continues_to_the_same_results(run, places, usual, start, stop_once, tmp_path, command, done):
+    out, kept = tmp_path / "out", LONG_COMMANDS[command].kept
+    words = [*words_of(command, places, out), "--workers", 1 + done % 2]
+    code, said = stop_once(start(*words), lambda: len(list(out.glob(kept))) >= done, signal.SIGKILL)
+    # A command that ends before it is looked at is as good as one that was not killed.
+    assert code in (-signal.SIGKILL, 0, 3, 5, 6), said
+    run(*words)
+    assert_same(command, results_in(out), usual(command, run))
