@@ -124,6 +124,15 @@ class CompressionResult:
                 raise ConfigError(f"scores: got those of {', '.join(part)}, expected horizons {', '.join(horizons)}")
 
     @property
+    def horizons(self) -> list[str]:
+        """Look-aheads in samples, as keys of scores."""
+        return [str(horizon) for horizon in self.task.horizons]
+
+    def ahead(self, horizon: str) -> str:
+        """Return a horizon in words."""
+        return f"{1e3 * int(horizon) / self.task.rate_hz:.0f} ms ahead (k = {horizon})"
+
+    @property
     def best(self) -> CompressedRow | None:
         """The chosen row."""
         return None if self.chosen is None else self.rows[self.chosen]
@@ -138,7 +147,7 @@ class CompressionResult:
         write_json(folder / FILE, self.to_json())
 
 
-def read_compression_result(folder: str | Path) -> CompressionResult:
+def read_compression(folder: str | Path) -> CompressionResult:
     """Return the checked content of the ``compression.json`` in a folder.
 
     Raises:

@@ -150,8 +150,9 @@ def test_the_judging_sessions_validate_and_predictions_are_made_window_by_window
     """The same training judged as a stream of one epoch's length differs: there the state is carried on."""
     one = dataclasses.replace(order, epochs=1, updates=24, patience=0, validation=())
     assert train_order(one.to_json())["sessions"] != train_order(order.to_json())["sessions"]
-    assert "validation" not in job_of(one, "data").identity.split
-    assert "epochs" not in one.to_json()
+    identity = job_of(one, "data").identity
+    assert "validation" not in identity.split
+    assert "epochs" not in identity.config
 
 
 @pytest.fixture(scope="module")
