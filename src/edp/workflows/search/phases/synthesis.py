@@ -80,16 +80,9 @@ def final_orders(context: SearchContext, settings: Table) -> list[TrainingReques
         # With several epochs the sessions of a fold choose the best epoch; test sessions never do.
         first = context.orders(settings, [0])[0]
         train, validation = first.train, first.judged
+    updates = context.spec.final_updates
     return [
-        TrainingRequest(
-            settings,
-            context.source,
-            train,
-            context.test,
-            context.seed("final", seed),
-            context.spec.final_updates,
-            **context.several(validation),
-        )
+        context.order(settings, train, context.test, context.seed("final", seed), updates, validation)
         for seed in range(context.spec.run_seeds)
     ]
 
