@@ -73,7 +73,9 @@ def transferred(regimes: Regimes, work: Path, quick: bool, seed: int) -> dict[st
     for folder, order in tried.items():
         finetune(work / "run", logs, order, folder)
     best = min(tried, key=validation)
-    return finetune(work / "run", logs, replace(tried[best], baselines=RIVALS), best)  # what is trained is read
+    return finetune(
+        work / "run", logs, replace(tried[best], baselines=RIVALS), best
+    ).to_table()  # what is trained is read
 
 
 def validation(folder: Path) -> float:

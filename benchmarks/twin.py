@@ -33,6 +33,7 @@ from edp.networks.twin.grey.fit_spec import GreyFitSpec
 from edp.networks.twin.greybox import GreyBox, GreyTwin
 from edp.networks.twin.recurrent import RecurrentTwin
 from edp.networks.twin.recurrent_cell import TwinNetwork
+from edp.settings.results import plain_value
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.testing.twin_cell import plain_steps
 from edp.training.blas import one_blas_thread
@@ -149,8 +150,9 @@ def scored(
     for name, (twin, seconds) in models.items():
         taught = name not in closed
         intervals = calibrated([(twin, data.validation)], experiment.judge) if taught else None
-        scores[name] = free_run_scores(free_runs(twin, data.test, 60.0, starts), experiment.judge, intervals)
-        scores[name] |= {"ahead": ahead_scores(look_ahead(twin, data.test, AHEAD)), "training_s": seconds}
+        own = free_run_scores(free_runs(twin, data.test, 60.0, starts), experiment.judge, intervals)
+        scores[name] = plain_value(replace(own, ahead=ahead_scores(look_ahead(twin, data.test, AHEAD))))
+        scores[name]["training_s"] = seconds
         if taught:
             scores[name]["validation_mae"] = validation_mae(twin, data, experiment)
     return scores
@@ -159,7 +161,7 @@ def scored(
 def validation_mae(twin: Twin, data: Any, experiment: TwinExperiment) -> float:
     """Error of the velocities over free runs of the validation part, mm/s, by which formulations are chosen."""
     runs = free_runs(twin, data.validation, VALIDATION_S, 4)
-    return float(free_run_scores(runs, experiment.judge)["velocity_mae"]["mean"])
+    return float(free_run_scores(runs, experiment.judge).velocity_mae.mean or 0.0)
 
 
 def check_goals(bench: Bench, scores: dict[str, dict[str, Any]], named: list[str], coverage: float) -> None:

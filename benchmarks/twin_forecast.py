@@ -30,6 +30,7 @@ from edp.networks.integer import integer_predictor
 from edp.networks.predictor import Predictor
 from edp.networks.twin import fit_scales
 from edp.networks.twin.greybox import GreyFitSpec
+from edp.settings.provenance import DataOrigin, Provenance
 from edp.signals import TABLE_A1
 from edp.sim.data_set import SimulationOrder, find_data_set_limit, simulate_data_set
 from edp.sim.predictability import LimitSpec
@@ -148,7 +149,7 @@ def forecasts(logs: Path, ahead: Path, grey: Path, seed: int, quick: bool) -> di
     spec = QUICK_FIT if quick else GreyFitSpec(ticks=5000, starts=1)
     twin, seconds = fitted_linkage((channels, fit_scales(channels, data.train), data), seed, spec)
     names = {part: [s.name for s in getattr(data, part)] for part in ("train", "validation", "test")}
-    save_twin(TwinBundle(twin.spec, twin, {"data": {"names": names}}), grey)
+    save_twin(TwinBundle(twin.spec, twin, Provenance(data=DataOrigin(names=names))), grey)
     began = time.process_time()
     # The choice of a gain alone would take a quarter of the short form's minute.
     written = forecast_logs(grey, DataSource.of(logs), HORIZONS, ahead, gain=0.3 if quick else None)

@@ -281,8 +281,8 @@ class Judged:
         for at in sorted({max(at, shortest) for at in judge.covered_at_s if at < HALF * longest}):
             # Runs as long as each horizon, so that starts lie all along the recording.
             runs = free_runs(twin, [self.test], at, STARTS)
-            row = coverage_of(runs, replace(judge, covered_at_s=(at,)), intervals)["at"][0]
-            rows.append({"at_s": at, "calibrated": row["calibrated"], "share": row[part]["share"]})
+            row = coverage_of(runs, replace(judge, covered_at_s=(at,)), intervals).at[0]
+            rows.append({"at_s": at, "calibrated": row.calibrated, "share": row.parts()[part].share})
         return rows
 
     def measure(self, seed: int, quick: bool) -> dict[str, Any]:

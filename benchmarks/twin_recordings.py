@@ -111,7 +111,7 @@ def measure(channels: TwinChannels, data: Prepared, experiment: TwinExperiment) 
     chosen = next(one for one in tried if one.chosen)
     return {
         "errors": {name: free_run_error(row, scores["static"]) for name, row in scores.items()},
-        "diverged": {name: row["diverged"] for name, row in scores.items()},
+        "diverged": {name: row.diverged for name, row in scores.items()},
         "chosen": chosen.label,
         "promise": chosen.error,
         "candidates": [one.row() for one in tried],

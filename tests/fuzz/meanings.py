@@ -32,6 +32,7 @@ from edp.networks.backbones import HybridSpec
 from edp.networks.heads import MlpHead
 from edp.networks.predictor import ModelSpec, build_model
 from edp.recording import Recording
+from edp.settings.provenance import Provenance
 from edp.signals import TABLE_A1, Channel, Kind
 from edp.storage import parse_toml
 from edp.training.bundle import HASH, HEADER, Bundle, blank_scaler, content_digest, save_bundle
@@ -343,7 +344,7 @@ def _bundle(folder: Path) -> Path:
         spec = ModelSpec(backbone=HybridSpec(channels=(4,), kernel=2, units=4), head=MlpHead(hidden=4), window=8)
         predictor = build_model(task, spec, blank_scaler(task), seed=1).eval()
         inputs = tuple(Channel(name, Kind.GENERIC) for name in names)
-        save_bundle(Bundle(predictor, inputs, (Kind.VELOCITY,), ("how fast",), {"seconds": 1.0}, {}), path)
+        save_bundle(Bundle(predictor, inputs, (Kind.VELOCITY,), ("how fast",), Provenance(seconds=1.0), {}), path)
     return path
 
 

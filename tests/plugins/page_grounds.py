@@ -94,7 +94,7 @@ def compress(folder: Path, request: pytest.FixtureRequest) -> Names:
     tiny, training = (request.getfixturevalue(name) for name in ("tiny", "tiny_training"))
     backbone = HybridSpec(channels=(32, 16), kernel=2, units=32)
     teacher = build_model(tiny.task, ModelSpec(backbone=backbone, head=MlpHead(hidden=16), window=10), tiny.scaler(), 0)
-    save_bundle(make_bundle(teacher.eval(), tiny, {}), folder / "runs" / "teacher" / "bundle")
+    save_bundle(make_bundle(teacher.eval(), tiny), folder / "runs" / "teacher" / "bundle")
     few = replace(training, epochs=1, updates=2, chunks=replace(training.chunks, length=64, batch=16))
     return {"data": tiny, "training": few, "network": teacher}
 

@@ -16,6 +16,7 @@ from edp.errors import BundleError
 from edp.networks.backbones import CommitteeSpec, HybridSpec, TcnSpec
 from edp.networks.heads import MlpHead
 from edp.networks.predictor import ModelSpec, build_model
+from edp.settings.provenance import Provenance
 from edp.signals import Channel, Kind
 from edp.training.bundle import (
     HASH,
@@ -41,7 +42,9 @@ def bundle_of(backbone):
     predictor = build_model(task, spec, blank_scaler(task), seed=1).eval()
     kinds = (Kind.CONTROL, Kind.PRESSURE, Kind.VELOCITY) if hasattr(Kind, "CONTROL") else (Kind.GENERIC,) * 3
     inputs = tuple(Channel(name, kind) for name, kind in zip(NAMES, kinds, strict=True))
-    return Bundle(predictor, inputs, (Kind.VELOCITY,), ("how fast",), {"seconds": 1.0, "by": {10: "a", 9: "b"}}, {})
+    return Bundle(
+        predictor, inputs, (Kind.VELOCITY,), ("how fast",), Provenance(seconds=1.0, more={"by": {10: "a", 9: "b"}}), {}
+    )
 
 
 @pytest.fixture
@@ -106,7 +109,7 @@ SLIPS = {
 def test_a_whole_bundle_loads(folder):
     loaded = load_bundle(folder)
     assert loaded.task.inputs == NAMES
-    assert loaded.provenance == {"seconds": 1.0, "by": {"10": "a", "9": "b"}}
+    assert loaded.provenance.to_table() == {"seconds": 1.0, "by": {"10": "a", "9": "b"}}
 
 
 @pytest.mark.parametrize("slip", SLIPS)
@@ -334,7 +337,11 @@ def test_a_bundle_of_the_former_words_says_how_it_is_upgraded(folder, schema):
     upgrade_bundle(folder)
     bundle = load_bundle(folder)
     assert weights_digest(bundle.predictor) == weights
-    assert bundle.provenance == {"seconds": 1.0, "strategy": {"kind": "few"}, "by": {"lesson": "of another kind"}}
+    assert bundle.provenance.to_table() == {
+        "seconds": 1.0,
+        "strategy": {"kind": "few"},
+        "by": {"lesson": "of another kind"},
+    }
     with pytest.raises(BundleError, match="nothing to upgrade"):
         upgrade_bundle(folder)
 

@@ -34,6 +34,7 @@ from edp.networks.backbones import LstmSpec
 from edp.networks.heads import MlpHead
 from edp.networks.integer import IntegerPredictor
 from edp.networks.predictor import ModelSpec
+from edp.settings.provenance import Provenance
 from edp.signals import Channel, Kind
 from edp.training.bundle import Bundle
 
@@ -89,7 +90,9 @@ def small(names: tuple[str, ...], whole: bool = False) -> Bundle:
         predictor = IntegerPredictor(predictor, calibrate(predictor.graph(), [rows]))
     inputs = tuple(Channel(name, Kind.PRESSURE, name) for name in names)
     texts = (HOSTILE[1], HOSTILE[0], HOSTILE[6])
-    return Bundle(predictor, inputs, (Kind.VELOCITY,) * 3, texts, {"note": HOSTILE[0]}, {"note": HOSTILE[0]})
+    return Bundle(
+        predictor, inputs, (Kind.VELOCITY,) * 3, texts, Provenance(more={"note": HOSTILE[0]}), {"note": HOSTILE[0]}
+    )
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from browser import long_numbers
 from edp.errors import StorageError
 from edp.report.run.facts import read_history
 from edp.storage import read_json, write_bytes, write_json
-from edp.storage.headers import FILES, check_files, digests_of
+from edp.storage.headers import check_files, digests_of
 from edp.storage.runs import Run
 from edp.storage.seals import HASH, files_without_seal
 
@@ -158,7 +158,7 @@ def test_a_history_of_an_earlier_version_is_read(history):
 
 def test_arrays_beside_a_result_are_bound_to_it(tmp_path):
     write_bytes(tmp_path / "arrays.bin", b"12345678")
-    content = {FILES: digests_of(tmp_path, "arrays.bin")}
+    content = digests_of(tmp_path, "arrays.bin")
     check_files(content, tmp_path, "again")
     write_bytes(tmp_path / "arrays.bin", b"12345679")
     with pytest.raises(StorageError, match="changed since it was written with the result beside it; again"):

@@ -9,6 +9,7 @@ from safetensors.numpy import load, save
 from edp.errors import BundleError
 from edp.networks.twin import TWINS
 from edp.networks.twin.recurrent import Recurrent
+from edp.settings.provenance import Provenance
 from edp.testing.twins import sample_twin
 from edp.training.bundle import HASH, content_digest, write_arrays
 from edp.training.twin_bundle import HEADER, TwinBundle, load_twin, save_twin
@@ -18,7 +19,7 @@ SPEC = Recurrent(units=4, prefix_ticks=5)
 
 @pytest.fixture
 def folder(tmp_path):
-    return save_twin(TwinBundle(SPEC, sample_twin(SPEC)[0], {"seconds": 1.0}, {"twin": {}}), tmp_path / "twin")
+    return save_twin(TwinBundle(SPEC, sample_twin(SPEC)[0], Provenance(seconds=1.0), {"twin": {}}), tmp_path / "twin")
 
 
 def header_of(folder):
@@ -42,11 +43,11 @@ def refused(folder, match):
 def test_a_twin_comes_back_to_the_bit(tmp_path, name):
     spec = TWINS[name]()
     twin, commands, measured = sample_twin(spec)
-    save_twin(TwinBundle(spec, twin, {"seconds": 2.0}, {"twin": {"diverged": 0.0}}), tmp_path)
+    save_twin(TwinBundle(spec, twin, Provenance(seconds=2.0), {"twin": {"diverged": 0.0}}), tmp_path)
     loaded = load_twin(tmp_path)
     assert loaded.spec == spec
     assert loaded.twin.channels == twin.channels
-    assert (loaded.provenance, loaded.scores) == ({"seconds": 2.0}, {"twin": {"diverged": 0.0}})
+    assert (loaded.provenance, loaded.scores) == (Provenance(seconds=2.0), {"twin": {"diverged": 0.0}})
     prefix = spec.prefix_ticks
     answers = [
         t.rollout(commands[:, prefix:], t.reset(commands[:, :prefix], measured[:, :prefix]))[0]
@@ -136,7 +137,7 @@ def test_numbers_that_cannot_be_are_refused(folder, change, message):
 )
 def test_a_static_map_that_cannot_be_is_refused(tmp_path, change, message):
     spec = Recurrent(units=4, members=2, valve_map=True, prefix_ticks=5)
-    folder = save_twin(TwinBundle(spec, sample_twin(spec)[0], {"seconds": 1.0}, {"twin": {}}), tmp_path / "twin")
+    folder = save_twin(TwinBundle(spec, sample_twin(spec)[0], Provenance(seconds=1.0), {"twin": {}}), tmp_path / "twin")
     rewritten(folder, change)
     refused(folder, message)
 

@@ -18,6 +18,7 @@ from edp.ir.rls import AdaptationSpec, RlsStatus
 from edp.networks import AdaptedStream
 from edp.networks.twin import TWINS, fit_scales
 from edp.networks.twin.greybox import GreyBox
+from edp.settings.provenance import Provenance
 from edp.signals import Channel, Kind
 from edp.storage import read_json, write_json
 from edp.training import load_bundle, save_bundle, upgrade_bundle
@@ -202,7 +203,7 @@ def test_a_thermometer_in_the_logs_of_twin_and_replay_moves_its_numbers(adapted,
     bundle = load_bundle(adapted[0])
     grey = load_twin(saved_twin(GreyBox(), lever_sessions, tmp_path / "grey"))
     assert math.isnan(tuned_spec(grey).oil_c)
-    spec = tuned_spec(dataclasses.replace(grey, provenance={"oil_c": 20.0}))
+    spec = tuned_spec(dataclasses.replace(grey, provenance=Provenance(more={"oil_c": 20.0})))
     moves, recordings = (
         TwinMoves(grey.twin, correction_of(grey.twin, bundle.adaptation, bundle.task, spec)),
         lever_sessions.read(),
@@ -216,7 +217,7 @@ def test_a_thermometer_in_the_logs_of_twin_and_replay_moves_its_numbers(adapted,
         assert moves.correction.tuned.factors["oil"] == pytest.approx(viscosity)
     for wrong in (True, "hot", 4000.0, [20.0]):
         with pytest.raises(BundleError, match="no temperature of oil"):
-            tuned_spec(dataclasses.replace(grey, provenance={"oil_c": wrong}))
+            tuned_spec(dataclasses.replace(grey, provenance=Provenance(more={"oil_c": wrong})))
 
 
 def with_channel(recording, channel, value):

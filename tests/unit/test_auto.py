@@ -12,6 +12,7 @@ from noted_progress import NotedProgress
 from edp.data.splits import SPLITS
 from edp.errors import ConfigError, DataError, StorageError
 from edp.evaluation.guard import beaten_by
+from edp.evaluation.scores_file import ScoresFile
 from edp.jobs import Workers
 from edp.report import build_report
 from edp.report.run.choice import model_tables, read_choice
@@ -54,13 +55,13 @@ def result(tmp_path_factory):
 
 def test_the_run_is_that_of_the_chosen_candidate(result):
     _, folder, found = result
-    assert found.facts["chosen"] in found.facts["candidates"]
+    assert found.choice.to_table()["chosen"] in found.choice.to_table()["candidates"]
     assert json.loads((folder / "auto.json").read_text())["sentence"] == found.sentence
     bundle, experiment, provenance, _ = trained_run(folder)
-    assert provenance["auto"] == found.sentence
+    assert provenance.more["auto"] == found.sentence
     assert experiment.training.bagging is not None
     assert load_bundle(folder).predictor.spec == bundle.predictor.spec
-    for one in found.facts["candidates"].values():
+    for one in found.choice.to_table()["candidates"].values():
         assert set(one["promise"]) == {"1", "4"}
         assert set(one["promise"]["1"]) == {"y"}
 
@@ -69,15 +70,17 @@ def test_the_promise_is_kept_on_the_test_part(result):
     _, folder, found = result
     evaluate(folder)
     scores = json.loads((folder / "scores.json").read_text())["models"]["network"]["overall"]
-    for horizon, promised in found.facts["candidates"][found.facts["chosen"]]["promise"].items():
+    for horizon, promised in found.choice.to_table()["candidates"][found.choice.to_table()["chosen"]][
+        "promise"
+    ].items():
         assert scores[horizon]["y"]["rmse"] < 1.5 * promised["y"]
-        assert scores[horizon]["y"]["rmse"] < found.facts["persistence"][horizon]["y"]
+        assert scores[horizon]["y"]["rmse"] < found.choice.persistence[horizon]["y"]
 
 
 def test_a_finished_run_is_read_again_and_another_one_refused(result):
     source, folder, _ = result
     before = (folder / "auto.json").read_bytes()
-    assert train_auto(source, load_auto(None, SET), folder).facts == read_json(folder / "auto.json")
+    assert train_auto(source, load_auto(None, SET), folder).choice.to_table() == read_json(folder / "auto.json")
     with pytest.raises(StorageError, match="another run"):
         train_auto(source, load_auto(None, [*SET, "auto.seed=1"]), folder)
     assert (folder / "auto.json").read_bytes() == before
@@ -109,7 +112,7 @@ def test_a_run_that_was_killed_while_it_was_written_is_made_again(result, tmp_pa
     (copied / "status.json").unlink()
     shutil.rmtree(copied / "bundle")
     again = train_auto(source, load_auto(None, SET), copied)
-    assert again.facts["excess"] == found.facts["excess"]
+    assert again.choice.to_table()["excess"] == found.choice.to_table()["excess"]
     assert (copied / "bundle").is_dir()
 
 
@@ -151,7 +154,7 @@ def test_a_network_with_a_validation_part_of_its_own_is_compared_on_that_part(tm
     monkeypatch.setattr("edp.workflows.auto.candidates.RECURRENT_ROWS", 1000)
     source = write(tmp_path / "logs", ticks=1500)
     settings = load_auto(None, [*SET, "auto.candidates=['linear', 'recurrent']"])
-    facts = train_auto(source, settings, tmp_path / "run").facts
+    facts = train_auto(source, settings, tmp_path / "run").choice.to_table()
     assert set(facts["candidates"]) == {"linear", "recurrent"}
     linear, recurrent = (facts["candidates"][name]["promise"]["4"]["y"] for name in ("linear", "recurrent"))
     # A network of a few updates hardly beats the mean change; the linear model does.
@@ -209,27 +212,27 @@ def test_page_and_file_show_every_model_on_left_out_data_and_on_the_test_part(re
     assert set(results) == {"network", "persistence", "ridge_arx"}
     assert "validation" not in results["network"]  # it trained on that part; its promise is from rows left out
     facts = read_facts(copied)
-    models = facts.scores["models"]
+    models = facts.scores.models
     for name in ("persistence", "ridge_arx"):
-        assert results[name]["test"]["4"]["y"] == models[name]["overall"]["4"]["y"]["rmse"]
-        assert results[name]["validation"]["4"]["y"] == models[name]["validation"]["4"]["y"]["rmse"]
+        assert results[name]["test"]["4"]["y"] == models[name].overall["4"]["y"]["rmse"]
+        assert results[name]["validation"]["4"]["y"] == models[name].validation["4"]["y"]["rmse"]
         assert results[name]["validation"] != results[name]["test"]
     (table,) = model_tables(facts, read_choice(copied))
     rows = {cells[0]: cells[1:] for cells in table.rows}
     assert list(rows)[-2:] == ["Persistence", "Ridge ARX"]
-    assert len(rows) == len(found.facts["candidates"]) + 2
-    kept = found.facts["candidates"][found.facts["chosen"]]
+    assert len(rows) == len(found.choice.to_table()["candidates"]) + 2
+    kept = found.choice.to_table()["candidates"][found.choice.to_table()["chosen"]]
     (marked,) = table.marked
     assert table.rows[marked][0] == kept["label"]
     promise, test = (float(cell) for cell in rows[kept["label"]][-2:])
     assert promise == pytest.approx(kept["promise"]["4"]["y"], rel=0.01)
-    assert test == pytest.approx(models["network"]["overall"]["4"]["y"]["rmse"], rel=0.01)
+    assert test == pytest.approx(models["network"].overall["4"]["y"]["rmse"], rel=0.01)
     others = [
         cells for label, cells in rows.items() if label in {"the linear model", "the committee"} - {kept["label"]}
     ]
     assert all(cells[1] == cells[3] == MISSING for cells in others)  # the test part was opened for one model alone
     assert "Every model, output by output" in build_report(copied).read_text()
-    assert train_auto(source, load_auto(None, SET), copied).facts["results"] == results
+    assert train_auto(source, load_auto(None, SET), copied).choice.to_table()["results"] == results
 
 
 def test_a_target_that_never_moves_is_refused(tmp_path):
@@ -340,7 +343,7 @@ def test_a_recurrent_network_is_trained_to_the_end_where_its_trial_comes_near_th
     monkeypatch.setattr("edp.workflows.auto.train_candidates.MARGIN", margin)
     told = NotedProgress()
     source = write(tmp_path / "logs", ticks=1500)
-    facts = train_auto(source, load_auto(None, SET), tmp_path / "run", told).facts
+    facts = train_auto(source, load_auto(None, SET), tmp_path / "run", told).choice.to_table()
     assert sorted(path.name for path in (tmp_path / "run" / "candidates").iterdir()) == trained
     assert list(facts["candidates"]) == ["linear", "committee", "recurrent"]
     assert any("short trial" in note for note in facts["notes"]) == (len(trained) == 1)
@@ -385,11 +388,12 @@ def scores(network, **others):
     def model(errors):
         return {"overall": {"1": {name: {"rmse": value} for name, value in errors.items()}}, "label": "x"}
 
-    return {
+    table = {
         "task": {"horizons": [1]},
         "targets": [{"name": "a"}, {"name": "b"}],
         "models": {"network": model(network), **{name: model(errors) for name, errors in others.items()}},
     }
+    return ScoresFile.from_table(table, "scores")
 
 
 def test_the_guard_names_the_baseline_that_wins_and_where():

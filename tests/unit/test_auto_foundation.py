@@ -48,7 +48,7 @@ def pretrained(tmp_path_factory):
 def test_it_is_trained_on_and_judged_in_the_units_of_the_data(pretrained, tmp_path):
     source = logs(tmp_path / "logs", 1.5)
     changes = [*AUTO, f"auto.foundation='{pretrained}'", "auto.candidates=['linear', 'foundation']"]
-    facts = train_auto(source, load_auto(None, changes), tmp_path / "run").facts
+    facts = train_auto(source, load_auto(None, changes), tmp_path / "run").choice.to_table()
     assert set(facts["candidates"]) == {"linear", "foundation"}
     promised = facts["candidates"]["foundation"]["promise"]["4"]["y"]
     # A scale of the source in place of the data's would put the promise far from what is measured.
@@ -63,11 +63,11 @@ def test_alone_it_is_kept_as_a_run_like_any_other(pretrained, tmp_path):
     source = logs(tmp_path / "logs", 1.5)
     changes = [*AUTO, f"auto.foundation='{pretrained}'", "auto.candidates=['foundation']"]
     found = train_auto(source, load_auto(None, changes), tmp_path / "run")
-    assert found.facts["chosen"] == "foundation"
+    assert found.choice.to_table()["chosen"] == "foundation"
     bundle, experiment, _, _ = trained_run(tmp_path / "run")
     assert experiment.model == bundle.predictor.spec
     assert experiment.training.bagging is None
-    assert train_auto(source, load_auto(None, changes), tmp_path / "run").facts == found.facts
+    assert train_auto(source, load_auto(None, changes), tmp_path / "run").choice.to_table() == found.choice.to_table()
 
 
 @pytest.mark.parametrize(

@@ -267,7 +267,7 @@ def write(folder: Path, oddity: Oddity) -> DataSource:
 
 def check(source: DataSource, settings: Sequence[str], factor: float, folder: Path, path: Path | None = None) -> None:
     """Train, judge beside simple rivals, and draw the page."""
-    facts = train_auto(source, load_auto(path, [*settings, *QUICK]), folder).facts
+    facts = train_auto(source, load_auto(path, [*settings, *QUICK]), folder).choice.to_table()
     for candidate in facts["candidates"].values():
         promised = [error for row in candidate["promise"].values() for error in row.values()]
         assert np.isfinite(promised).all()

@@ -14,6 +14,7 @@ from edp.data.series import Series
 from edp.data.task import TargetMode, Task
 from edp.errors import StorageError
 from edp.evaluation.guard import beaten_by
+from edp.evaluation.scores_file import DataSituation, ModelScores, ScoredTarget, ScoredTask, ScoresFile
 from edp.evaluation.situation import situation_of
 from edp.report.run.choice import note_test_result, promise_line, read_choice
 from edp.report.run.outputs import minutes_of, situation_line
@@ -78,15 +79,17 @@ def content(test=1.1, floor=2.0):
     }  # fmt: skip
 
 
-def scores(value):
-    model = {"label": "m", "overall": {"1": {"v": {"rmse": value}, "mean": {"rmse": value}}}}
-    return {"models": {"network": model}}
+def scores(value, **models):
+    network = ModelScores(label="m", overall={"1": {"v": {"rmse": value}, "mean": {"rmse": value}}})
+    return ScoresFile(
+        task=ScoredTask(horizons=(1,)), targets=(ScoredTarget(name="v"),), models={"network": network, **models}
+    )
 
 
 def test_what_became_of_a_promise_is_said(tmp_path):
     (tmp_path / "auto.json").write_text(json.dumps(content()))
     assert promise_line(read_choice(tmp_path)) == ""
-    note_test_result(tmp_path, scores(1.1), scores(2.0)["models"]["network"])
+    note_test_result(tmp_path, scores(1.1), scores(2.0).models["network"])
     assert promise_line(read_choice(tmp_path)) == (
         "The promised error held on 1 of 1 pair of output and horizon (within its 90 % interval); relative to the "
         "linear model's it was promised as 0.50 and is 0.55."
@@ -98,10 +101,7 @@ def test_what_became_of_a_promise_is_said(tmp_path):
 
 def test_who_gave_the_preset_auto_too_little_time_is_told_to_give_it_more(tmp_path):
     (tmp_path / "auto.json").write_text(json.dumps(content()))
-    overall = {"1": {"v": {"rmse": 0.5}}}
-    judged = scores(1.0)
-    judged["models"]["trees"] = {"label": "Trees", "overall": overall}
-    judged |= {"task": {"horizons": [1]}, "targets": [{"name": "v"}]}
+    judged = scores(1.0, trees=ModelScores(label="Trees", overall={"1": {"v": {"rmse": 0.5}}}))
     assert "more than 1 minute (" in beaten_by(judged, minutes_of(tmp_path)).sentence()
     assert "train with the preset auto" in beaten_by(judged, minutes_of(tmp_path / "none")).sentence()
 
@@ -150,17 +150,17 @@ def walk(seed, size=1.0, samples=2000):
 
 def test_a_test_like_the_training_is_no_other_situation():
     found = situation_of(prepared(walk(0), walk(1)))
-    assert found == {"outside": [], "changes": []}
-    assert situation_line({"situation": found}) == situation_line({}) == ""
+    assert found == DataSituation(outside=(), changes=())
+    assert situation_line(replace(scores(1.0), situation=found)) == situation_line(scores(1.0)) == ""
 
 
 def test_values_outside_of_the_range_and_changes_of_another_size_are_said():
     found = situation_of(prepared(walk(0), walk(1, size=3.0)))
-    assert [row["channel"] for row in found["outside"]] == ["v"]
-    assert found["outside"][0]["share"] == pytest.approx(1 - 2 * np.arcsin(1 / 3) / np.pi, abs=0.05)
-    assert {row["horizon"] for row in found["changes"]} == {1, 5}
-    assert all(row["ratio"] == pytest.approx(3.0, rel=0.05) for row in found["changes"])
-    line = situation_line({"situation": found})
+    assert [row.channel for row in found.outside] == ["v"]
+    assert found.outside[0].share == pytest.approx(1 - 2 * np.arcsin(1 / 3) / np.pi, abs=0.05)
+    assert {row.horizon for row in found.changes} == {1, 5}
+    assert all(row.ratio == pytest.approx(3.0, rel=0.05) for row in found.changes)
+    line = situation_line(replace(scores(1.0), situation=found))
     assert "v is outside of its range in training in" in line
     assert "3 times as large as in training" in line
 
@@ -168,26 +168,26 @@ def test_values_outside_of_the_range_and_changes_of_another_size_are_said():
 def test_a_test_at_rest_is_said_and_one_that_never_moves_is_no_error():
     rest = walk(1)
     rest[:, 1] = 0.01 * np.random.default_rng(0).normal(size=len(rest))
-    assert "times as large" in situation_line({"situation": situation_of(prepared(walk(0), rest))})
+    assert "times as large" in situation_line(replace(scores(1.0), situation=situation_of(prepared(walk(0), rest))))
     rest[:, 1] = 0.0
-    assert situation_of(prepared(walk(0), rest))["changes"] == []
-    assert situation_of(prepared(rest, rest))["outside"] == []
+    assert situation_of(prepared(walk(0), rest)).changes == ()
+    assert situation_of(prepared(rest, rest)).outside == ()
 
 
 def test_a_bundle_alone_has_no_training_to_differ_from():
     alone = replace(prepared(walk(0), walk(1)), train=[], validation=[])
-    assert situation_of(alone) == {"outside": [], "changes": []}
+    assert situation_of(alone) == DataSituation(outside=(), changes=())
 
 
 def test_a_training_no_longer_than_the_horizon_has_no_changes_to_compare():
     found = situation_of(prepared(walk(0, samples=4), walk(1)))
-    assert {row["horizon"] for row in found["changes"]} <= {1, 5}
+    assert {row.horizon for row in found.changes} <= {1, 5}
 
 
 def test_rare_pulses_are_said():
     pulses = walk(1)
     pulses[::100, 1] += 0.1
-    line = situation_line({"situation": situation_of(prepared(walk(0), pulses))})
+    line = situation_line(replace(scores(1.0), situation=situation_of(prepared(walk(0), pulses))))
     assert "of the changes of v in" in line
 
 

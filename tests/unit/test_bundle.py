@@ -12,6 +12,7 @@ from edp.errors import BundleError, StorageError
 from edp.networks.outputs import OUTPUTS
 from edp.networks.predictor import Predictor, build_model
 from edp.networks.running import stream_intervals, stream_predictions
+from edp.settings.provenance import Provenance
 from edp.signals import Channel, Kind
 from edp.training.bundle import (
     ADAPTED_SCHEMA,
@@ -35,7 +36,9 @@ def network(tiny, model, seed=1):
 
 @pytest.fixture
 def folder(tmp_path, tiny, tiny_bypass):
-    return save_bundle(make_bundle(network(tiny, tiny_bypass), tiny, {"seed": 1}, {"score": 0.5}), tmp_path / "b")
+    return save_bundle(
+        make_bundle(network(tiny, tiny_bypass), tiny, Provenance(seed=1), {"score": 0.5}), tmp_path / "b"
+    )
 
 
 def predictions(predictor, tiny):
@@ -52,7 +55,7 @@ def test_a_round_trip_predicts_the_same_bits(folder, tiny, tiny_bypass):
     assert loaded.inputs == tiny.inputs
     assert loaded.target_kinds == tiny.target_kinds
     assert loaded.descriptions == tiny.descriptions
-    assert (loaded.provenance, loaded.scores) == ({"seed": 1}, {"score": 0.5})
+    assert (loaded.provenance, loaded.scores) == (Provenance(seed=1), {"score": 0.5})
 
 
 def test_every_structure_survives_a_round_trip(structure, predictor_of, tmp_path, tiny):
@@ -71,7 +74,7 @@ def test_every_structure_survives_a_round_trip(structure, predictor_of, tmp_path
 def test_calibrated_intervals_survive_a_round_trip(output, tmp_path, tiny, tiny_model):
     predictor = network(tiny, replace(tiny_model, output=OUTPUTS[output]()))
     predictor.output.stretch.uniform_(0.5, 2.0)
-    loaded = load_bundle(save_bundle(make_bundle(predictor, tiny, {}), tmp_path)).predictor
+    loaded = load_bundle(save_bundle(make_bundle(predictor, tiny), tmp_path)).predictor
     wanted, found = (stream_intervals(net, tiny.test)[0] for net in (predictor, loaded))
     np.testing.assert_array_equal(found, wanted)
     assert loaded.spec.output == predictor.spec.output
@@ -85,13 +88,13 @@ def test_a_bundle_from_before_outputs_had_kinds_says_points(folder):
 
 
 def test_a_run_folder_opens_its_bundle(tmp_path, tiny, tiny_model):
-    save_bundle(make_bundle(network(tiny, tiny_model), tiny, {}), tmp_path / "bundle")
+    save_bundle(make_bundle(network(tiny, tiny_model), tiny), tmp_path / "bundle")
     assert load_bundle(tmp_path).task == tiny.task
 
 
 def test_saving_again_replaces_header_and_weights(folder, tiny, tiny_bypass):
     other = network(tiny, tiny_bypass, seed=2)
-    save_bundle(make_bundle(other, tiny, {}), folder)
+    save_bundle(make_bundle(other, tiny), folder)
     assert len(list(folder.iterdir())) == 2
     np.testing.assert_array_equal(predictions(load_bundle(folder).predictor, tiny), predictions(other, tiny))
 
@@ -186,9 +189,9 @@ def test_a_full_disk_leaves_the_old_bundle(write, folder, tiny, tiny_bypass, mon
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(StorageError, match="No space left on device; free space"):
-        save_bundle(make_bundle(network(tiny, tiny_bypass, seed=2), tiny, {}), folder)
+        save_bundle(make_bundle(network(tiny, tiny_bypass, seed=2), tiny), folder)
     np.testing.assert_array_equal(predictions(load_bundle(folder).predictor, tiny), before)
     assert not list(folder.glob("*.tmp")) + list(folder.glob(".*.tmp"))
     monkeypatch.undo()
-    save_bundle(make_bundle(network(tiny, tiny_bypass, seed=2), tiny, {}), folder)
+    save_bundle(make_bundle(network(tiny, tiny_bypass, seed=2), tiny), folder)
     assert len(list(folder.iterdir())) == 2

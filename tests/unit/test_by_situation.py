@@ -1,5 +1,7 @@
 """Errors by what the axes did: situations by hand, shares that add up, and targets that have none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,9 @@ from edp.data.series import Series
 from edp.data.task import TargetMode, Task
 from edp.evaluation.by_situation import NEAR_STOP, SITUATIONS, Situations
 from edp.evaluation.judge import score_predictions
+from edp.evaluation.scores_file import ModelScores, ScoredTarget, ScoredTask, ScoresFile
 from edp.report.run.sheets import situation_table
+from edp.settings.results import plain_value
 from edp.signals import Channel, Kind
 
 RATE, STILL = 10.0, 0.0
@@ -84,7 +88,7 @@ def test_targets_that_are_no_velocities_have_no_situations():
     data = prepared(kinds=(Kind.PRESSURE,), channels=channels, targets=("p",))
     assert Situations(data).axes == ()
     scores = score_predictions([np.repeat(data.test[0].targets[:, None], 1, axis=1)], data, 0)
-    assert "by_situation" not in scores
+    assert scores.by_situation == {}
 
 
 def test_an_axis_that_never_moves_has_no_situations():
@@ -102,7 +106,7 @@ def scores():
 
 def test_errors_and_shares(scores):
     """Errors are those of the ticks of a situation; situations that leave nothing out hold all of the error."""
-    data, row = scores
+    data, row = scores[0], plain_value(scores[1])
     found = found_of(data, data.test[0].samples - 1)
     size = 1e3 * np.abs(np.diff(data.test[0].targets[:, 0].astype(np.float64)))
     rows = {entry["situation"]: entry for entry in row["by_situation"]["1"]}
@@ -121,7 +125,7 @@ def test_ticks_without_a_prediction_are_left_out():
     data = prepared()
     values = data.test[0].targets[:, None].copy()
     values[:40] = np.nan
-    rows = score_predictions([values], data, 3)["by_situation"]["1"]
+    rows = plain_value(score_predictions([values], data, 3).by_situation["1"])
     shares = {row["situation"]: row["share"] for row in rows}
     assert all(np.isfinite(list(row["mae"].values())).all() for row in rows)
     assert max(shares.values()) <= 1.0
@@ -130,13 +134,13 @@ def test_ticks_without_a_prediction_are_left_out():
 def test_table_shows_most_of_the_error_first_and_the_best_baseline(scores):
     data, held = scores
     better = score_predictions([1.0 * data.test[0].targets[:, None] * 0.99], data, 3)
-    models = {
-        "network": {"label": "network", **better},
-        "persistence": {"label": "Persistence", **held},
-    }
-    content = {"targets": [{"name": "v", "unit": "mm/s"}], "task": {"horizons": [1]}, "models": models}
+    content = ScoresFile(
+        task=ScoredTask(horizons=(1,)),
+        targets=(ScoredTarget(name="v", unit="mm/s"),),
+        models={"network": replace(better, label="network"), "persistence": replace(held, label="Persistence")},
+    )
     sheet = situation_table(content, 1)
     assert [c.heading for c in sheet.columns] == ["Situation", "Of the time", "Of the error", "v", "Relative to"]
     shown = [float(text[2].split()[0]) for text in sheet.texts()]
     assert shown == sorted(shown, reverse=True)
-    assert situation_table({**content, "models": {"network": {"label": "n", "overall": {}}}}, 1) is None
+    assert situation_table(replace(content, models={"network": ModelScores(label="n", overall={})}), 1) is None

@@ -84,8 +84,8 @@ def test_pruned_starts_further_recordings_and_teachers_take_part(run, lever_sess
         spec=DistilSpec(units=4, levels=2), teachers=(str(tmp_path / "plain"),), further=lever_sessions
     )
     taught = distil(run / "bundle", spec, tmp_path / "taught")
-    assert len(taught.provenance["strategy"]["teachers"]) == 2
-    assert len(taught.provenance["strategy"]["further"]) == 5
+    assert len(taught.provenance.more["strategy"]["teachers"]) == 2
+    assert len(taught.provenance.more["strategy"]["further"]) == 5
 
 
 def test_a_pruned_student_has_no_levels_of_its_own():
@@ -126,7 +126,7 @@ def test_other_recordings_can_be_learned_on(run, lever_sessions, tmp_path):
         run, DistilRequest(spec=DistilSpec(units=4), changes=("training.epochs=1",)), tmp_path / "other", source
     )
     assert dataclasses.is_dataclass(bundle)
-    assert bundle.provenance["data"]["source"] == str(lever_sessions.path)
+    assert bundle.provenance.origin.source == str(lever_sessions.path)
 
 
 def test_the_command_makes_a_run_and_says_what_it_is(run, tmp_path):

@@ -86,7 +86,7 @@ def test_sizes_are_those_of_table_4_9(name, size):
 
 def test_a_quantised_network_is_not_saved_as_if_it_were_not(tiny, network, tmp_path):
     with pytest.raises(BundleError, match="dynamic int8"):
-        save_bundle(make_bundle(dynamic_int8(network).predictor, tiny, {}), tmp_path / "bundle")
+        save_bundle(make_bundle(dynamic_int8(network).predictor, tiny), tmp_path / "bundle")
     assert not (tmp_path / "bundle").exists()
     with pytest.raises(ExportError, match="dynamic int8 has no list of float32 layers"):
         dynamic_int8(network).predictor.graph()

@@ -1,5 +1,7 @@
 """Scores of recordings hold what the verdict compares, so that a verdict on several outputs has an interval."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from edp.evaluation.guard import network_verdict
@@ -13,10 +15,10 @@ def test_scores_by_recording_give_the_verdict_an_interval(tiny):
 
     def model(label, error):
         noisy = [(number, values + error * rng.standard_normal(values.shape)) for number, values in truth]
-        return {"label": label, **ruler.measure(noisy)}
+        return replace(ruler.measure(noisy), label=label)
 
-    scores = ruler.header() | {"models": {"network": model("network", 0.1), "other": model("other", 0.4)}}
-    for recording in scores["models"]["network"]["recordings"].values():
+    scores = ruler.file({"network": model("network", 0.1), "other": model("other", 0.4)}, ())
+    for recording in scores.models["network"].recordings.values():
         for errors in recording.values():
             assert all({"mae", "rmse"} <= errors[name].keys() for name in tiny.task.targets)
     verdict = network_verdict(scores)

@@ -1,4 +1,5 @@
 import json
+from dataclasses import asdict
 from statistics import NormalDist
 
 import numpy as np
@@ -107,7 +108,7 @@ def test_mean_over_outputs(pair):
 
 
 def test_spread():
-    assert spread([4.0, 1.0, 2.0, 3.0, 5.0]) == {
+    assert asdict(spread([4.0, 1.0, 2.0, 3.0, 5.0])) == {
         "median": 3.0,
         "q25": 2.0,
         "q75": 4.0,
@@ -115,7 +116,7 @@ def test_spread():
         "max": 5.0,
         "std": pytest.approx(2.5**0.5),
     }
-    assert spread([2.0])["std"] is None
+    assert spread([2.0]).std is None
     with pytest.raises(DataError, match="NaN"):
         spread([1.0, float("nan")])
 

@@ -291,5 +291,5 @@ def test_baselines_do_not_see_the_physics_columns(truth):
         data = prepare(recordings, task, split, 10)
         predictor = build_model(task, ModelSpec(physics=spec, window=10), data.scaler(), seed=0).eval()
         found = judge(predictor, data, JudgeSpec(baselines=("persistence", "ridge_arx"), history=10), "network")
-        scores.append({name: found.scores["models"][name]["overall"] for name in ("persistence", "ridge_arx")})
+        scores.append({name: found.scores.models[name].overall for name in ("persistence", "ridge_arx")})
     assert scores[0] == scores[1]

@@ -61,7 +61,7 @@ def test_the_result_is_an_ordinary_network_on_the_grid(tiny, tiny_model, brief, 
         torch.testing.assert_close(matrix.values.detach(), levels * steps, rtol=1e-6, atol=0)
         assert levels.abs().max() == 127
     assert not same(net, start)
-    save_bundle(make_bundle(net, tiny, {}), tmp_path / "bundle")
+    save_bundle(make_bundle(net, tiny), tmp_path / "bundle")
     assert same(load_bundle(tmp_path / "bundle").predictor, net)
     TARGETS["c"]().write(load_bundle(tmp_path / "bundle"), "rounded", tmp_path / "c")
     with torch.no_grad():

@@ -124,10 +124,10 @@ def test_baselines_do_not_see_the_start_and_it_is_not_scored(free, predictor):
     spec = JudgeSpec(baselines=("persistence", "ridge_arx"), history=5, skip=0)
     assert baseline_task(free, spec).present == (None,)
     found = judge(predictor.float(), free, spec, "network").scores
-    assert found["task"]["skip"] == TICKS
+    assert found.task.skip == TICKS
     changed = dataclasses.replace(free, test=[dataclasses.replace(s, inputs=s.inputs * [1, 0]) for s in free.test])
     again = judge(predictor.float(), changed, spec, "network").scores
-    assert found["models"]["ridge_arx"]["overall"] == again["models"]["ridge_arx"]["overall"]
+    assert found.models["ridge_arx"].overall == again.models["ridge_arx"].overall
 
 
 def test_a_network_learns_to_start_from_a_measured_state(free, tiny_model, tiny_training):
@@ -151,6 +151,6 @@ def test_a_network_learns_to_start_from_a_measured_state(free, tiny_model, tiny_
     def error(data):
         fitted = fit(data, tiny_model, spec)
         scores = judge(fitted.predictor, data, JudgeSpec(baselines=(), skip=TICKS), "").scores
-        return scores["models"]["network"]["overall"]["0"]["mean"]["mae"]
+        return scores.models["network"].overall["0"]["mean"]["mae"]
 
     assert error(free) < 0.7 * error(blind)

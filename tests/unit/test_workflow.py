@@ -15,6 +15,7 @@ from edp.cli.evaluate import score_table
 from edp.config.experiment import load_experiment
 from edp.data.prepared import Prepared
 from edp.errors import ConfigError, DataError, EdpError, StorageError
+from edp.evaluation.scores_file import ScoresFile
 from edp.logs import open_log, read_recording, write_recording
 from edp.logs.repair import Repair
 from edp.networks.running import stream_intervals
@@ -142,7 +143,7 @@ def test_a_run_that_diverged_says_so_again_and_keeps_what_was_good(logs, tmp_pat
     assert (status["status"], status["epoch"], status["update"], status["kept_epoch"]) == ("diverged", 2, 5, 1)
     assert len((run / "history.jsonl").read_text().splitlines()) == 1
     kept = load_bundle(run)
-    assert "the training diverged" in kept.provenance["diverged"]
+    assert "the training diverged" in kept.provenance.more["diverged"]
     bits = _contents(run)
     with pytest.raises(
         Diverged, match=r"diverged on 20.*nan at update 5.*would do so again.*another folder with --out"
@@ -201,7 +202,7 @@ def test_intervals_are_judged_and_shown(output, logs, tmp_path, capsys):
     mae = scores["models"]["network"]["overall"]["2"]["v"]["mae"]
     weighted = 0.5 * mae + sum(0.5 * (1 - row["coverage"]) * row["score"]["v"] for row in rows)
     assert scores["models"]["network"]["weighted_interval_score"]["2"]["v"] == pytest.approx(weighted / 2.5)
-    score_table(scores)
+    score_table(ScoresFile.read(tmp_path / "run"))
     assert "meant" in capsys.readouterr().out
     page = build_report(tmp_path / "run").read_text(encoding="utf-8")
     assert "Meant to hold" in page
@@ -261,7 +262,7 @@ def test_a_bundle_is_judged_without_a_run_folder(logs, tmp_path):
     data = prepare_data(source_of(logs), experiment())
     assert isinstance(data, Prepared)
     found = judge_bundle(bundle, data, experiment().judge)
-    assert found.scores["models"]["network"]["overall"]["2"]["mean"]["mae"] > 0
+    assert found.scores.models["network"].overall["2"]["mean"]["mae"] > 0
 
 
 def test_data_set_files_give_parts_names_and_maps(logs):

@@ -43,7 +43,7 @@ def compare(
     emit(as_json, {"page": str(page), **facts_of(comparison)}, show)
 
 
-def facts_of(comparison: Any) -> dict[str, Any]:
+def facts_of(comparison: Any) -> dict[str, object]:
     """Return a comparison as JSON types."""
     rows = []
     for measure in comparison.measures:

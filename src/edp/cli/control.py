@@ -149,9 +149,9 @@ def tune(
     end_with(verdict)
 
 
-def _options(task: str, machine: str, controller: str, seeds: int | None) -> dict[str, Any]:
+def _options(task: str, machine: str, controller: str, seeds: int | None) -> dict[str, object]:
     """Return the settings of the given options."""
-    options: dict[str, Any] = {"machine": machine} if machine else {}
+    options: dict[str, object] = {"machine": machine} if machine else {}
     options |= {} if seeds is None else {"loops": seeds}
     options |= {"task": {"kind": task}} if task else {}
     return options | ({"controller": {"kind": controller}} if controller else {})

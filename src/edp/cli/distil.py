@@ -72,7 +72,7 @@ def distil(
     facts = {
         "run": str(folder),
         "bundle": str(folder / "bundle"),
-        "seconds": bundle.provenance["seconds"],
+        "seconds": bundle.provenance.seconds,
         "validation_mae": progress.display.measured("validation_mae"),
         **{name: {"parameters": count.parameters, "macs_tick": count.macs_tick} for name, count in counts.items()},
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -30,6 +30,7 @@ from edp.wording import figure, number, percent, setting_text
 
 if TYPE_CHECKING:
     from edp.evaluation.channel_importance import ChannelImportances
+    from edp.evaluation.scores_file import ScoresFile
     from edp.jobs import Workers
     from edp.logs.source import DataSource
 
@@ -90,7 +91,7 @@ def evaluate(
     from edp.evaluation.guard import network_verdict
     from edp.report.run.choice import promise_line, read_choice
     from edp.report.run.outputs import judged_line, losses_line, minutes_of, situation_line
-    from edp.storage.provenance import read_provenance
+    from edp.settings.provenance import read_provenance
 
     folder, scores = run_evaluation(run, source, names, as_json, minutes, divided, at_most)
     verdict = network_verdict(scores, minutes_of(run))
@@ -111,23 +112,23 @@ def evaluate(
         out.print(f"next: edp report {folder}")
 
     sentences = {"losses": lost, "tests": judged, "promise": promise, "situation_line": beyond}
-    facts = {"folder": str(folder), **verdict_facts(verdict), **sentences, **scores}
+    facts = {"folder": str(folder), **verdict_facts(verdict), **sentences, **scores.to_table()}
     importance_json = {} if importances is None else {"channel_importance": importances.to_json()}
     emit(as_json, facts | importance_json, show)
     end_with(verdict)
 
 
-def show_scores(scores: dict[str, Any], sentences: Sequence[str], minutes: float | None) -> None:
+def show_scores(scores: ScoresFile, sentences: Sequence[str], minutes: float | None) -> None:
     """Print the tables of an evaluation, its messages, and the parts omitted for lack of time."""
     score_table(scores)
     by_situation_table(scores)
     for sentence in sentences:
         if sentence:
             out.print(sentence)
-    if "drawn" in scores:
-        out.print(f"judged on {scores['drawn']['what']}; leave --at-most out for all")
-    if scores.get("left_out"):
-        left = ", ".join(map(str, scores["left_out"]))
+    if scores.drawn is not None:
+        out.print(f"judged on {scores.drawn.what}; leave --at-most out for all")
+    if scores.left_out:
+        left = ", ".join(scores.left_out)
         out.print(
             f"left out after --minutes {setting_text(minutes)}: {left}; give the command without it to judge them, too"
         )
@@ -146,27 +147,26 @@ def evaluate_twin_run(run: Path, source: DataSource | None, predictor: Path | No
     """Judge a twin with a progress display, and print its scores."""
     from edp.cli.twin import ahead_table, coverage_table, score_table, situation_table
     from edp.evaluation.beyond import beyond_sentence
+    from edp.evaluation.free_run_file import TWIN, FreeRunFile
     from edp.evaluation.guard import twin_verdict
-    from edp.storage import read_object
     from edp.workflows.twin import evaluate_twin
-    from edp.workflows.twin.judge_twin import SCORES
 
     with shown_progress("evaluate", as_json) as progress:
         folder = evaluate_twin(run, source, predictor, progress)
-    scores = read_object(folder / SCORES)
-    verdict = twin_verdict(scores["models"])
+    scores = FreeRunFile.read(folder)
+    verdict = twin_verdict(scores.models)
 
     def show() -> None:
         show_verdict(verdict)
-        if note := beyond_sentence(scores["models"]["twin"].get("beyond", {})):
+        if note := beyond_sentence(scores.models[TWIN].beyond):
             out.print(note, style="bold")
-        score_table(scores["models"])
+        score_table(scores.models)
         for print_table in (coverage_table, situation_table, ahead_table):
-            print_table(scores["models"]["twin"])
-        out.print(f"scores in {folder / SCORES}")
+            print_table(scores.models[TWIN])
+        out.print(f"scores in {folder / FreeRunFile.NAME}")
         out.print(f"next: edp report {folder}")
 
-    emit(as_json, {"folder": str(folder), **verdict_facts(verdict), **scores}, show)
+    emit(as_json, {"folder": str(folder), **verdict_facts(verdict), **scores.to_table()}, show)
     end_with(verdict)
 
 
@@ -178,15 +178,15 @@ def run_evaluation(
     minutes: float | None = None,
     workers: Workers | None = None,
     at_most_h: float | None = None,
-) -> tuple[Path, dict[str, Any]]:
+) -> tuple[Path, ScoresFile]:
     """Judge with a progress display; returns the folder of the scores and the scores."""
+    from edp.evaluation.scores_file import ScoresFile
     from edp.jobs import IN_PROCESS
-    from edp.storage import read_object
     from edp.workflows.train_evaluate import evaluate as judge_run
 
     with shown_progress("evaluate", quiet, timed=True) as progress:
         folder = judge_run(run, source, names, progress, minutes, workers or IN_PROCESS, at_most_h)
-    return folder, read_object(folder / "scores.json")
+    return folder, ScoresFile.read(folder)
 
 
 def run_importance(
@@ -218,73 +218,81 @@ def importance_table(importances: ChannelImportances) -> None:
         table(title, ["channel", "its own", "95 %", "with all it shares", "explained by others"], rows)
 
 
-def score_table(scores: dict[str, Any]) -> None:
+def score_table(scores: ScoresFile) -> None:
     """Print one table per horizon: mean scores of every model, best first."""
     from edp.evaluation.guard import MEASURE, MEASURE_NAME
+    from edp.evaluation.scores_file import MEAN, metric
 
-    rate = scores["task"]["rate_hz"]
-    units = {target["unit"] for target in scores["targets"]}
+    units = {target.unit for target in scores.targets}
     unit = units.pop() if len(units) == 1 else "mixed units"
-    if len(scores["targets"]) > 1 and unit in ("mixed units", "1"):
-        _tables_by_output(scores, rate)
+    if len(scores.targets) > 1 and unit in ("mixed units", "1"):
+        _tables_by_output(scores)
         interval_rows(scores, unit)
         return
-    for horizon in scores["task"]["horizons"]:
+    for horizon in scores.task.horizons:
         rows = []
-        for model in scores["models"].values():
-            s = model["overall"][str(horizon)]["mean"]
+        for model in scores.models.values():
+            s = model.overall[str(horizon)][MEAN]
             r2 = "-" if s["r2"] is None else number(s["r2"], 4)
-            figures = [figure(s[key]) for key in (MEASURE, "mae", "p95", "p99", "composite")]
-            rows.append((s[MEASURE], [model["label"], *figures, r2]))
+            figures = [figure(metric(s, key)) for key in (MEASURE, "mae", "p95", "p99", "composite")]
+            rows.append((metric(s, MEASURE), [model.label, *figures, r2]))
         rows.sort(key=lambda row: row[0])
-        ahead = f"{number(1e3 * horizon / rate, 0)} ms ahead (k = {horizon})"
+        ahead = _ahead(scores, horizon)
         heads = ["model", MEASURE_NAME, "MAE", "P95", "P99", "composite", "R2"]
         table(f"{ahead}, mean over outputs, {unit}", heads, [row for _, row in rows])
     interval_rows(scores, unit)
-    for name, model in scores["models"].items():
-        for target, integral_scores in model.get("integrated", {}).items():
-            out.print(f"free run of the integral of {target}, {name}: RMSE {figure(integral_scores['rmse'])} {unit} s")
+    for name, model in scores.models.items():
+        for target, integral_scores in model.integrated.items():
+            out.print(
+                f"free run of the integral of {target}, {name}: RMSE {figure(metric(integral_scores, 'rmse'))} {unit} s"
+            )
 
 
-def by_situation_table(scores: dict[str, Any]) -> None:
+def _ahead(scores: ScoresFile, horizon: int) -> str:
+    rate = scores.task.rate_hz
+    return f"k = {horizon}" if rate is None else f"{number(1e3 * horizon / rate, 0)} ms ahead (k = {horizon})"
+
+
+def by_situation_table(scores: ScoresFile) -> None:
     """Print the network's error by motion of the axes, at the longest horizon, if the scores contain it."""
     from edp.report.run.sheets import situation_table
 
-    horizon = max(scores["task"]["horizons"])
+    horizon = max(scores.task.horizons)
     sheet = situation_table(scores, horizon)
     if sheet is not None:
         heads = [f"{column.heading}{f', {column.unit}' if column.unit else ''}" for column in sheet.columns]
         table(f"{sheet.caption}, k = {horizon}", heads, [list(row) for row in sheet.texts()])
 
 
-def _tables_by_output(scores: dict[str, Any], rate: float) -> None:
+def _tables_by_output(scores: ScoresFile) -> None:
     """Print one table per horizon with one column per output, for outputs in different units, which have no mean."""
     from edp.evaluation.guard import MEASURE, MEASURE_NAME
+    from edp.evaluation.scores_file import metric
 
-    targets = scores["targets"]
-    heads = ["model", *(f"{t['name']}{'' if t['unit'] == '1' else ', ' + t['unit']}" for t in targets)]
-    for horizon in scores["task"]["horizons"]:
+    targets = scores.targets
+    heads = ["model", *(f"{t.name}{'' if t.unit == '1' else ', ' + t.unit}" for t in targets)]
+    for horizon in scores.task.horizons:
         errors = {
-            model["label"]: [model["overall"][str(horizon)][t["name"]][MEASURE] for t in targets]
-            for model in scores["models"].values()
+            model.label: [metric(model.overall[str(horizon)][t.name], MEASURE) for t in targets]
+            for model in scores.models.values()
         }
-        ahead = f"{number(1e3 * horizon / rate, 0)} ms ahead (k = {horizon})"
+        ahead = _ahead(scores, horizon)
         rows = [[label, *(figure(value) for value in values)] for label, values in errors.items()]
         table(f"{ahead}, {MEASURE_NAME} of each output", heads, rows)
-    for name, model in scores["models"].items():
-        for target, integral_scores in model.get("integrated", {}).items():
-            out.print(f"free run of the integral of {target}, {name}: RMSE {figure(integral_scores['rmse'])}")
+    for name, model in scores.models.items():
+        for target, integral_scores in model.integrated.items():
+            out.print(f"free run of the integral of {target}, {name}: RMSE {figure(metric(integral_scores, 'rmse'))}")
 
 
-def interval_rows(scores: dict[str, Any], unit: str) -> None:
+def interval_rows(scores: ScoresFile, unit: str) -> None:
     """Print how much of the truth the network's intervals hold, where it states any."""
-    intervals = scores["models"]["network"].get("intervals", {})
+    network = scores.models["network"]
     rows = [
-        [f"k = {horizon}", percent(row["coverage"]), percent(row["covered"]["mean"]), f"{figure(row['width']['mean'])}"]
-        for horizon, entries in intervals.items()
+        [f"k = {horizon}", percent(row.coverage), percent(row.covered["mean"]), figure(row.width["mean"])]
+        for horizon, entries in network.intervals.items()
         for row in entries
     ]
     if rows:
         table(f"intervals of the network, mean over outputs, {unit}", ["ahead", "meant", "holds", "mean width"], rows)
-    for horizon, score in scores["models"]["network"].get("weighted_interval_score", {}).items():
+    for horizon, score in network.weighted_interval_score.items():
         out.print(f"weighted interval score, k = {horizon}: {figure(score['mean'])} {unit} (a point: its MAE)")

@@ -108,7 +108,7 @@ def finetune(
         out.print(f"report: {page}")
         out.print(f"next: edp evaluate {folder}, or edp export {folder} --to c --out exported")
 
-    emit(as_json, result | {"run": str(folder), "report": str(page)} | verdict_facts(verdict), show)
+    emit(as_json, result.to_table() | {"run": str(folder), "report": str(page)} | verdict_facts(verdict), show)
     end_with(verdict)
 
 

@@ -11,6 +11,7 @@ from edp.cli.console import JsonFlag, emit, out, table
 from edp.cli.options import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.progress import shown_progress
 from edp.errors import count_of
+from edp.settings.results import plain_value
 from edp.wording import figure
 
 MODELS = ("twin", "persistence")
@@ -50,23 +51,20 @@ def forecast(
         "logs": len(result.files),
         "channels": result.channels,
         "gain": result.gain,
-        "ahead": result.scores,
+        "ahead": plain_value(result.scores),
     }
 
     def show() -> None:
         for row in result.scores.values():
-            unit = row["twin"]["unit"]
             errors = [
                 [
                     name,
-                    row["twin"].get("units", {}).get(name, unit),
-                    *(figure(row[m]["by_channel"][name], 3) for m in MODELS),
+                    row.twin.unit_of(name),
+                    *(figure(one.by_channel[name] or 0.0, 3) for one in (row.twin, row.persistence)),
                 ]
-                for name in row["twin"]["by_channel"]
+                for name in row.twin.by_channel
             ]
-            title = (
-                f"{figure(row['seconds'])} s ahead, commands held: mean absolute error at {row['moments']:,} moments"
-            )
+            title = f"{figure(row.seconds)} s ahead, commands held: mean absolute error at {row.moments:,} moments"
             table(title, ["", "unit", "twin", "present value held"], errors)
         out.print(f"gain of the observer: {figure(result.gain)}")
         out.print(f"{count_of(len(result.files), 'log')} in {folder}, each with {', '.join(result.channels)}")

@@ -12,6 +12,7 @@ from edp.cli.options import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.progress import shown_progress
 from edp.cli.twin import score_table
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
+from edp.settings.results import plain_value
 from edp.wording import figure
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def identify(
     numbers = [row.plain() for row in result.rows]
     verdict = machine_verdict(result.scores)
     facts = {
-        "machine": str(file), "numbers": numbers, "models": result.scores, "notes": result.notes,
+        "machine": str(file), "numbers": numbers, "models": plain_value(result.scores), "notes": result.notes,
         **verdict_facts(verdict),
     }  # fmt: skip
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -137,7 +137,7 @@ def _cut(name: str) -> str:
     return name if len(name) <= _SHOWN_NAME else f"{name[:half]} ... {name[-half:]}"
 
 
-def _facts(proposal: LogsProposal, paths: list[Path], commands: list[str]) -> dict[str, Any]:
+def _facts(proposal: LogsProposal, paths: list[Path], commands: list[str]) -> dict[str, object]:
     clock = proposal.proposal.clock
     return {
         "files": [str(path) for path in paths],

@@ -88,7 +88,7 @@ def fit(
     from edp.workflows.monitor import fit_monitor
     from edp.workflows.monitor.fit_monitor import holds_model
 
-    options: dict[str, Any] = {} if hours is None else {"hours_per_false_alarm": hours}
+    options: dict[str, object] = {} if hours is None else {"hours_per_false_alarm": hours}
     options |= {} if minutes is None else {"minutes": minutes}
     options |= {} if machine is None else {"dictionary": {"machine": machine}}
     experiment = load_monitor_experiment(config, changes, options)

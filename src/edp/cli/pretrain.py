@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -73,7 +73,7 @@ def pretrain(
     emit(as_json, result | {"run": str(folder)}, show)
 
 
-def _tables(result: dict[str, Any]) -> None:
+def _tables(result: dict[str, object]) -> None:
     """Machines of each part, and the errors on those that test."""
     from edp.report.run.sheets import contexts_table, parts_table
 

@@ -177,7 +177,7 @@ def _write_report(study: Path, output: Path | None, pictures: bool) -> Path:
     return write_study_page(read_study(study), study if output is None else output, pictures).page
 
 
-def _facts(result: SearchResult) -> dict[str, Any]:
+def _facts(result: SearchResult) -> dict[str, object]:
     return {
         "study": str(result.folder),
         "state": result.state,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -27,6 +27,7 @@ from edp.wording import figure, number, percent
 if TYPE_CHECKING:
     from edp.jobs import Workers
     from edp.logs.source import DataSource
+    from edp.report.run.choice import AutoChoice
     from edp.training import Bundle
 
 AUTO = "auto"
@@ -80,17 +81,18 @@ def train(
         _train_auto(source, folder, config, [*changes, *own], divided, as_json)
         return
     bundle, best = run(data, folder, config, preset, changes, source, as_json)
+    seconds = bundle.provenance.seconds or 0.0
     facts = {
         "run": str(folder),
         "bundle": str(folder / "bundle"),
         "parameters": sum(parameter.numel() for parameter in bundle.predictor.parameters()),
-        "seconds": bundle.provenance["seconds"],
+        "seconds": seconds,
         "validation_mae": best,
     }
 
     def show() -> None:
         tail = "" if best is None else f", validation MAE {figure(best)} (report units)"
-        out.print(f"trained in {duration(bundle.provenance['seconds'])}{tail}; bundle in {folder / 'bundle'}")
+        out.print(f"trained in {duration(seconds)}{tail}; bundle in {folder / 'bundle'}")
         out.print(f"next: edp evaluate {folder}")
 
     emit(as_json, facts, show)
@@ -108,47 +110,48 @@ def _train_auto(
         err.print(f"train: reads the logs, then trains for at most about {limit} of processor time (--minutes)")
     with shown_progress("train", quiet) as progress:
         result = train_auto(source, settings, folder, progress, workers)
-    facts = {"run": str(folder), "bundle": str(folder / "bundle"), **result.facts}
+    facts = {"run": str(folder), "bundle": str(folder / "bundle"), **result.choice.to_table()}
 
     def show() -> None:
         out.print(result.sentence)
-        for note in result.facts.get("notes", ()):
+        for note in result.choice.notes or ():
             out.print(note)
-        _promise_table(result.facts)
-        _expected_table(result.facts)
+        _promise_table(result.choice)
+        _expected_table(result.choice)
         out.print(f"bundle in {folder / 'bundle'}")
         out.print(f"next: edp evaluate {folder}")
 
     emit(quiet, facts, show)
 
 
-def _promise_table(facts: dict[str, Any]) -> None:
+def _promise_table(choice: AutoChoice) -> None:
     """Print the expected error of each candidate by output."""
     rows = []
-    for name, one in facts["candidates"].items():
-        mark = "*" if name == facts["chosen"] else ""
-        share = percent(math.expm1(facts["excess"][name] - facts["excess"][facts["chosen"]]), signed=True)
-        rows.append([f"{one['label']} {mark}".strip(), f"{one['parameters']:,}", duration(one["seconds"]), share])
-    title = f"error on left-out data against the model that is kept (*), within {figure(facts['minutes'])} min"
+    for name, one in choice.candidates.items():
+        mark = "*" if name == choice.chosen else ""
+        share = percent(math.expm1(choice.excess[name] - choice.excess[choice.chosen]), signed=True)
+        rows.append([f"{one.label} {mark}".strip(), f"{one.parameters:,}", duration(one.seconds), share])
+    title = f"error on left-out data against the model that is kept (*), within {figure(choice.minutes)} min"
     table(title, ["model", "parameters", "trained in", "error"], rows)
 
 
-def _expected_table(facts: dict[str, Any]) -> None:
+def _expected_table(choice: AutoChoice) -> None:
     """Print the error to expect of each output at the longest horizon."""
-    if "interval" not in facts:
+    interval, skill = choice.interval, choice.skill
+    if interval is None or skill is None:
         return  # a run of an earlier version
-    promised, interval, skill = facts["candidates"][facts["chosen"]]["promise"], facts["interval"], facts["skill"]
+    promised = choice.candidates[choice.chosen].promise
     horizon = max(promised, key=int)
-    expected = [promised[horizon], interval["low"][horizon], interval["high"][horizon]]
+    expected = [promised[horizon], interval.low[horizon], interval.high[horizon]]
     rows = [
         [
             target,
             *(figure(values[target]) for values in expected),
-            number(skill["promise"][horizon][target], 2),
+            number(skill.promise[horizon][target], 2),
         ]
         for target in list(promised[horizon])[:MOST_EXPECTED]
     ]
-    beside = "persistence's" if skill["against"] == "persistence" else "the linear model's"
+    beside = "persistence's" if skill.against == "persistence" else "the linear model's"
     heads = ["output", "error", "90 % of tests: from", "to", f"over {beside}"]
     table(f"error (RMSE) to expect of tests that are like the training, k = {horizon}", heads, rows)
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -26,10 +27,12 @@ from edp.cli.progress import shown_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.errors import count_of
 from edp.settings.bounds import MIN_MINUTES, above, span
+from edp.settings.results import plain_value
 from edp.storage.paths import full_path, is_file_at
 from edp.wording import figure, number, percent
 
 if TYPE_CHECKING:
+    from edp.evaluation.free_run_file import CandidateRow, ChannelErrors, FreeRunScores
     from edp.workflows.twin import TrainedTwin
 
 
@@ -85,14 +88,20 @@ def twin(
     with shown_progress("twin", as_json) as progress:
         source = source_of(data, signal_map, repair)
         trained = train_twin(source, experiment, folder, progress, divided, start)
-    seconds = trained.bundle.provenance["seconds"]
+    seconds = trained.bundle.provenance.seconds or 0.0
     verdict = twin_verdict(trained.scores)
-    facts = {"run": str(folder), "twin": str(folder / "twin"), "seconds": seconds, "models": trained.scores}
+    facts = {
+        "run": str(folder),
+        "twin": str(folder / "twin"),
+        "seconds": seconds,
+        "models": plain_value(trained.scores),
+    }
     facts |= verdict_facts(verdict)
-    facts["candidates"] = candidates = read_candidates(folder)
+    candidates = read_candidates(folder)
+    facts["candidates"] = plain_value(candidates)
 
     if trained.bundle.ground is not None:
-        facts["ground"] = trained.bundle.provenance.get("ground")
+        facts["ground"] = trained.bundle.provenance.more.get("ground")
 
     def show() -> None:
         show_verdict(verdict)
@@ -117,10 +126,10 @@ def show_trained(trained: TrainedTwin) -> None:
     provenance = trained.bundle.provenance
     if trained.bundle.ground is not None:
         out.print(ground_line(provenance))
-    if note := beyond_sentence(trained.scores.get("twin", {}).get("beyond", {})):
+    if note := beyond_sentence(trained.scores["twin"].beyond if trained.scores else {}):
         out.print(note, style="bold")
     score_table(trained.scores)
-    network = provenance.get("residual")
+    network = provenance.more.get("residual")
     if network and not network["helps"]:
         out.print("the network does not help on the validation part: this twin is its grey box alone")
 
@@ -161,8 +170,8 @@ def rollout(
 
     result = rollout_log(run, source_of(log, signal_map, repair), seconds, start_s, measured, file, plots, page)
     written = {"file": file and str(file), "plots": plots and str(plots), "page": page and str(page)}
-    facts = {"start_s": result.start_s, "calibrated_s": result.calibrated_s, **written, **result.scores}
-    facts["beyond"] = result.beyond
+    facts = {"start_s": result.start_s, "calibrated_s": result.calibrated_s, **written}
+    facts |= plain_value(result.scores) | {"beyond": plain_value(result.beyond)}
 
     def show() -> None:
         if result.beyond:
@@ -181,131 +190,125 @@ def rollout(
     emit(as_json, facts, show)
 
 
-def candidate_table(candidates: list[dict[str, Any]]) -> None:
+def candidate_table(candidates: Sequence[CandidateRow]) -> None:
     """Print a row a formulation that was tried: its error over the static map's, and why one could not be fitted."""
     rows = [
         [
-            ("* " if row["chosen"] else "  ") + row["label"],
-            "-" if row["error"] is None else number(row["error"], 3),
-            duration(row["seconds"]),
+            ("* " if row.chosen else "  ") + row.label,
+            "-" if row.error is None else number(row.error, 3),
+            duration(row.seconds),
         ]
         for row in candidates
     ]
     table("error of free runs that the fits had not seen, over the static map's", ["", "error", "processor time"], rows)
     for row in candidates:
-        if row["why"]:
-            out.print(f"{row['label']} was left out: {row['why']}")
+        if row.why:
+            out.print(f"{row.label} was left out: {row.why}")
 
 
-def score_table(models: dict[str, Any]) -> None:
+def score_table(models: Mapping[str, FreeRunScores]) -> None:
     """Print one row per model: errors of velocities, strokes by time, pressures, and the fraction of diverged runs.
 
     Actuators of different units have no mean over them: each has a table of its own.
     """
     first = next(iter(models.values()))
-    if first["velocity_mae"].get("units"):
+    if first.velocity_mae.units:
         actuator_tables(models)
         return
-    velocity, strokes = first["velocity_mae"], first["stroke_error"]
-    rows = [[_with_unit("velocity", velocity), *(_number(one["velocity_mae"]["mean"]) for one in models.values())]]
+    velocity, strokes = first.velocity_mae, first.stroke_error
+    rows = [[_with_unit("velocity", velocity), *(_number(one.velocity_mae.mean) for one in models.values())]]
     for k, row in enumerate(strokes):
-        name = _with_unit(f"stroke after {figure(row['at_s'])} s", row)
-        rows.append([name, *(_number(one["stroke_error"][k]["mean"]) for one in models.values())])
-    rows.append(["pressure, deviations", *(_number(one["pressure_nrmse"]["mean"]) for one in models.values())])
-    rows.append(["diverged runs", *(percent(one["diverged"]) for one in models.values())])
+        name = _with_unit(f"stroke after {figure(row.at_s)} s", row)
+        rows.append([name, *(_number(one.stroke_error[k].mean) for one in models.values())])
+    rows.append(["pressure, deviations", *(_number(one.pressure_nrmse.mean) for one in models.values())])
+    rows.append(["diverged runs", *(percent(one.diverged) for one in models.values())])
     out.print(
-        f"{count_of(first['runs'], 'free run')} of {figure(first['seconds'])} s on commands alone, mean over actuators "
+        f"{count_of(first.runs, 'free run')} of {figure(first.seconds)} s on commands alone, mean over actuators "
         "and runs:"
     )
     # A column a model: with a column a time it would be too wide for a terminal of 80.
     table("MAE of velocities, stroke error by time, NRMSE of pressures", ["", *models], rows)
 
 
-def actuator_tables(models: dict[str, Any]) -> None:
+def actuator_tables(models: Mapping[str, FreeRunScores]) -> None:
     """Print one table per actuator: errors of velocity and of stroke by time, one row per model."""
     first = next(iter(models.values()))
-    strokes = first["stroke_error"]
-    out.print(
-        f"{count_of(first['runs'], 'free run')} of {figure(first['seconds'])} s on commands alone, mean over runs:"
-    )
-    places = zip(first["velocity_mae"]["by_channel"], strokes[0]["by_channel"], strict=True)
+    strokes = first.stroke_error
+    out.print(f"{count_of(first.runs, 'free run')} of {figure(first.seconds)} s on commands alone, mean over runs:")
+    places = zip(first.velocity_mae.by_channel, strokes[0].by_channel, strict=True)
     for velocity, stroke in places:
-        unit, length = first["velocity_mae"]["units"][velocity], strokes[0].get("units", {}).get(stroke, "")
+        unit, length = first.velocity_mae.unit_of(velocity), strokes[0].unit_of(stroke)
         every = models.values()
-        rows = [[f"velocity, {unit}", *(_number(one["velocity_mae"]["by_channel"][velocity]) for one in every)]]
+        rows = [[f"velocity, {unit}", *(_number(one.velocity_mae.by_channel[velocity]) for one in every)]]
         for k, row in enumerate(strokes):
-            errors = (one["stroke_error"][k]["by_channel"][stroke] for one in every)
-            rows.append([f"after {figure(row['at_s'])} s, {length}", *map(_number, errors)])
-        rows.append(["diverged runs", *(percent(one["diverged"]) for one in every)])
+            errors = (one.stroke_error[k].by_channel[stroke] for one in every)
+            rows.append([f"after {figure(row.at_s)} s, {length}", *map(_number, errors)])
+        rows.append(["diverged runs", *(percent(one.diverged) for one in every)])
         table(f"{velocity}: its MAE, and the error of {stroke} by time", ["", *models], rows)
-    if first["pressure_nrmse"]["mean"] is not None:
-        listed = ", ".join(f"{name} {_number(one['pressure_nrmse']['mean'])}" for name, one in models.items())
+    if first.pressure_nrmse.mean is not None:
+        listed = ", ".join(f"{name} {_number(one.pressure_nrmse.mean)}" for name, one in models.items())
         out.print(f"NRMSE of pressures: {listed}")
 
 
-def error_table(scores: dict[str, Any]) -> None:
+def error_table(scores: FreeRunScores) -> None:
     """Print the errors of one run: a row a time with the error of each stroke, then velocities and pressures."""
-    strokes = scores["stroke_error"]
-    rows = [[f"{figure(row['at_s'])} s", *map(_number, row["by_channel"].values())] for row in strokes]
-    unit = "" if strokes[0]["unit"] is None else f", {strokes[0]['unit']}"
-    units = strokes[0].get("units", {})
-    heads = [f"{name}, {units[name]}" if name in units else name for name in strokes[0]["by_channel"]]
+    strokes = scores.stroke_error
+    rows = [[f"{figure(row.at_s)} s", *map(_number, row.by_channel.values())] for row in strokes]
+    unit = "" if strokes[0].unit is None else f", {strokes[0].unit}"
+    units = strokes[0].units
+    heads = [f"{name}, {units[name]}" if name in units else name for name in strokes[0].by_channel]
     table(f"error after{unit}", ["", *heads], rows)
-    velocity, pressures = scores["velocity_mae"], scores["pressure_nrmse"]
-    unit = "" if velocity["unit"] is None else f", {velocity['unit']}"
-    units = velocity.get("units", {})
-    errors = [
-        f"{name} {_number(value)} {units.get(name, '')}".rstrip() for name, value in velocity["by_channel"].items()
-    ]
+    velocity, pressures = scores.velocity_mae, scores.pressure_nrmse
+    unit = "" if velocity.unit is None else f", {velocity.unit}"
+    units = velocity.units
+    errors = [f"{name} {_number(value)} {units.get(name, '')}".rstrip() for name, value in velocity.by_channel.items()]
     out.print(f"MAE{unit}: " + ", ".join(errors))
-    if pressures["by_channel"]:
-        out.print("NRMSE: " + ", ".join(f"{name} {_number(value)}" for name, value in pressures["by_channel"].items()))
+    if pressures.by_channel:
+        out.print("NRMSE: " + ", ".join(f"{name} {_number(value)}" for name, value in pressures.by_channel.items()))
 
 
-def coverage_table(scores: dict[str, Any]) -> None:
+def coverage_table(scores: FreeRunScores) -> None:
     """Print the fraction of free runs inside the intervals, by time and kind of channel."""
-    intervals = scores.get("intervals")
-    if intervals is None or not intervals["at"]:
+    intervals = scores.intervals
+    if intervals is None or not intervals.at:
         return
-    parts = [part for part in ("velocities", "strokes", "pressures") if part in intervals["at"][0]]
-    rows = [[f"{figure(row['at_s'])} s", *(percent(row[part]["share"]) for part in parts)] for row in intervals["at"]]
-    table(f"share of free runs in intervals meant to hold {percent(intervals['coverage'])}", ["", *parts], rows)
+    parts = list(intervals.at[0].parts())
+    rows = [[f"{figure(row.at_s)} s", *(percent(part.share) for part in row.parts().values())] for row in intervals.at]
+    table(f"share of free runs in intervals meant to hold {percent(intervals.coverage)}", ["", *parts], rows)
 
 
-def situation_table(scores: dict[str, Any]) -> None:
+def situation_table(scores: FreeRunScores) -> None:
     """Print the errors at end stops, at rest and in motion."""
     rows = []
-    for name, row in scores["situations"].items():
-        strokes = row.get("stroke_error", {"mean": None})
-        cells = [percent(row["share"]), *map(_number, (row["velocity_mae"]["mean"], strokes["mean"]))]
-        rows.append([name.replace("_", " "), *cells, _number(row["pressure_nrmse"]["mean"])])
-    heads = ["", "share of the time", _with_unit("velocity", scores["velocity_mae"]), "stroke", "pressure (NRMSE)"]
+    for name, row in scores.situations.items():
+        strokes = None if row.stroke_error is None else row.stroke_error.mean
+        cells = [percent(row.share), *map(_number, (row.velocity_mae.mean, strokes, row.pressure_nrmse.mean))]
+        rows.append([name.replace("_", " "), *cells])
+    heads = ["", "share of the time", _with_unit("velocity", scores.velocity_mae), "stroke", "pressure (NRMSE)"]
     table("errors by what the actuators did", heads, rows)
 
 
-def ahead_table(scores: dict[str, Any]) -> None:
+def ahead_table(scores: FreeRunScores) -> None:
     """Print the k-step-ahead errors, together with those of a look-ahead predictor if one was given."""
-    ahead, beside = scores.get("ahead"), scores.get("beside")
+    ahead, beside = scores.ahead, scores.beside
     if ahead is not None:
-        velocity = ahead["velocity_mae"]
-        unit = "" if velocity["unit"] is None else f" {velocity['unit']}"
-        out.print(
-            f"{figure(ahead['seconds'])} s ahead, told the commands: MAE of velocities "
-            f"{_number(velocity['mean'])}{unit}"
-        )
+        velocity = ahead.velocity_mae
+        unit = "" if velocity.unit is None else f" {velocity.unit}"
+        mae = f"{_number(velocity.mean)}{unit}"
+        out.print(f"{figure(ahead.seconds)} s ahead, told the commands: MAE of velocities {mae}")
     if beside is not None:
         rows = [
-            [part, row["predictor"]["unit"] or "", _number(row["twin"]["mean"]), _number(row["predictor"]["mean"])]
-            for part, row in beside["errors"].items()
+            [part, row.predictor.unit or "", _number(row.twin.mean), _number(row.predictor.mean)]
+            for part, row in beside.errors.items()
         ]
-        title = f"MAE {figure(beside['seconds'])} s ahead at the same {beside['moments']:,} moments"
-        table(title, ["", "unit", "twin, told the commands", beside["label"]], rows)
-        if beside["trained_on"]:
-            out.print(f"the predictor was trained on {len(beside['trained_on'])} of these recordings: it is flattered")
+        title = f"MAE {figure(beside.seconds)} s ahead at the same {beside.moments:,} moments"
+        table(title, ["", "unit", "twin, told the commands", beside.label], rows)
+        if beside.trained_on:
+            out.print(f"the predictor was trained on {len(beside.trained_on)} of these recordings: it is flattered")
 
 
-def _with_unit(text: str, row: dict[str, Any]) -> str:
-    return text if row["unit"] is None else f"{text}, {row['unit']}"
+def _with_unit(text: str, row: ChannelErrors) -> str:
+    return text if row.unit is None else f"{text}, {row.unit}"
 
 
 def _number(value: float | None) -> str:

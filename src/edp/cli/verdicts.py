@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -18,7 +18,7 @@ def show_verdict(verdict: ErrorVerdict | None) -> None:
         out.print(verdict.sentence(), style="bold red" if verdict.exit_code else "bold")
 
 
-def verdict_facts(verdict: ErrorVerdict | None) -> dict[str, Any]:
+def verdict_facts(verdict: ErrorVerdict | None) -> dict[str, object]:
     """Return a verdict as JSON has it; ``beaten_by`` names the reference where the outcome is *worse*."""
     beaten = verdict is not None and verdict.exit_code
     return {

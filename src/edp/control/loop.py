@@ -70,7 +70,7 @@ def run_loop(
     controller: Controller,
     task: ControlTask,
     seed: int,
-    options: Mapping[str, Any] | None = None,
+    options: Mapping[str, object] | None = None,
     guard: LoopGuard | None = None,
     deadline_s: float = 0.0,
 ) -> LoopResult:

@@ -69,7 +69,7 @@ def bundle_of(run: str | Path, machine: Machine, rate_hz: float | None = None) -
         EdpError: there is none, it learned from a machine with other cylinders, or it is of another rate.
     """
     bundle = load_twin(run)
-    theirs, ours = bundle.provenance.get(STROKES), np.array(machine.cylinders.stroke)
+    theirs, ours = bundle.provenance.more.get(STROKES), np.array(machine.cylinders.stroke)
     # Logs of real machines do not say it.
     if isinstance(theirs, list) and all(isinstance(m, int | float) for m in theirs):
         strokes = np.array(theirs, float)

@@ -101,8 +101,8 @@ class TwinEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._digs, self._free = False, np.full(len(twin.channels.answers), np.nan, np.float32)
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        self, *, seed: int | None = None, options: dict[str, object] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, object]]:
         """Begin an episode in steady state.
 
         Args:
@@ -127,7 +127,7 @@ class TwinEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._tick = 0
         return row, self._info(row)
 
-    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, object]]:
         """Hold lever positions, shape (3,), for one tick.
 
         Raises:
@@ -152,7 +152,7 @@ class TwinEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         answer, self._state = self.twin.step(command[None], self._state)
         return np.asarray(answer[0], np.float32)
 
-    def _info(self, row: NDArray[np.float32]) -> dict[str, Any]:
+    def _info(self, row: NDArray[np.float32]) -> dict[str, object]:
         strokes = row[self._start.strokes].astype(float)
         tip = self._geometry.tip(strokes)
         return {"truth": dict(zip((*STROKES, *TIP), (*strokes.tolist(), *tip.tolist()), strict=True))}

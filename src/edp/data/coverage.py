@@ -135,7 +135,7 @@ class Coverage:
     absent: tuple[str, ...] = field(default=())
     contradictions: tuple[str, ...] = field(default=())
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Convert to JSON types; arrays become lists, the occupancy gets its fraction of visited cells."""
         plain: dict[str, Any] = _plain(asdict(self))
         plain["singular"] = {str(lags): value for lags, value in self.singular.items()}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
 
 from edp.data.coverage import Coverage
 from edp.data.spectrum import FLAT_DB
@@ -38,7 +37,7 @@ class CoverageTarget:
         """Whether the figure keeps the bound."""
         return self.value >= self.bound if self.at_least else self.value <= self.bound
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Plain values."""
         return {**asdict(self), "met": self.met}
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from edp.data.features import FeatureSet
 from edp.errors import ConfigError
@@ -19,7 +18,7 @@ def is_set_file(features: object) -> bool:
     return isinstance(features, str) and features.endswith(SUFFIX)
 
 
-def read_set_table(path: str | Path) -> dict[str, Any]:
+def read_set_table(path: str | Path) -> dict[str, object]:
     """Read the table of a feature-set file. Missing keys are empty; a missing name is replaced by the file name.
 
     The names of its keys and the values are checked where the settings are.

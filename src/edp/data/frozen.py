@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from edp.data.splits import PART, ByRecording, Split, SplitSpec, Stretch
 from edp.data.splits import SPLITS as SPLITS  # those who need the split `frozen` registered import it from here
-from edp.errors import ConfigError, DataError, StorageError
+from edp.errors import ConfigError, DataError
 from edp.recording import Recording
 from edp.settings.bounds import SEED, check_bounds, shown
 
@@ -166,24 +165,6 @@ class ByFrozen:
 def frozen_of(split: SplitSpec) -> dict[str, str]:
     """Return the names of the frozen sessions by digest; empty for a split without frozen sessions."""
     return split.frozen if isinstance(split, ByFrozen) else {}
-
-
-def frozen_before(provenance: Mapping[str, Any]) -> dict[str, str]:
-    """Return the names of the frozen sessions by digest from the provenance of a run.
-
-    They stay frozen for derived runs.
-
-    Raises:
-        StorageError: it is no table of names.
-    """
-    data = provenance.get("data", {})
-    frozen_names = data.get("frozen", {}) if isinstance(data, Mapping) else {}
-    if not isinstance(frozen_names, Mapping) or not all(isinstance(name, str) for name in frozen_names.values()):
-        raise StorageError(
-            "provenance.json: data.frozen is no table of hashes and names of sessions; it was edited or is damaged: "
-            "restore it"
-        )
-    return {str(digest): name for digest, name in frozen_names.items()}
 
 
 def refuse_frozen(recordings: Sequence[Recording], frozen: Mapping[str, str], what: str) -> None:

@@ -41,7 +41,7 @@ class Moments:
         """Take in what other rows gave."""
         self.add(other.state())
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> dict[str, object]:
         """All that it holds, as plain values and arrays."""
         return {
             "count": self.count, "low": self.low, "high": self.high, "mean": self.mean, "squares": self.squares

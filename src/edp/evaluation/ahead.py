@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
 from edp.errors import DataError
+from edp.evaluation.free_run_file import AheadErrors, ErrorPair
 from edp.evaluation.free_run_parts import by_channel, nrmse_by_channel
 from edp.networks.twin import Twin
 
@@ -74,28 +74,33 @@ def look_ahead(twin: Twin, series: Sequence[Series], ticks: int, first: int = 0)
     return Ahead(twin.channels, ticks, tuple(moments), np.concatenate(answers), np.concatenate(truths))
 
 
-def ahead_scores(ahead: Ahead) -> dict[str, Any]:
+def ahead_scores(ahead: Ahead) -> AheadErrors:
     """Velocity MAE, stroke error and pressure NRMSE that far ahead, never averaged together."""
     channels = ahead.channels
     errors = np.abs(ahead.answers - ahead.truth).astype(np.float64)
-    rows: dict[str, Any] = {"ticks": ahead.ticks, "seconds": ahead.ticks / channels.rate_hz}
-    rows["moments"] = len(ahead.truth)
-    for part, key in (("velocities", "velocity_mae"), ("strokes", "stroke_error")):
-        columns = channels.parts[part]
-        rows[key] = by_channel(channels.answers[columns], errors[:, columns].mean(axis=0))
-    # The scores of pressures read runs and ticks: here each moment is a run of one tick.
-    rows["pressure_nrmse"] = nrmse_by_channel(channels, ahead.answers[:, None], ahead.truth[:, None])
-    return rows
+    velocities, strokes = (
+        by_channel(channels.answers[columns], errors[:, columns].mean(axis=0))
+        for columns in (channels.parts["velocities"], channels.parts["strokes"])
+    )
+    return AheadErrors(
+        ticks=ahead.ticks,
+        seconds=ahead.ticks / channels.rate_hz,
+        moments=len(ahead.truth),
+        velocity_mae=velocities,
+        stroke_error=strokes,
+        # The scores of pressures read runs and ticks: here each moment is a run of one tick.
+        pressure_nrmse=nrmse_by_channel(channels, ahead.answers[:, None], ahead.truth[:, None]),
+    )
 
 
-def predictor_scores(ahead: Ahead, predicted: Mapping[str, Array]) -> dict[str, Any]:
+def predictor_scores(ahead: Ahead, predicted: Mapping[str, Array]) -> dict[str, ErrorPair]:
     """Mean absolute errors of a look-ahead predictor at the same moments, by kind of channel.
 
     Args:
         ahead: of the twin.
         predicted: of each channel that both answer, ``(moment,)``, SI units.
     """
-    rows: dict[str, Any] = {}
+    pairs = {}
     for part, columns in ahead.channels.parts.items():
         named = [(i, c) for i, c in enumerate(ahead.channels.answers) if c in ahead.channels.answers[columns]]
         shared = [(i, c) for i, c in named if c.name in predicted]
@@ -104,5 +109,7 @@ def predictor_scores(ahead: Ahead, predicted: Mapping[str, Array]) -> dict[str, 
             chosen = [c for _, c in shared]
             errors = np.abs(np.stack([predicted[c.name] for c in chosen], axis=1) - truth).astype(np.float64)
             own = np.abs(ahead.answers[:, [i for i, _ in shared]] - truth).astype(np.float64)
-            rows[part] = {"predictor": by_channel(chosen, errors.mean(axis=0)), "twin": by_channel(chosen, own.mean(0))}
-    return rows
+            pairs[part] = ErrorPair(
+                predictor=by_channel(chosen, errors.mean(axis=0)), twin=by_channel(chosen, own.mean(axis=0))
+            )
+    return pairs

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
+from edp.evaluation.free_run_file import CommandExcess
 from edp.wording import figure
 
 MARGIN = 0.02
@@ -36,15 +37,15 @@ def command_ranges(channels: TwinChannels, series: Sequence[Series], before: Any
     return ranges
 
 
-def commands_beyond(ranges: Any, channels: TwinChannels, inputs: Sequence[NDArray[Any]]) -> dict[str, dict[str, float]]:
-    """Commands that leave their ranges, by name: share of the ticks, how far they go, and how far they did.
+def commands_beyond(ranges: Any, channels: TwinChannels, inputs: Sequence[NDArray[Any]]) -> dict[str, CommandExcess]:
+    """Return the commands that leave their ranges, by name.
 
     Args:
         ranges: of `command_ranges`, from a file that may hold anything; a command without two numbers is left out.
         channels: of the twin.
         inputs: commands ``(tick, command)``, SI units.
     """
-    beyond: dict[str, dict[str, float]] = {}
+    beyond: dict[str, CommandExcess] = {}
     if not isinstance(ranges, Mapping) or not inputs:
         return beyond
     values = np.concatenate([np.asarray(rows, dtype=np.float64) for rows in inputs])
@@ -56,9 +57,8 @@ def commands_beyond(ranges: Any, channels: TwinChannels, inputs: Sequence[NDArra
         margin, own = MARGIN * (high - low), values[:, column]
         share = float(((own < low - margin) | (own > high + margin)).mean())
         if share > 0.0:
-            beyond[channel.name] = {
-                "share": share, "low": low, "high": high, "least": float(own.min()), "largest": float(own.max()),
-            }  # fmt: skip
+            extremes = {"least": float(own.min()), "largest": float(own.max())}
+            beyond[channel.name] = CommandExcess(share=share, low=low, high=high, **extremes)
     return beyond
 
 
@@ -71,14 +71,13 @@ def _ends(value: Any) -> tuple[float, float] | None:
     return float(value[0]), float(value[1])
 
 
-def beyond_sentence(beyond: Mapping[str, Mapping[str, float]]) -> str:
+def beyond_sentence(beyond: Mapping[str, CommandExcess]) -> str:
     """What a person must know before they trust errors and intervals there; empty where nothing is beyond."""
     if not beyond:
         return ""
     listed = ", ".join(
-        f"{name} ({figure(row['share'], 2)} of the ticks, {figure(row['least'], 3)} to {figure(row['largest'], 3)}; "
-        "learned from "
-        f"{figure(row['low'], 3)} to {figure(row['high'], 3)})"
-        for name, row in sorted(beyond.items(), key=lambda pair: -pair[1]["share"])
+        f"{name} ({figure(row.share, 2)} of the ticks, {figure(row.least, 3)} to {figure(row.largest, 3)}; "
+        f"learned from {figure(row.low, 3)} to {figure(row.high, 3)})"
+        for name, row in sorted(beyond.items(), key=lambda pair: -pair[1].share)
     )
     return f"commands beyond all that taught the twin: {listed}; intervals promise nothing there"

@@ -14,6 +14,7 @@ from edp.data.roles import Axis, roles_of_channels
 from edp.data.series import Series
 from edp.data.twin_channels import INTEGRAL
 from edp.evaluation.free_run_parts import AT_REST
+from edp.evaluation.scores_file import SituationErrors
 from edp.signals import Kind
 from edp.stats.sketch import QuantileSketch
 
@@ -179,7 +180,7 @@ class SituationTally:
             getattr(self, name).__iadd__(state[name])
         self.seen |= state["seen"]
 
-    def rows(self) -> list[dict[str, Any]]:
+    def rows(self) -> tuple[SituationErrors, ...]:
         """By situation that occurs: ticks, shares of the time and of the error (means over the axes), error by target.
 
         The error of a target is None where the situation never occurs or cannot be told.
@@ -192,15 +193,15 @@ class SituationTally:
                 continue
             some = [axis for axis in axes if self.total[axis] > 0]
             rows.append(
-                {
-                    "situation": name,
-                    "ticks": int(ticks.sum()),
-                    "share": float(np.mean(ticks[axes] / self.scored[axes])),
-                    "of_error": float(np.mean(errors[some] / self.total[some])) if some else 0.0,
-                    "mae": {
+                SituationErrors(
+                    situation=name,
+                    ticks=int(ticks.sum()),
+                    share=float(np.mean(ticks[axes] / self.scored[axes])),
+                    of_error=float(np.mean(errors[some] / self.total[some])) if some else 0.0,
+                    mae={
                         target: float(errors[i] / ticks[i]) if ticks[i] else None
                         for i, target in enumerate(self.targets)
                     },
-                }
+                )
             )
-        return rows
+        return tuple(rows)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +52,7 @@ class Contexts:
         error = change.std(axis=1, ddof=1) / np.sqrt(count) if count > 1 else np.full(len(change), np.nan)
         return np.stack([change.mean(axis=1), error], axis=1)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Plain values; the errors are means over targets of the first horizon."""
         gains = self.gain()
         rows = [

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from edp.errors import ConfigError, closest
 from edp.export.c.sizes import Sizes
@@ -177,7 +176,7 @@ class Estimate:
         """Constants and program."""
         return self.parameter_bytes + self.program_bytes
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Plain values."""
         return asdict(self) | {"flash_bytes": self.flash_bytes}
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,22 @@ from threadpoolctl import threadpool_limits
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
 from edp.errors import DataError
-from edp.evaluation.free_run_parts import by_channel, by_horizon, by_name, nrmse_by_channel, situations
+from edp.evaluation.free_run_file import (
+    CoverageAt,
+    FreeRunErrors,
+    FreeRunScores,
+    IntervalCoverage,
+    PartCoverage,
+    RunSummary,
+)
+from edp.evaluation.free_run_parts import (
+    by_channel,
+    by_horizon,
+    by_name,
+    nrmse_by_channel,
+    situations,
+    stroke_errors,
+)
 from edp.networks.twin import FreeRunIntervals, Twin, TwinScales, calibrate, even_starts, starts_within
 from edp.settings.bounds import MOST_BATCH, MOST_NAMES, MOST_TICKS, above, between, check_bounds, check_count, integer
 from edp.wording import figure
@@ -245,8 +259,8 @@ def free_run_scores(
     spec: FreeRunJudgeSpec,
     intervals: FreeRunIntervals | None = None,
     labels: Mapping[str, str] | None = None,
-) -> dict[str, Any]:
-    """Scores as plain values in the units of reports; velocities, strokes and pressures are never averaged together.
+) -> FreeRunScores:
+    """Scores in the units of reports; velocities, strokes and pressures are never averaged together.
 
     Args:
         runs: free runs.
@@ -259,58 +273,60 @@ def free_run_scores(
     labels = labels or {}
     # A stretch of a recording is named after it, with the rows behind.
     driving = np.array([labels.get(name, labels.get(name.partition("[")[0], "")) for name in runs.names])
-    scores = {
-        "runs": len(names),
-        "recordings": len(set(runs.names)),
-        "seconds": runs.truth.shape[1] / channels.rate_hz,
-        **_errors(runs, spec.at_s),
-        "by_horizon": by_horizon(channels, runs.answers - runs.truth, runs.stroke_errors),
-        "by_recording": by_name(runs.names, lambda of: _summary(runs.only(of), spec.at_s)),
-        "by_driving": by_name(driving.tolist(), lambda of: _summary(runs.only(of), spec.at_s)) if driving.all() else {},
-        "situations": situations(channels, runs.answers, runs.truth, runs.low, runs.high),
-    }
-    return scores if intervals is None else scores | {"intervals": coverage_of(runs, spec, intervals)}
+    return FreeRunScores(
+        runs=len(names),
+        recordings=len(set(runs.names)),
+        seconds=runs.truth.shape[1] / channels.rate_hz,
+        **vars(_errors(runs, spec.at_s)),
+        by_horizon=by_horizon(channels, runs.answers - runs.truth, runs.stroke_errors),
+        by_recording=by_name(runs.names, lambda of: _summary(runs.only(of), spec.at_s)),
+        by_driving=by_name(driving.tolist(), lambda of: _summary(runs.only(of), spec.at_s)) if driving.all() else {},
+        situations=situations(channels, runs.answers, runs.truth, runs.low, runs.high),
+        intervals=None if intervals is None else coverage_of(runs, spec, intervals),
+    )
 
 
-def coverage_of(runs: FreeRuns, spec: FreeRunJudgeSpec, intervals: FreeRunIntervals) -> dict[str, Any]:
+def coverage_of(runs: FreeRuns, spec: FreeRunJudgeSpec, intervals: FreeRunIntervals) -> IntervalCoverage:
     """Share of the free runs whose truth lies in the interval at each horizon, by kind of channel, and half widths."""
     channels, ticks = runs.channels, _ticks(runs, spec.covered_at_s)
     rows = []
     for at, tick in ticks:
         half = intervals.at(np.array([tick]))[0]
         inside = np.abs(runs.answers[:, tick - 1] - runs.truth[:, tick - 1]) <= half
-        row: dict[str, Any] = {"at_s": at, "calibrated": tick <= intervals.ticks[-1]}
+        parts = {}
         for part, columns in channels.parts.items():
             chosen = channels.answers[columns]
             if chosen:
-                shares = {c.name: float(x) for c, x in zip(chosen, inside[:, columns].mean(axis=0), strict=True)}
-                share = {"share": float(inside[:, columns].mean()), "by_channel": shares}
-                row[part] = share | {"half_width": by_channel(chosen, half[columns])}
-        rows.append(row)
-    return {"coverage": intervals.coverage, "calibrated_by": intervals.runs, "at": rows}
+                parts[part] = PartCoverage(
+                    share=float(inside[:, columns].mean()),
+                    by_channel={c.name: float(x) for c, x in zip(chosen, inside[:, columns].mean(axis=0), strict=True)},
+                    half_width=by_channel(chosen, half[columns]),
+                )
+        rows.append(CoverageAt(at_s=at, calibrated=bool(tick <= intervals.ticks[-1]), **parts))
+    return IntervalCoverage(coverage=intervals.coverage, calibrated_by=intervals.runs, at=tuple(rows))
 
 
-def _errors(runs: FreeRuns, at_s: Sequence[float]) -> dict[str, Any]:
+def _errors(runs: FreeRuns, at_s: Sequence[float]) -> FreeRunErrors:
     """Velocity MAE, stroke errors by time, pressure NRMSE and the share of diverged runs."""
     channels, count = runs.channels, len(runs.channels.velocities)
     velocity_mae = np.abs(runs.answers - runs.truth)[..., :count].mean(axis=(0, 1), dtype=np.float64)
     ends = channels.strokes or channels.velocities
-    stroke_errors = runs.stroke_errors
-    return {
-        "velocity_mae": by_channel(channels.velocities, velocity_mae),
-        "stroke_error": [
-            {"at_s": at, **by_channel(ends, stroke_errors[:, tick - 1], integral=not channels.strokes)}
+    errors = runs.stroke_errors
+    return FreeRunErrors(
+        velocity_mae=by_channel(channels.velocities, velocity_mae),
+        stroke_error=tuple(
+            stroke_errors(ends, at, errors[:, tick - 1], integral=not channels.strokes)
             for at, tick in _ticks(runs, at_s)
-        ],
-        "pressure_nrmse": nrmse_by_channel(channels, runs.answers, runs.truth),
-        "diverged": float(runs.diverged().mean()),
-    }
+        ),
+        pressure_nrmse=nrmse_by_channel(channels, runs.answers, runs.truth),
+        diverged=float(runs.diverged().mean()),
+    )
 
 
-def _summary(runs: FreeRuns, at_s: Sequence[float]) -> dict[str, Any]:
+def _summary(runs: FreeRuns, at_s: Sequence[float]) -> RunSummary:
     """Return errors over whole runs, and stroke errors at the given times and at the end of the runs."""
     end = runs.truth.shape[1] / runs.channels.rate_hz
-    return {"runs": len(runs.names), **_errors(runs, (*(at for at in at_s if at < end), end))}
+    return RunSummary(runs=len(runs.names), **vars(_errors(runs, (*(at for at in at_s if at < end), end))))
 
 
 def _ticks(runs: FreeRuns, at_s: Sequence[float]) -> list[tuple[float, int]]:

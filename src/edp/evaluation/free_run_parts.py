@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.data.twin_channels import TwinChannels
+from edp.evaluation.free_run_file import (
+    ChannelErrors,
+    ErrorLine,
+    HorizonErrors,
+    MotionErrors,
+    PressureErrors,
+    RunSummary,
+    StrokeErrors,
+)
 from edp.signals import KINDS, Channel
 
 Array = NDArray[np.float32]
@@ -20,36 +30,44 @@ HORIZONS_A_DECADE = 6
 """Points of an error over the horizon: a line on a page with a logarithmic axis needs no more."""
 
 
-def by_channel(channels: Sequence[Channel], values: NDArray[Any], integral: bool = False) -> dict[str, Any]:
-    """Mean of each channel in its unit of reports, and over all, with the median over runs, where the unit is one.
-
-    Where units differ, `units` has that of each channel.
+def by_channel(channels: Sequence[Channel], values: NDArray[Any], integral: bool = False) -> ChannelErrors:
+    """Return the mean of each channel in its unit of reports, and over all channels if they share a unit.
 
     Args:
         channels: of the columns.
         values: SI units, ``(channel,)`` or ``(run, channel)``.
         integral: whether they are integrals of the channels over seconds.
     """
-    facts = [KINDS[channel.kind] for channel in channels]
     unit_of = {
-        channel.name: _integrated(fact.report_unit) if integral else fact.report_unit
-        for channel, fact in zip(channels, facts, strict=True)
+        channel.name: _integrated(KINDS[channel.kind].report_unit) if integral else KINDS[channel.kind].report_unit
+        for channel in channels
     }
     units = set(unit_of.values())
-    by_run = np.atleast_2d(values * np.array([fact.report_factor for fact in facts]))
-    plain: dict[str, Any] = {c.name: float(x) for c, x in zip(channels, by_run.mean(axis=0), strict=True)}
-    row: dict[str, Any] = {"unit": units.pop() if len(units) == 1 else None, "by_channel": plain}
-    if len(unit_of) > 1 and row["unit"] is None:
-        row["units"] = unit_of
-    row["mean"] = None if row["unit"] is None or not by_run.size else float(by_run.mean())
-    if values.ndim == 2:
-        row["median"] = None if row["unit"] is None else float(np.median(by_run))
-    return row
+    unit = units.pop() if len(units) == 1 else None
+    by_run = _reported(channels, values)
+    return ChannelErrors(
+        unit=unit,
+        by_channel={c.name: float(x) for c, x in zip(channels, by_run.mean(axis=0), strict=True)},
+        units=unit_of if len(unit_of) > 1 and unit is None else {},
+        mean=None if unit is None or not by_run.size else float(by_run.mean()),
+    )
+
+
+def stroke_errors(channels: Sequence[Channel], at_s: float, values: NDArray[Any], integral: bool) -> StrokeErrors:
+    """Return the means of `by_channel` of runs ``(run, channel)`` at a time, with the median over runs."""
+    means = by_channel(channels, values, integral)
+    median = None if means.unit is None else float(np.median(_reported(channels, values)))
+    return StrokeErrors(at_s=at_s, **vars(means), median=median)
+
+
+def _reported(channels: Sequence[Channel], values: NDArray[Any]) -> NDArray[Any]:
+    """Return values ``(run, channel)`` in units of reports."""
+    return np.atleast_2d(values * np.array([KINDS[channel.kind].report_factor for channel in channels]))
 
 
 def nrmse_by_channel(
     channels: TwinChannels, answers: Array, truth: Array, ticks: NDArray[np.bool_] | None = None
-) -> dict[str, Any]:
+) -> PressureErrors:
     """Root mean square error of each pressure in its deviations over all runs, and their mean.
 
     Args:
@@ -66,13 +84,13 @@ def nrmse_by_channel(
     # A pressure that does not move has no scale to measure its error by.
     each = [float(np.sqrt(s) / d) if d > 0 and np.isfinite(s) else None for s, d in zip(squares, spread, strict=True)]
     numbers = [value for value in each if value is not None]
-    return {
-        "mean": float(np.mean(numbers)) if numbers else None,
-        "by_channel": {c.name: value for c, value in zip(channels.pressures, each, strict=True)},
-    }
+    return PressureErrors(
+        mean=float(np.mean(numbers)) if numbers else None,
+        by_channel={c.name: value for c, value in zip(channels.pressures, each, strict=True)},
+    )
 
 
-def by_horizon(channels: TwinChannels, errors: Array, stroke_errors: NDArray[np.float64]) -> dict[str, Any]:
+def by_horizon(channels: TwinChannels, errors: Array, stroke_errors: NDArray[np.float64]) -> HorizonErrors:
     """Mean absolute error of each answer at horizons that grow geometrically, in units of reports.
 
     Args:
@@ -83,27 +101,29 @@ def by_horizon(channels: TwinChannels, errors: Array, stroke_errors: NDArray[np.
     longest = errors.shape[1]
     count = max(2, round(HORIZONS_A_DECADE * np.log10(longest)) + 1)
     ticks = np.unique(np.geomspace(1, longest, count).round().astype(np.int64))
-    rows: dict[str, Any] = {"seconds": [float(tick / channels.rate_hz) for tick in ticks]}
+    lines = {}
     for part, columns in channels.parts.items():
         named, integral = channels.answers[columns], False
         values = np.abs(errors[:, ticks - 1][..., columns]).astype(np.float64)
         if part == "strokes" and not named:
             named, integral, values = channels.velocities, True, stroke_errors[:, ticks - 1]
         means = [by_channel(named, row, integral) for row in values.mean(axis=0)] if named else []
-        rows[part] = {
-            "unit": means[0]["unit"] if means else None,
-            "mean": [row["mean"] for row in means],
-            "by_channel": {c.name: [row["by_channel"][c.name] for row in means] for c in named},
-        }
-    return rows
+        lines[part] = ErrorLine(
+            unit=means[0].unit if means else None,
+            mean=tuple(row.mean for row in means),
+            by_channel={c.name: tuple(row.by_channel[c.name] for row in means) for c in named},
+        )
+    return HorizonErrors(seconds=tuple(float(tick / channels.rate_hz) for tick in ticks), **lines)
 
 
-def by_name(names: Sequence[str], summary: Callable[[NDArray[np.int64]], dict[str, Any]]) -> dict[str, Any]:
+def by_name(names: Sequence[str], summary: Callable[[NDArray[np.int64]], RunSummary]) -> dict[str, RunSummary]:
     """A summary of the runs of each name, in the order in which the names came."""
     return {name: summary(np.flatnonzero(np.array(names) == name)) for name in dict.fromkeys(names)}
 
 
-def situations(channels: TwinChannels, answers: Array, truth: Array, low: Array, high: Array) -> dict[str, Any]:
+def situations(
+    channels: TwinChannels, answers: Array, truth: Array, low: Array, high: Array
+) -> dict[str, MotionErrors]:
     """Errors at end stops, at rest and in motion, by what was measured; a situation that never occurs is left out.
 
     An actuator is at an end stop within `AT_STOP` of its stroke, at rest where it is slower than `AT_REST` of its
@@ -132,23 +152,24 @@ def situations(channels: TwinChannels, answers: Array, truth: Array, low: Array,
         ticks = machine[name]
         if not axes.any() and not ticks.any():
             continue
-        row: dict[str, Any] = {"share": float(axes.mean()), "machine_share": float(ticks.mean())}
-        for columns, key in ((velocities, "velocity_mae"), (strokes, "stroke_error")):
-            named = channels.answers[columns]
-            if named:
-                errors = np.abs(answers - truth)[..., columns].astype(np.float64)
-                row[key] = _where(named, errors, axes)
-        rows[name] = row | {"pressure_nrmse": nrmse_by_channel(channels, answers, truth, ticks)}
+        errors = np.abs(answers - truth)
+        rows[name] = MotionErrors(
+            share=float(axes.mean()),
+            machine_share=float(ticks.mean()),
+            velocity_mae=_where(channels.velocities, errors[..., velocities], axes),
+            stroke_error=_where(channels.strokes, errors[..., strokes], axes) if channels.strokes else None,
+            pressure_nrmse=nrmse_by_channel(channels, answers, truth, ticks),
+        )
     return rows
 
 
-def _where(channels: Sequence[Channel], errors: NDArray[np.float64], axes: NDArray[np.bool_]) -> dict[str, Any]:
+def _where(channels: Sequence[Channel], errors: Array, axes: NDArray[np.bool_]) -> ChannelErrors:
     """Mean of each channel over its own ticks; None where it has none, and no mean over channels then."""
     counts = axes.sum(axis=(0, 1))
-    sums = np.where(axes, errors, 0.0).sum(axis=(0, 1))
+    sums = np.where(axes, errors.astype(np.float64), 0.0).sum(axis=(0, 1))
     seen = [i for i, count in enumerate(counts) if count]
     row = by_channel([channels[i] for i in seen], sums[seen] / counts[seen])
-    return row | {"by_channel": {channel.name: row["by_channel"].get(channel.name) for channel in channels}}
+    return replace(row, by_channel={channel.name: row.by_channel.get(channel.name) for channel in channels})
 
 
 def _integrated(unit: str) -> str:

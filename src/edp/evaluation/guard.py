@@ -22,6 +22,8 @@ from typing import Any
 import numpy as np
 
 from edp.errors import count_of
+from edp.evaluation.free_run_file import FreeRunErrors, FreeRunScores
+from edp.evaluation.scores_file import ByHorizon, ModelScores, ScoresFile, error_at
 from edp.stats.resampled import paired_t
 from edp.wording import figure, percent, percent_interval
 
@@ -205,7 +207,7 @@ def best_verdict(ratios: Iterable[ErrorRatios], template: ErrorVerdict) -> Error
     return None if worst is None else worst[1]
 
 
-def network_verdict(scores: Mapping[str, Any], minutes: float | None = None) -> ErrorVerdict | None:
+def network_verdict(scores: ScoresFile, minutes: float | None = None) -> ErrorVerdict | None:
     """Return the verdict on a network against the baseline with the least error; None without a baseline.
 
     Errors are compared by the geometric mean of the ratio of root-mean-square errors over horizons and targets, so
@@ -215,24 +217,23 @@ def network_verdict(scores: Mapping[str, Any], minutes: float | None = None) -> 
         scores: the content of ``scores.json``.
         minutes: that the preset auto was given; None for any other training.
     """
-    models = scores["models"]
+    models = scores.models
     if NETWORK not in models:
         return None
     unit = "minute" if minutes == 1 else "minutes"
     advice = (
         ADVICE if minutes is None else f"give it more than {figure(minutes)} {unit} (--minutes), or more recordings"
     )
-    horizons, targets = scores["task"]["horizons"], [target["name"] for target in scores["targets"]]
-    ratios = []
+    horizons, network, ratios = scores.task.horizons, models[NETWORK], []
     for name, model in models.items():
         if name != NETWORK:
-            by_target = {target: _logarithm(models[NETWORK], model, target, horizons) for target in targets}
+            by_target = {t.name: _logarithm(network.overall, model.overall, t.name, horizons) for t in scores.targets}
             finite = {target: [value] for target, value in by_target.items() if math.isfinite(value)}
-            ratios.append(ErrorRatios(str(model["label"]), finite, _by_recording(models[NETWORK], model, scores)))
+            ratios.append(ErrorRatios(model.label, finite, _by_recording(network, model, scores)))
     return best_verdict(ratios, ErrorVerdict("", 0.0, (), NETWORK, advice))
 
 
-def beaten_by(scores: Mapping[str, Any], minutes: float | None = None) -> ErrorVerdict | None:
+def beaten_by(scores: ScoresFile, minutes: float | None = None) -> ErrorVerdict | None:
     """Return the verdict of `network_verdict` where it is *worse*, else None."""
     return _if_worse(network_verdict(scores, minutes))
 
@@ -241,13 +242,12 @@ def _if_worse(verdict: ErrorVerdict | None) -> ErrorVerdict | None:
     return verdict if verdict is not None and verdict.outcome is ErrorOutcome.WORSE else None
 
 
-def _by_recording(network: Mapping[str, Any], model: Mapping[str, Any], scores: Mapping[str, Any]) -> dict[str, float]:
+def _by_recording(network: ModelScores, model: ModelScores, scores: ScoresFile) -> dict[str, float]:
     """Logarithms of the ratio of errors of the recordings that both have."""
-    ours, theirs = network.get("recordings", {}), model.get("recordings", {})
     logs = {}
-    for name in ours:
-        pair = ({"overall": ours[name]}, {"overall": theirs.get(name, {})})
-        logs[name] = [_logarithm(*pair, target["name"], scores["task"]["horizons"]) for target in scores["targets"]]
+    for name, ours in network.recordings.items():
+        theirs = model.recordings.get(name, {})
+        logs[name] = [_logarithm(ours, theirs, target.name, scores.task.horizons) for target in scores.targets]
     return by_recording(logs)
 
 
@@ -277,34 +277,34 @@ class LostOutput:
     horizon: int
 
 
-def lost_outputs(scores: Mapping[str, Any]) -> list[LostOutput]:
+def lost_outputs(scores: ScoresFile) -> list[LostOutput]:
     """The outputs on which some baseline has less root-mean-square error at some horizon, the worst first.
 
     Args:
         scores: the content of ``scores.json``.
     """
-    models, horizons = scores["models"], scores["task"]["horizons"]
+    models, horizons = scores.models, scores.task.horizons
     lost = []
-    for target in scores["targets"] if NETWORK in models else ():
+    for target in scores.targets if NETWORK in models else ():
         # Each horizon by itself: a network that leads at one may be of no use at another.
         gains = {
-            (str(model["label"]), horizon): _logarithm(models[NETWORK], model, target["name"], [horizon])
+            (model.label, horizon): _logarithm(models[NETWORK].overall, model.overall, target.name, [horizon])
             for name, model in models.items()
             for horizon in horizons
             if name != NETWORK
         }
         best = max((where for where in gains if gains[where] > LEAST), key=lambda where: gains[where], default=None)
         if best is not None:
-            lost.append(LostOutput(str(target["name"]), best[0], 1.0 - math.exp(-gains[best]), int(best[1])))
+            lost.append(LostOutput(target.name, best[0], 1.0 - math.exp(-gains[best]), best[1]))
     return sorted(lost, key=lambda output: -output.less)
 
 
-def twin_beaten_by(models: Mapping[str, Any]) -> ErrorVerdict | None:
+def twin_beaten_by(models: Mapping[str, FreeRunScores]) -> ErrorVerdict | None:
     """Return the verdict of `twin_verdict` where it is *worse*, else None."""
     return _if_worse(twin_verdict(models))
 
 
-def twin_verdict(models: Mapping[str, Any]) -> ErrorVerdict | None:
+def twin_verdict(models: Mapping[str, FreeRunScores]) -> ErrorVerdict | None:
     """Return the comparison of a twin with its best baseline in free-run simulation; None without a baseline.
 
     Compared is the geometric mean, over actuators, of the ratios of the velocities' errors and of the strokes' at each
@@ -316,7 +316,7 @@ def twin_verdict(models: Mapping[str, Any]) -> ErrorVerdict | None:
     return _verdict_on_free_runs(models, TWIN, TWIN, TWIN_ADVICE)
 
 
-def machine_verdict(models: Mapping[str, Any]) -> ErrorVerdict | None:
+def machine_verdict(models: Mapping[str, FreeRunScores]) -> ErrorVerdict | None:
     """Return the verdict on an identified machine against the guess and the static map on free runs.
 
     Args:
@@ -327,7 +327,9 @@ def machine_verdict(models: Mapping[str, Any]) -> ErrorVerdict | None:
     return _verdict_on_free_runs(rivals, MACHINE, "machine file", MACHINE_ADVICE)
 
 
-def _verdict_on_free_runs(models: Mapping[str, Any], judged: str, what: str, advice: str) -> ErrorVerdict | None:
+def _verdict_on_free_runs(
+    models: Mapping[str, FreeRunScores], judged: str, what: str, advice: str
+) -> ErrorVerdict | None:
     own = models[judged]
     ratios = [
         ErrorRatios(name, _free_run_logs(own, scores), by_recording(_free_run_logs_by_recording(own, scores)))
@@ -337,7 +339,7 @@ def _verdict_on_free_runs(models: Mapping[str, Any], judged: str, what: str, adv
     return best_verdict(ratios, ErrorVerdict("", 0.0, (), what, advice))
 
 
-def _free_run_logs(own: Mapping[str, Any], scores: Mapping[str, Any]) -> dict[str, list[float]]:
+def _free_run_logs(own: FreeRunErrors, scores: FreeRunErrors) -> dict[str, list[float]]:
     """Logarithms of the ratio of errors of each actuator, at the times that both have; without errors of zero."""
     ours, theirs = _free_run_errors(own), _free_run_errors(scores)
     return {
@@ -347,12 +349,12 @@ def _free_run_logs(own: Mapping[str, Any], scores: Mapping[str, Any]) -> dict[st
     }  # fmt: skip
 
 
-def _free_run_logs_by_recording(own: Mapping[str, Any], scores: Mapping[str, Any]) -> dict[str, list[float]]:
+def _free_run_logs_by_recording(own: FreeRunScores, scores: FreeRunScores) -> dict[str, list[float]]:
     """The same of each recording, over all actuators."""
-    theirs = scores.get("by_recording", {})
+    theirs = scores.by_recording
     return {
         name: [value for logs in _free_run_logs(summary, theirs[name]).values() for value in logs]
-        for name, summary in own.get("by_recording", {}).items()
+        for name, summary in own.by_recording.items()
         if name in theirs
     }
 
@@ -394,7 +396,7 @@ def change_verdict(change: float, by_unit: Mapping[str, float], reference: Error
     return replace(reference, less=1.0 - math.exp(-mean), interval=_interval(logs, mean), recordings=len(logs))
 
 
-def free_run_error(scores: Mapping[str, Any], reference: Mapping[str, Any]) -> float:
+def free_run_error(scores: FreeRunErrors, reference: FreeRunErrors) -> float:
     """Error of free runs over that of a reference on the same runs: what `twin_beaten_by` compares, as one number.
 
     Args:
@@ -408,24 +410,22 @@ def free_run_error(scores: Mapping[str, Any], reference: Mapping[str, Any]) -> f
     return math.exp(sum(ratios) / len(ratios)) if ratios else 1.0
 
 
-def _free_run_errors(scores: Mapping[str, Any]) -> dict[str, dict[float, float]]:
+def _free_run_errors(scores: FreeRunErrors) -> dict[str, dict[float, float]]:
     """Return errors by actuator and time (s): the velocity error at time 0, stroke errors at later times."""
-    rows = [(0.0, scores["velocity_mae"]), *((row["at_s"], row) for row in scores["stroke_error"])]
-    columns = zip(*(row["by_channel"].values() for _, row in rows), strict=True)
+    rows = [(0.0, scores.velocity_mae), *((row.at_s, row) for row in scores.stroke_error)]
+    columns = zip(*([value or 0.0 for value in row.by_channel.values()] for _, row in rows), strict=True)
     times = [at for at, _ in rows]
     return {
         actuator: dict(zip(times, column, strict=True))
-        for actuator, column in zip(scores["velocity_mae"]["by_channel"], columns, strict=True)
+        for actuator, column in zip(scores.velocity_mae.by_channel, columns, strict=True)
     }
 
 
-def _logarithm(network: Mapping[str, Any], model: Mapping[str, Any], target: str, horizons: list[int]) -> float:
+def _logarithm(network: ByHorizon, model: ByHorizon, target: str, horizons: Sequence[int]) -> float:
     """Mean over horizons of the logarithm of the network's error over a model's; NaN where one of them is zero."""
     values = []
     for horizon in horizons:
-        ours, theirs = (
-            entry["overall"].get(str(horizon), {}).get(target, {}).get(MEASURE) for entry in (network, model)
-        )
+        ours, theirs = (error_at(entry, horizon, target, MEASURE) for entry in (network, model))
         # A perfect prediction has no logarithm; such a target decides nothing.
         if ours and theirs:
             values.append(math.log(ours / theirs))

@@ -18,8 +18,7 @@ from edp.data.spread_rows import spread_series
 from edp.errors import ConfigError
 from edp.evaluation.baselines import BASELINES, Baseline, BaselineTask
 from edp.evaluation.ruler import Numbered, Ruler
-from edp.evaluation.scores_file import nearest_to_shown
-from edp.evaluation.situation import situation_of
+from edp.evaluation.scores_file import ByHorizon, IntervalScores, Means, ModelScores, ScoresFile, nearest_to_shown
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_groups, streamed
 from edp.progress import SILENT, Progress
@@ -70,12 +69,12 @@ class Evaluation:
     """Scores of every model, and what pictures need of the first recordings.
 
     Attributes:
-        scores: the content of ``scores.json`` (schema 1).
+        scores: the content of ``scores.json``.
         tensors: truth, predictions, inputs and interval of the first `KEPT_RECORDINGS` and `KEPT_TICKS`, by
             ``recording/name``.
     """
 
-    scores: dict[str, Any]
+    scores: ScoresFile
     tensors: dict[str, NDArray[Any]]
 
 
@@ -156,7 +155,7 @@ def by_effort(names: Sequence[str]) -> list[str]:
 class JudgedModel:
     """One model's entry in ``scores.json``, and what pictures show of it, by ``recording/name``."""
 
-    entry: Mapping[str, Any]
+    entry: ModelScores
     tensors: Mapping[str, NDArray[np.float32]]
 
 
@@ -170,8 +169,8 @@ class JudgedPart:
         tensors: by ``recording/name``.
     """
 
-    measured: Mapping[str, Any]
-    intervals: Mapping[str, Any] | None
+    measured: Mapping[str, object]
+    intervals: Mapping[str, object] | None
     tensors: Mapping[str, NDArray[np.float32]]
 
 
@@ -257,20 +256,22 @@ class ModelBench:
             if part.intervals is not None:
                 within.add(part.intervals)
             tensors |= part.tensors
-        entry = {"label": label, "seconds": seconds, **self.ruler.scores(measured)}
+        scores = replace(self.ruler.scores(measured), label=label, seconds=seconds)
         if coverages:
-            entry["intervals"] = self.ruler.intervals(within, coverages)
-            entry["weighted_interval_score"] = _weighted(entry["overall"], entry["intervals"])
-        return JudgedModel(entry, tensors)
+            intervals = self.ruler.intervals(within, coverages)
+            weighted = _weighted(scores.overall, intervals)
+            scores = replace(scores, intervals=intervals, weighted_interval_score=weighted)
+        return JudgedModel(scores, tensors)
 
     def baseline(self, name: str) -> JudgedModel:
         """Fit a baseline on the training part, and run it along test and validation part."""
         began, pictures = time.perf_counter(), _Kept(self.data.test)
         baseline = _fitted(BASELINES[name], self.data, self.spec)
         measured = self.ruler.measure(pictures.seen(_predicted(baseline, self.data, self.data.test), name))
-        on_validation = _on_validation(baseline, self.data, max(self.skip, self.spec.history))
+        validation = _on_validation(baseline, self.data, max(self.skip, self.spec.history))
         seconds = time.perf_counter() - began
-        return JudgedModel({"label": baseline.label, "seconds": seconds, **measured, **on_validation}, pictures.tensors)
+        scores = replace(measured, label=baseline.label, seconds=seconds, validation=validation)
+        return JudgedModel(scores, pictures.tensors)
 
     def together(self, models: Mapping[str, JudgedModel], left_out: Sequence[str] = ()) -> Evaluation:
         """All models as one evaluation; `left_out` names baselines that were asked for and not run."""
@@ -279,33 +280,30 @@ class ModelBench:
         tensors = {**pictures.tensors}
         for model in models.values():
             tensors |= model.tensors
-        left = {"left_out": list(left_out)} if left_out else {}
-        entries = {name: dict(model.entry) for name, model in models.items()}
-        scores = self.ruler.header() | {"models": entries, "situation": situation_of(self.data)} | left
-        return Evaluation(scores, tensors)
+        return Evaluation(self.ruler.file({name: model.entry for name, model in models.items()}, left_out), tensors)
 
 
-def _weighted(overall: Mapping[str, Any], intervals: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
+def _weighted(overall: ByHorizon, intervals: Mapping[str, Sequence[IntervalScores]]) -> dict[str, Means]:
     """Weighted interval score by horizon and target, of medians and intervals of the same ticks."""
     return {
         horizon: {
             target: weighted_interval_score(
-                overall[horizon][target]["mae"], {row["coverage"]: row["score"][target] for row in rows}
+                overall[horizon][target]["mae"] or 0.0, {row.coverage: row.score[target] for row in rows}
             )
-            for target in rows[0]["score"]
+            for target in rows[0].score
         }
         for horizon, rows in intervals.items()
     }
 
 
-def _on_validation(baseline: Baseline, data: Prepared, skip: int) -> dict[str, Any]:
+def _on_validation(baseline: Baseline, data: Prepared, skip: int) -> ByHorizon:
     """Overall scores on the validation part, which also chose its sizes; none where it is too short."""
     if max((part.samples for part in data.validation), default=0) - data.task.max_horizon <= skip:
         return {}
     # As epochs are judged: of a large validation part evenly spread stretches.
     parts = spread_series(data.validation, 100 * (skip + data.task.max_horizon), MOST_VALIDATED)
     ruler = Ruler(replace(data, test=parts), skip)
-    return {"validation": ruler.measure(_predicted(baseline, data, parts))["overall"]}
+    return ruler.measure(_predicted(baseline, data, parts)).overall
 
 
 def _check_memory(predictor: Predictor, data: Prepared, spec: JudgeSpec) -> None:
@@ -341,7 +339,7 @@ def _predicted(
         yield number, baseline.predict(part)
 
 
-def score_predictions(predictions: Iterable[NDArray[np.float32]], data: Prepared, skip: int) -> dict[str, Any]:
+def score_predictions(predictions: Iterable[NDArray[np.float32]], data: Prepared, skip: int) -> ModelScores:
     """Scores of predictions ``(time, horizon, target)`` of each of ``data.test``, as `judge` gives them for a model.
 
     Args:
@@ -355,7 +353,7 @@ def score_predictions(predictions: Iterable[NDArray[np.float32]], data: Prepared
     return Ruler(data, skip).measure(enumerate(predictions))
 
 
-def score_network(predictor: Predictor, data: Prepared, skip: int) -> dict[str, Any]:
+def score_network(predictor: Predictor, data: Prepared, skip: int) -> ModelScores:
     """As `score_predictions`, of a network that is run as a stream over ``data.test``."""
     return Ruler(data, skip).measure(streamed(predictor, predictor.predict, data.test))
 

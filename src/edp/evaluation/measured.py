@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from edp.evaluation.by_situation import SituationTally
+from edp.evaluation.scores_file import ByTarget, SpeedBin
 from edp.evaluation.tally import Tally, Values
 
 # Six bins show where an error grows with speed and leave enough samples in each.
@@ -31,9 +32,9 @@ class Measured:
         self.by_situation = [SituationTally(targets) for _ in range(horizons)]
         self.speeds = [SpeedTally(edges) for _ in range(horizons)]
         self.integrals = {target: np.zeros(2) for target in integrate}
-        self.recordings: dict[int, dict[str, Any]] = {}
+        self.recordings: dict[int, dict[str, ByTarget]] = {}
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> dict[str, object]:
         """All that it holds, as plain values and arrays."""
         return {
             "tallies": [tally.state() for tally in self.tallies],
@@ -85,7 +86,7 @@ class SpeedTally:
         self.count += np.bincount(places, minlength=SPEED_BINS)
         self.total += np.bincount(places, weights=np.abs(predicted - truth).ravel(), minlength=SPEED_BINS)
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> dict[str, object]:
         """All that it holds, as arrays."""
         return {"count": self.count, "total": self.total}
 
@@ -94,14 +95,14 @@ class SpeedTally:
         self.count += state["count"]
         self.total += state["total"]
 
-    def rows(self) -> list[dict[str, Any]]:
-        """By bin, from slow to fast."""
-        return [
-            {
-                "low": float(self.edges[i]),
-                "high": float(self.edges[i + 1]),
-                "count": int(self.count[i]),
-                "mae": float(self.total[i] / self.count[i]) if self.count[i] else None,
-            }
+    def rows(self) -> tuple[SpeedBin, ...]:
+        """Return the bins from slow to fast."""
+        return tuple(
+            SpeedBin(
+                low=float(self.edges[i]),
+                high=float(self.edges[i + 1]),
+                count=int(self.count[i]),
+                mae=float(self.total[i] / self.count[i]) if self.count[i] else None,
+            )
             for i in range(SPEED_BINS)
-        ]
+        )

@@ -197,7 +197,7 @@ class MonitorFootprint:
             "verdict": self.verdict(budget),
         }
 
-    def verdict(self, budget: Budget) -> list[dict[str, Any]]:
+    def verdict(self, budget: Budget) -> list[dict[str, object]]:
         """A row for each limit, as `Footprint.verdict` has them."""
         low, typical, high = self.cycles[budget.core]
         text = f"high estimate of the longest tick; low {low:,}, typical {typical:,}"

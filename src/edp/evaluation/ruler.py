@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,17 @@ from edp.data.prepared import Prepared
 from edp.errors import DataError
 from edp.evaluation.by_situation import Situations, SituationTally
 from edp.evaluation.measured import SPEED_BINS, Measured, MeasuredIntervals
+from edp.evaluation.scores_file import (
+    MEAN,
+    ByTarget,
+    IntervalScores,
+    ModelScores,
+    ScoredInput,
+    ScoredTarget,
+    ScoredTask,
+    ScoresFile,
+)
+from edp.evaluation.situation import situation_of
 from edp.evaluation.tally import Values, named_scores
 from edp.signals import KINDS
 from edp.stats.metrics import interval_score, interval_scores, score, spread
@@ -60,29 +72,31 @@ class Ruler:
         future = np.stack([series.targets[k : k + ticks] for k in self.task.horizons], axis=1)
         return np.asarray(future.astype(np.float64) * self.factors)
 
-    def header(self) -> dict[str, Any]:
-        """The task, its targets and inputs."""
+    def file(self, models: Mapping[str, ModelScores], left_out: Sequence[str]) -> ScoresFile:
+        """Return the scores of all models with the task, its targets and inputs."""
         targets = zip(self.task.targets, self.data.descriptions, self.units, self.factors, strict=True)
-        return {
-            "schema": 1,
-            "task": {
-                "name": self.task.features.name,
-                "horizons": list(self.task.horizons),
-                "rate_hz": self.task.rate_hz,
-                "mode": str(self.task.mode),
-                "skip": self.skip,
-            },
-            "targets": [
-                {"name": name, "description": text, "unit": unit, "factor": float(factor)}
+        return ScoresFile(
+            task=ScoredTask(
+                name=self.task.features.name,
+                horizons=self.task.horizons,
+                rate_hz=self.task.rate_hz,
+                mode=str(self.task.mode),
+                skip=self.skip,
+            ),
+            targets=tuple(
+                ScoredTarget(name=name, description=text, unit=unit, factor=float(factor))
                 for name, text, unit, factor in targets
-            ],
-            "inputs": [
-                {"name": c.name, "unit": KINDS[c.kind].report_unit, "factor": float(KINDS[c.kind].report_factor)}
+            ),
+            inputs=tuple(
+                ScoredInput(name=c.name, unit=KINDS[c.kind].report_unit, factor=float(KINDS[c.kind].report_factor))
                 for c in self.data.inputs
-            ],
-        }
+            ),
+            models=dict(models),
+            situation=situation_of(self.data),
+            left_out=tuple(left_out),
+        )
 
-    def measure(self, predictions: Numbered) -> dict[str, Any]:
+    def measure(self, predictions: Numbered) -> ModelScores:
         """Scores of one model: overall, by recording with spread, by speed and situation, and of running integrals."""
         return self.scores(self.gathered(predictions))
 
@@ -107,25 +121,25 @@ class Ruler:
                 sums += self._integrated(target, predicted, truth)
         return measured
 
-    def scores(self, measured: Measured) -> dict[str, Any]:
+    def scores(self, measured: Measured) -> ModelScores:
         """Scores of what all recordings measure together, as `measure` gives them."""
         names = [str(horizon) for horizon in self.task.horizons]
-        recordings: dict[str, Any] = {}
+        recordings: dict[str, dict[str, ByTarget]] = {}
         for number in sorted(measured.recordings):
             recordings.setdefault(self.data.test[number].name, {}).update(measured.recordings[number])
         # Of each horizon by recording: `recordings` holds what was scored at all.
-        errors = {name: [r[name]["mean"]["mae"] for r in recordings.values() if name in r] for name in names}
-        scores = {
-            "overall": {name: tally.scores() for name, tally in zip(names, measured.tallies, strict=True)},
-            "recordings": recordings,
-            "spread": {name: spread(values) for name, values in errors.items()},
-            "by_speed": {name: speed.rows() for name, speed in zip(names, measured.speeds, strict=True)},
-        }
-        if self.situations.axes:
-            by_situation = zip(names, measured.by_situation, strict=True)
-            scores["by_situation"] = {name: tally.rows() for name, tally in by_situation}
-        roots = {target: {"rmse": float(np.sqrt(sums[1] / sums[0]))} for target, sums in measured.integrals.items()}
-        return scores | ({"integrated": roots} if roots else {})
+        errors = {name: [r[name][MEAN]["mae"] for r in recordings.values() if name in r] for name in names}
+        by_situation = zip(names, measured.by_situation, strict=True) if self.situations.axes else ()
+        return ModelScores(
+            overall={name: tally.scores() for name, tally in zip(names, measured.tallies, strict=True)},
+            recordings=recordings,
+            spread={name: asdict(spread([x for x in values if x is not None])) for name, values in errors.items()},
+            by_speed={name: speed.rows() for name, speed in zip(names, measured.speeds, strict=True)},
+            by_situation={name: tally.rows() for name, tally in by_situation},
+            integrated={
+                target: {"rmse": float(np.sqrt(sums[1] / sums[0]))} for target, sums in measured.integrals.items()
+            },
+        )
 
     def unmeasured_intervals(self, coverages: Sequence[float]) -> MeasuredIntervals:
         """What no interval has come to yet."""
@@ -148,24 +162,26 @@ class Ruler:
                 measured.wide[h, which, i] += width * len(truth)
         return measured
 
-    def intervals(self, measured: MeasuredIntervals, coverages: Sequence[float]) -> dict[str, Any]:
+    def intervals(
+        self, measured: MeasuredIntervals, coverages: Sequence[float]
+    ) -> dict[str, tuple[IntervalScores, ...]]:
         """Share of the truth that each interval holds, its mean width and score, by horizon, coverage and target."""
         ticks = measured.ticks
         return {
-            str(horizon): [
-                {
-                    "coverage": coverage,
-                    "covered": self._named(measured.covered[h, which] / ticks),
-                    "width": self._named(measured.wide[h, which] / ticks),
-                    "score": self._named(measured.scored[h, which] / ticks),
-                }
+            str(horizon): tuple(
+                IntervalScores(
+                    coverage=coverage,
+                    covered=self._named(measured.covered[h, which] / ticks),
+                    width=self._named(measured.wide[h, which] / ticks),
+                    score=self._named(measured.scored[h, which] / ticks),
+                )
                 for which, coverage in enumerate(coverages)
-            ]
+            )
             for h, horizon in enumerate(self.task.horizons)
         }
 
     def _named(self, values: Values) -> dict[str, float]:
-        return {"mean": float(np.mean(values)), **dict(zip(self.task.targets, map(float, values), strict=True))}
+        return {MEAN: float(np.mean(values)), **dict(zip(self.task.targets, map(float, values), strict=True))}
 
     def _by_situation(
         self, tally: SituationTally, number: int, horizon: int, predicted: NDArray[Any], truth: NDArray[Any]
@@ -187,15 +203,14 @@ class Ruler:
         scored = self._scored(predicted)
         return predicted[scored], truth[scored]
 
-    def _of_recording(self, predicted: NDArray[Any], truth: NDArray[Any]) -> dict[str, Any]:
+    def _of_recording(self, predicted: NDArray[Any], truth: NDArray[Any]) -> ByTarget:
         """Return all scores of the mean over outputs; of each output errors alone, since runs have many recordings."""
         scores = named_scores(
             self.task.targets, [score(predicted[:, i], truth[:, i]) for i in range(len(self.task.targets))]
         )
         measures = ("mae", "rmse")
         return {
-            name: values if name == "mean" else {key: values[key] for key in measures}
-            for name, values in scores.items()
+            name: values if name == MEAN else {key: values[key] for key in measures} for name, values in scores.items()
         }
 
     def _integrated(self, target: str, predicted: NDArray[Any], truth: NDArray[Any]) -> Values:

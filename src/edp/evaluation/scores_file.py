@@ -1,189 +1,281 @@
-"""Reading ``scores.json``: the shapes that reports and tables rely on are checked before anything is drawn."""
+"""Content of ``scores.json``: errors of a network and of its baselines on the same recordings, in report units."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from edp.errors import StorageError
-from edp.settings.bounds import shown
-from edp.storage import read_object
+from edp.errors import ConfigError, DataError
+from edp.settings.bounds import MOST_TICKS, above, check_bounds, integer
+from edp.settings.results import ResultFile
+from edp.signals import display_offset
 from edp.storage.paths import is_file_at
 
-
-@dataclass(frozen=True)
-class Leaf:
-    """A plain value: whether it may stand there, and the words for what must."""
-
-    fits: Callable[[Any], bool]
-    words: str
-
-
-@dataclass(frozen=True)
-class NamedValues:
-    """An object whose keys are names; every value has one shape.
-
-    Attributes:
-        value: the shape.
-        needed: keys that must be there.
-    """
-
-    value: Shape
-    needed: tuple[str, ...] = ()
+MEAN = "mean"
+"""Name of the mean over targets beside the names of targets."""
+Metrics = Mapping[str, float | int | None]
+"""Values by name of a metric, such as ``rmse``; None where it is not defined."""
+ByTarget = Mapping[str, Metrics]
+"""Metrics of each target, and of `MEAN`."""
+ByHorizon = Mapping[str, ByTarget]
+"""By horizon in samples, as text."""
+Means = Mapping[str, float]
+"""A value of each target, and of `MEAN`."""
+PREDICTIONS = "predictions.safetensors"
+FACTOR = above(0.0, 1e12)
 
 
-@dataclass(frozen=True)
-class Listed:
-    """A list; every entry has one shape."""
-
-    value: Shape
-
-
-@dataclass(frozen=True)
-class KeyedObject:
-    """An object with known keys; others are passed over.
+@dataclass(frozen=True, kw_only=True)
+class ScoredTask:
+    """The task that was evaluated.
 
     Attributes:
-        keys: shapes by key.
-        needed: keys that must be there.
+        name: of the task.
+        horizons: samples ahead.
+        rate_hz: samples per second; None where unknown.
+        mode: how targets are predicted.
+        skip: first samples of each segment that are not evaluated.
     """
 
-    keys: dict[str, Shape]
-    needed: tuple[str, ...] = ()
+    name: str = ""
+    horizons: tuple[int, ...]
+    rate_hz: float | None = None
+    mode: str = ""
+    skip: int = 0
+
+    def __post_init__(self) -> None:
+        check_bounds("task", self, horizons=integer(0, MOST_TICKS), skip=integer(0, MOST_TICKS))
+        if self.rate_hz is not None:
+            check_bounds("task", self, rate_hz=FACTOR)
 
 
-Shape = Leaf | NamedValues | Listed | KeyedObject
+@dataclass(frozen=True, kw_only=True)
+class ScoredTarget:
+    """A target. Values in `unit` are SI values times `factor` plus `offset`; differences have no offset."""
+
+    name: str
+    description: str = ""
+    unit: str = ""
+    factor: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_bounds("target", self, factor=FACTOR)
+
+    @property
+    def offset(self) -> float:
+        """See `edp.signals.display_offset`."""
+        return display_offset(self.unit)
 
 
-def _is_number(value: Any) -> bool:
-    # true and false are integers to Python.
-    return isinstance(value, int | float) and not isinstance(value, bool)
+@dataclass(frozen=True, kw_only=True)
+class ScoredInput:
+    """An input channel, with the unit of reports and its factor."""
+
+    name: str
+    unit: str
+    factor: float
+
+    def __post_init__(self) -> None:
+        check_bounds("input", self, factor=FACTOR)
 
 
-NUMBER = Leaf(lambda value: value is None or _is_number(value), "a number or null")
-REAL = Leaf(_is_number, "a number")
-COUNT = Leaf(lambda value: isinstance(value, int) and _is_number(value) and value >= 0, "an integer, 0 or more")
-SIZE = Leaf(lambda value: _is_number(value) and value > 0, "a number above 0")
-NAME = Leaf(lambda value: isinstance(value, str), "a text")
-METRICS = NamedValues(NUMBER)
-"""Metrics by name."""
-BOUNDS = ("coverage", "covered", "width")
-MEANS = NamedValues(REAL, ("mean",))
-"""Of each target, and of all."""
-MODEL = KeyedObject(
-    {
-        "label": NAME,
-        "seconds": NUMBER,
-        "overall": NamedValues(NamedValues(METRICS)),
-        "validation": NamedValues(NamedValues(METRICS)),
-        "recordings": NamedValues(NamedValues(NamedValues(METRICS))),
-        "spread": NamedValues(METRICS),
-        "by_speed": NamedValues(
-            Listed(KeyedObject({"low": REAL, "high": REAL, "count": COUNT, "mae": NUMBER}, ("low", "high", "count")))
-        ),
-        "by_situation": NamedValues(
-            Listed(
-                KeyedObject(
-                    {
-                        "situation": NAME,
-                        "ticks": COUNT,
-                        "share": REAL,
-                        "of_error": REAL,
-                        "mae": NamedValues(NUMBER),
-                    },
-                    ("situation", "share", "of_error", "mae"),
-                )
-            )
-        ),
-        "intervals": NamedValues(Listed(KeyedObject({"coverage": REAL, "covered": MEANS, "width": MEANS}, BOUNDS))),
-        "weighted_interval_score": NamedValues(MEANS),
-        "integrated": NamedValues(METRICS),
-    },
-    ("overall",),
-)
-SITUATION = KeyedObject(
-    {
-        "outside": Listed(KeyedObject({"channel": NAME, "share": REAL}, ("channel", "share"))),
-        "changes": Listed(
-            KeyedObject(
-                {"target": NAME, "horizon": COUNT, "ratio": REAL, "beyond": REAL},
-                ("target", "horizon", "ratio", "beyond"),
-            )
-        ),
-    },
-    ("outside", "changes"),
-)
-SCORES = KeyedObject(
-    {
-        "task": KeyedObject(
-            {"name": NAME, "horizons": Listed(COUNT), "rate_hz": SIZE, "mode": NAME, "skip": COUNT}, ("horizons",)
-        ),
-        "targets": Listed(KeyedObject({"name": NAME, "description": NAME, "unit": NAME, "factor": SIZE}, ("name",))),
-        "inputs": Listed(KeyedObject({"name": NAME, "unit": NAME, "factor": SIZE}, ("name", "unit", "factor"))),
-        "models": NamedValues(MODEL),
-        "situation": SITUATION,
-    },
-    ("task", "targets", "models"),
-)
+@dataclass(frozen=True, kw_only=True)
+class SpeedBin:
+    """Mean absolute error of the samples whose target has a magnitude from `low` to `high`; None without samples."""
+
+    low: float
+    high: float
+    count: int
+    mae: float | None
 
 
-def read_scores(path: str | Path) -> dict[str, Any]:
-    """The content of a ``scores.json``, in the form in which `edp.evaluation.judge` writes it.
+@dataclass(frozen=True, kw_only=True)
+class SituationErrors:
+    """Errors while the axes do one thing.
+
+    Attributes:
+        situation: name, see `edp.evaluation.by_situation`.
+        ticks: number of samples.
+        share: fraction of the time.
+        of_error: fraction of the summed error.
+        mae: mean absolute error of each target; None without samples.
+    """
+
+    situation: str
+    ticks: int = 0
+    share: float
+    of_error: float
+    mae: Mapping[str, float | None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class IntervalScores:
+    """How prediction intervals of one nominal coverage hold the truth.
+
+    Attributes:
+        coverage: nominal.
+        covered: fraction of the truth inside.
+        width: mean width.
+        score: mean interval score; empty in files of earlier versions.
+    """
+
+    coverage: float
+    covered: Means
+    width: Means
+    score: Means = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("covered", "width"):
+            check_mean(name, getattr(self, name))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelScores:
+    """Scores of one model.
+
+    Attributes:
+        label: name in tables.
+        seconds: training time.
+        overall: metrics over all recordings.
+        recordings: metrics of each recording.
+        spread: order statistics over recordings of the mean absolute error, by horizon.
+        by_speed, by_situation: errors by horizon.
+        integrated: error of the running integral, by target.
+        intervals: by horizon; empty for a model without intervals.
+        weighted_interval_score: by horizon.
+        validation: metrics on the validation part, of a baseline.
+    """
+
+    label: str = ""
+    seconds: float | None = None
+    overall: ByHorizon
+    recordings: Mapping[str, ByHorizon] = field(default_factory=dict)
+    spread: Mapping[str, Metrics] = field(default_factory=dict)
+    by_speed: Mapping[str, tuple[SpeedBin, ...]] = field(default_factory=dict)
+    by_situation: Mapping[str, tuple[SituationErrors, ...]] = field(default_factory=dict)
+    integrated: Mapping[str, Metrics] = field(default_factory=dict)
+    intervals: Mapping[str, tuple[IntervalScores, ...]] = field(default_factory=dict)
+    weighted_interval_score: Mapping[str, Means] = field(default_factory=dict)
+    validation: ByHorizon = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for horizon, values in self.weighted_interval_score.items():
+            check_mean(f"weighted_interval_score.{horizon}", values)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutsideRange:
+    """A channel outside of its range in training, in a fraction `share` of the samples."""
+
+    channel: str
+    share: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class TargetChange:
+    """How changes of a target differ from those in training.
+
+    Attributes:
+        target: name.
+        horizon: in samples.
+        ratio: root-mean-square change over that in training.
+        beyond: fraction of the changes that are larger than any in training.
+    """
+
+    target: str
+    horizon: int
+    ratio: float
+    beyond: float
+
+    def __post_init__(self) -> None:
+        check_bounds("change", self, horizon=integer(0, MOST_TICKS), ratio=FACTOR)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataSituation:
+    """How the evaluated recordings differ from those in training.
+
+    Attributes:
+        outside: channels that leave their range, most of the time first.
+        changes: targets that change more or less than in training.
+    """
+
+    outside: tuple[OutsideRange, ...]
+    changes: tuple[TargetChange, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrawnSample:
+    """Which part of the recordings was evaluated: hours of all hours, in segments; `what` says it in words."""
+
+    hours: float
+    of_hours: float
+    stretches: int
+    what: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoresFile(ResultFile):
+    """Content of ``scores.json``.
+
+    Attributes:
+        models: by name; the network is ``network``.
+        left_out: baselines that were asked for and not run.
+        drawn: the part of the recordings that was evaluated; None for all.
+        key: of the evaluation, see `edp.storage.runs.run_key`; empty where `left_out` names some.
+        files: hashes of files in the same folder.
+    """
+
+    NAME = "scores.json"
+    SCHEMA = 1
+    WHAT = "scores"
+    ADVICE = "remove it and run edp evaluate"
+
+    task: ScoredTask
+    targets: tuple[ScoredTarget, ...]
+    inputs: tuple[ScoredInput, ...] = ()
+    models: Mapping[str, ModelScores]
+    situation: DataSituation | None = None
+    left_out: tuple[str, ...] = ()
+    drawn: DrawnSample | None = None
+    key: str | None = None
+    files: Mapping[str, str] = field(default_factory=dict)
+
+
+def metric(values: Metrics, name: str) -> float:
+    """Return a metric by its name.
 
     Raises:
-        StorageError: it cannot be read, or a value in it has another form; the message names the value.
+        DataError: the metric is absent or not defined.
     """
-    return read_shaped(path, SCORES)
+    value = values.get(name)
+    if value is None:
+        raise DataError(f"scores: '{name}' is not defined; evaluate again, on more recordings")
+    return float(value)
 
 
-def earlier_scores(folder: Path, key: str) -> dict[str, Any] | None:
-    """Scores of an earlier judgement with this key, beside their predictions; None where there are none."""
-    if not is_file_at(folder / "scores.json") or not is_file_at(folder / "predictions.safetensors"):
+def error_at(overall: ByHorizon, horizon: int, target: str, name: str) -> float | None:
+    """Return a finite metric of a target, or of `MEAN`, at a horizon; None where it was not computed."""
+    value = overall.get(str(horizon), {}).get(target, {}).get(name)
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def check_mean(name: str, values: Means) -> None:
+    """Raise ConfigError if values by target lack their mean."""
+    if MEAN not in values:
+        raise ConfigError(f"'{name}.{MEAN}' is missing; it must be given")
+
+
+def earlier_scores(folder: Path, key: str) -> ScoresFile | None:
+    """Return the scores of an earlier evaluation with this key and with its predictions; None if there are none."""
+    if not is_file_at(folder / ScoresFile.NAME) or not is_file_at(folder / PREDICTIONS):
         return None
-    scores = read_scores(folder / "scores.json")
-    return scores if scores.get("key") == key else None
-
-
-def read_shaped(path: str | Path, shape: Shape) -> dict[str, Any]:
-    """The content of a JSON file of scores whose values have the forms that a shape tells.
-
-    Raises:
-        StorageError: it cannot be read, or a value in it has another form; the message names the value.
-    """
-    content = read_object(path)
-    _check(content, shape, "", f"'{path}'")
-    return content
-
-
-def _check(value: Any, shape: Shape, where: str, file: str) -> None:
-    if isinstance(shape, Leaf):
-        if not shape.fits(value):
-            _refuse(value, shape.words, where, file)
-    elif isinstance(shape, Listed):
-        if not isinstance(value, list):
-            _refuse(value, "a list", where, file)
-        for number, entry in enumerate(value):
-            _check(entry, shape.value, f"{where}[{number}]", file)
-    else:
-        if not isinstance(value, dict):
-            _refuse(value, "an object", where, file)
-        shapes = dict.fromkeys(value, shape.value) if isinstance(shape, NamedValues) else shape.keys
-        for key in shape.needed:
-            if key not in value:
-                _refuse(value, f"an object with the key '{key}'", where, file)
-        for key in value.keys() & shapes.keys():
-            _check(value[key], shapes[key], f"{where}.{key}".lstrip("."), file)
-
-
-def _refuse(value: Any, words: str, where: str, file: str) -> None:
-    raise StorageError(
-        f"{file}: {where or 'the whole'} is {shown(value)}; {words} must hold. The file was changed by hand or is of "
-        "another version: remove it and run edp evaluate"
-    )
+    scores = ScoresFile.read(folder)
+    return scores if scores.key == key else None
 
 
 def nearest_to_shown(coverages: Sequence[float]) -> int:
-    """Which of several intervals pictures show: that nearest to 90 %."""
+    """Return the place of the interval that pictures show: the one nearest to 90 %."""
     return min(range(len(coverages)), key=lambda which: abs(coverages[which] - 0.9))

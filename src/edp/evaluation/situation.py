@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.data.prepared import Prepared
 from edp.data.series import Series
+from edp.evaluation.scores_file import DataSituation, OutsideRange, TargetChange
 
 MARGIN = 0.01
 """Of the range in training, by which a value must leave it: sensors are noisy."""
@@ -22,19 +22,13 @@ LEAST_RATIO = 2.0
 """Times that targets change more, or less, than in training before it is said."""
 
 
-def situation_of(data: Prepared) -> dict[str, Any]:
-    """What is out of the ordinary in ``data.test``, beside the training and validation parts.
-
-    Returns:
-        ``outside``: of channels that leave their range, ``channel`` and ``share`` of the ticks, the most first.
-        ``changes``: of targets and horizons (in ticks), ``target``, ``horizon``, ``ratio`` of the root-mean-square
-        change to that in training, and ``beyond``, the share of changes that are larger than any in training.
-    """
+def situation_of(data: Prepared) -> DataSituation:
+    """Return what is out of the ordinary in ``data.test``, compared with the training and validation parts."""
     trained = [part for part in (*data.train, *data.validation) if part.samples]
     if not trained:
-        return {"outside": [], "changes": []}  # a bundle alone does not know what trained it
+        return DataSituation(outside=(), changes=())  # a bundle alone does not know what trained it
     outside = _outside(trained, data.test, [channel.name for channel in data.inputs], list(data.task.targets))
-    changes: list[dict[str, Any]] = []
+    changes = []
     for horizon in (k for k in data.task.horizons if k > 0):
         usual, largest = _changes(trained, horizon)
         size, beyond = _changes(data.test, horizon, largest)
@@ -42,14 +36,13 @@ def situation_of(data: Prepared) -> dict[str, Any]:
             # Of a target that never moved in training, or rests now, the ratio would say nothing.
             ratio = float(now / before) if before > 0 and now > 0 else 1.0
             if share >= LEAST_BEYOND or not 1 / LEAST_RATIO <= ratio <= LEAST_RATIO:
-                row = {"target": target, "horizon": int(horizon), "ratio": ratio, "beyond": float(share)}
-                changes.append(row)
-    return {"outside": outside, "changes": changes}
+                changes.append(TargetChange(target=target, horizon=int(horizon), ratio=ratio, beyond=float(share)))
+    return DataSituation(outside=outside, changes=tuple(changes))
 
 
 def _outside(
     trained: Iterable[Series], tested: Iterable[Series], inputs: list[str], targets: list[str]
-) -> list[dict[str, Any]]:
+) -> tuple[OutsideRange, ...]:
     # Targets that no input shows, too: of the others the inputs say the same.
     hidden = [number for number, name in enumerate(targets) if name not in inputs]
     names = [*inputs, *(targets[number] for number in hidden)]
@@ -67,7 +60,7 @@ def _outside(
         ticks += len(part)
     shares = count / max(ticks, 1)
     order = sorted(range(len(names)), key=lambda i: -shares[i])
-    return [{"channel": names[i], "share": float(shares[i])} for i in order if shares[i] >= LEAST_SHARE]
+    return tuple(OutsideRange(channel=names[i], share=float(shares[i])) for i in order if shares[i] >= LEAST_SHARE)
 
 
 def _changes(

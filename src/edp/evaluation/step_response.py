@@ -9,6 +9,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from edp.data.series import Series
+from edp.evaluation.free_run_file import CommandStep, StepAnswer, StepResponses
 from edp.networks.twin import Twin, even_starts
 from edp.signals import KINDS, Channel
 
@@ -21,7 +22,7 @@ SPAN = (0.05, 0.95)
 """Quantiles of a command between which its range is; half of it is a step."""
 
 
-def step_responses(twin: Twin, series: Sequence[Series]) -> dict[str, Any]:
+def step_responses(twin: Twin, series: Sequence[Series]) -> StepResponses:
     """Differences between free runs with and without a step of a command, from moments of recordings on.
 
     At each moment all commands are held as they are. Once one of them jumps by half of its range, towards the middle of
@@ -32,8 +33,7 @@ def step_responses(twin: Twin, series: Sequence[Series]) -> dict[str, Any]:
         series: inputs are commands, targets are what it answers.
 
     Returns:
-        Plain values in units of reports: ``seconds`` since the step, ``moments``, and ``steps``: for each command its
-        ``size`` and for each answer the median and the ends of the middle 80 %.
+        Responses in units of reports.
 
     Raises:
         DataError: no stretch is long enough.
@@ -60,12 +60,12 @@ def step_responses(twin: Twin, series: Sequence[Series]) -> dict[str, Any]:
             stepped[:, :, column] += (size * upwards)[:, None].astype(stepped.dtype)
             answers = twin.rollout(stepped, twin.reset(before, measured))[0]
             change = (answers - base)[:, rows] * upwards[:, None, None]
-            steps.append(_plain(command, size, change, channels.answers))
-    seconds = ((rows + 1) / channels.rate_hz).tolist()
-    return {"schema": 1, "seconds": seconds, "moments": len(lanes), "steps": steps}
+            steps.append(_step(command, size, change, channels.answers))
+    seconds = tuple(((rows + 1) / channels.rate_hz).tolist())
+    return StepResponses(seconds=seconds, moments=len(lanes), steps=tuple(steps))
 
 
-def _plain(command: Channel, size: float, change: Any, answers: Sequence[Channel]) -> dict[str, Any]:
+def _step(command: Channel, size: float, change: Any, answers: Sequence[Channel]) -> CommandStep:
     facts = KINDS[command.kind]
     entries = []
     for column, channel in enumerate(answers):
@@ -73,11 +73,11 @@ def _plain(command: Channel, size: float, change: Any, answers: Sequence[Channel
         values = kind.report_factor * change[:, :, column].astype(np.float64)
         ends = np.quantile(values, (0.1, 0.9), axis=0)
         lines = {"median": np.median(values, axis=0), "low": ends[0], "high": ends[1]}
-        rounded = {name: [float(f"{value:.4g}") for value in line] for name, line in lines.items()}
-        entries.append({"name": channel.name, "unit": kind.report_unit, **rounded})
-    return {
-        "command": command.description or command.name,
-        "size": float(f"{facts.report_factor * size:.3g}"),
-        "unit": facts.report_unit,
-        "answers": entries,
-    }
+        rounded = {name: tuple(float(f"{value:.4g}") for value in line) for name, line in lines.items()}
+        entries.append(StepAnswer(name=channel.name, unit=kind.report_unit, **rounded))
+    return CommandStep(
+        command=command.description or command.name,
+        size=float(f"{facts.report_factor * size:.3g}"),
+        unit=facts.report_unit,
+        answers=tuple(entries),
+    )

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.data.moments import Moments
+from edp.evaluation.scores_file import MEAN, ByTarget
 from edp.stats.metrics import Scores, composite, mean_scores, score
 from edp.stats.sketch import MOST_EXACT, QuantileSketch
 
@@ -38,7 +39,7 @@ class Tally:
         if self.count > MOST_EXACT or self._sums is not None:
             self._sum_all()
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> dict[str, object]:
         """All that it holds, as plain values and arrays."""
         if self._sums is not None:
             return {"count": self.count, "sums": self._sums.state()}
@@ -62,7 +63,7 @@ class Tally:
         self._kept = []
         return self._sums
 
-    def scores(self) -> dict[str, Any]:
+    def scores(self) -> ByTarget:
         """By target, and their mean."""
         if self._sums is not None:
             return named_scores(self.targets, self._sums.scores())
@@ -88,7 +89,7 @@ class _Sums:
         for sketch, column in zip(self.sizes, size.T, strict=True):
             sketch.update(column)
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> dict[str, object]:
         return {"truth": self.truth.state(), "errors": self.errors, "sizes": [sketch.state() for sketch in self.sizes]}
 
     def add(self, state: Mapping[str, Any]) -> None:
@@ -109,7 +110,7 @@ class _Sums:
         return each
 
 
-def named_scores(targets: Sequence[str], each: Sequence[Scores]) -> dict[str, Any]:
+def named_scores(targets: Sequence[str], each: Sequence[Scores]) -> ByTarget:
     """Scores of each target by name and their mean, as plain values."""
-    named = {"mean": mean_scores(each), **dict(zip(targets, each, strict=True))}
+    named = {MEAN: mean_scores(each), **dict(zip(targets, each, strict=True))}
     return {name: values.to_json() for name, values in named.items()}

@@ -117,7 +117,7 @@ def has_equations(graph: Graph) -> bool:
     return any(isinstance(layer, HydraulicTick) for layer in graph.layers)
 
 
-def golden(predictor: Predictor, window: int) -> dict[str, Any]:
+def golden(predictor: Predictor, window: int) -> dict[str, object]:
     """Return a recording for comparison.
 
     Returns:
@@ -135,13 +135,13 @@ def golden(predictor: Predictor, window: int) -> dict[str, Any]:
     }
 
 
-def as_json(content: Mapping[str, Any]) -> bytes:
+def as_json(content: Mapping[str, object]) -> bytes:
     """Return a description as a JSON file."""
     # NaN is no JSON; a reader in another language would fail on it.
     return (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()
 
 
-def as_mat(variables: Mapping[str, Any]) -> bytes:
+def as_mat(variables: Mapping[str, object]) -> bytes:
     """Return variables as a MAT file (version 5) that is independent of the time of day.
 
     Lists become rows of numbers or cells.

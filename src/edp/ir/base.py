@@ -96,7 +96,7 @@ class Layer(ABC):
         values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> dict[str, object]:
         """Return the options of the layer by name, without its constant arrays."""
         arrays = self.tensors()
         return {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name not in arrays}

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
 
 import numpy as np
 
@@ -119,7 +118,7 @@ class Elementwise(Layer):
     def kind(self) -> str:
         return self.operation.capitalize()
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> dict[str, object]:
         # `kind` says which operation it is.
         return {name: value for name, value in super().options().items() if name != "operation"}
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 from edp.signals import KINDS, Channel, display_offset
 
@@ -98,14 +97,14 @@ class LiveLayout:
     width: int
     traces: Sequence[LiveTrace]
     forecasts: Sequence[Forecast] = ()
-    geometry: Mapping[str, Any] | None = None
+    geometry: Mapping[str, object] | None = None
     angles: Sequence[int] = ()
     levers: Sequence[int] = ()
     statistics: Mapping[str, int] | None = None
     steered: bool = False
     ticks: int | None = None
 
-    def to_plain(self) -> dict[str, Any]:
+    def to_plain(self) -> dict[str, object]:
         """Plain JSON values, keys as the fields."""
         plain = asdict(self)
         for entry, forecast in zip(plain["forecasts"], self.forecasts, strict=True):

@@ -6,7 +6,6 @@ import base64
 import hashlib
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from markupsafe import Markup
 
@@ -79,7 +78,7 @@ def parts() -> tuple[str, str]:
     return "\n".join(map(asset, _SCRIPTS)), stylesheet(*_STYLES)
 
 
-def _rendered(title: str, connect: str, content: dict[str, Any]) -> str:
+def _rendered(title: str, connect: str, content: dict[str, object]) -> str:
     script, style = parts()
     return template("live.html.jinja").render(
         title=title, connect=connect, style=Markup(style), script=Markup(script), data=json_text(content)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 from edp.errors import EdpError
 from edp.logs.proposal.columns import names_in_log
 from edp.logs.read import find_recordings
 from edp.logs.repair import Repair
 from edp.logs.source import DataSource
+from edp.settings.tree import Table
 from edp.signals import SignalMap
 
 
-def read_as_before(source: DataSource, reader: Mapping[str, Any]) -> DataSource:
+def read_as_before(source: DataSource, reader: Table) -> DataSource:
     """Return the source with the map and repairs used for other logs, unless the source states its own map.
 
     Only where all of these had one map and the first log of the source has all of its columns; any other source stays
@@ -27,7 +26,7 @@ def read_as_before(source: DataSource, reader: Mapping[str, Any]) -> DataSource:
     if source.signal_map is not None or source.stored or source.address or source.path.suffix == ".toml":
         return source
     try:
-        before = _one_way(DataSource.from_plain(dict(reader)))
+        before = _one_way(DataSource.from_plain(reader))
         if before is None:
             return source
         signal_map, repair = before

@@ -62,7 +62,7 @@ class Assembly:
     rate_hz: float
     ticks: slice
     missing: Mask
-    repairs: list[dict[str, Any]] = field(default_factory=list)
+    repairs: list[dict[str, object]] = field(default_factory=list)
     untouched: bool = False
 
     @property
@@ -316,14 +316,14 @@ class _Stamps:
 
 def _timelines(
     raw: RawLog, sources: Sequence[ChannelSource], signal_map: SignalMap, repair: Repair
-) -> tuple[dict[int, _Timeline], Grid, list[dict[str, Any]]]:
+) -> tuple[dict[int, _Timeline], Grid, list[dict[str, object]]]:
     if signal_map.rate_hz is not None and not 0 < signal_map.rate_hz < np.inf:
         raise DataError(f"signal map: rate_hz is {signal_map.rate_hz}; it must be a positive number")
     signals = [entry.signal for entry in sources if entry.signal is not None]
     if not signals:
         raise DataError(f"'{raw.path}': no channel is read from the file; map at least one to a column")
     stamps: dict[int, _Stamps] = {}
-    repairs: list[dict[str, Any]] = []
+    repairs: list[dict[str, object]] = []
     for signal in signals:
         key = _clock_key(signal)
         if key in stamps:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +47,7 @@ class Repair:
                 raise ConfigError(f"repair: {name} = '{value}' is not one of {', '.join(allowed)}")
 
 
-def repair_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Rows | None, list[dict[str, Any]]]:
+def repair_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Rows | None, list[dict[str, object]]]:
     """Judge stamps and repair falling and duplicate ones where allowed.
 
     Returns:
@@ -58,7 +57,7 @@ def repair_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Ro
         DataError: a defect that `repair` does not allow to repair.
     """
     clock = judge(stamps, where)
-    repairs: list[dict[str, Any]] = []
+    repairs: list[dict[str, object]] = []
     order: Rows | None = None
     if len(clock.falling):
         if repair.falling == "refuse":
@@ -94,7 +93,7 @@ def _longest_rise(clock: Clock) -> Rows:
     return np.arange(edges[best], edges[best + 1])
 
 
-def repair_gaps(missing: Mask, rate_hz: float, repair: Repair, where: str) -> tuple[slice, list[dict[str, Any]]]:
+def repair_gaps(missing: Mask, rate_hz: float, repair: Repair, where: str) -> tuple[slice, list[dict[str, object]]]:
     """Return the rows to keep and the repairs made, given the samples in gaps, shape ``(time,)``.
 
     Raises:
@@ -127,7 +126,7 @@ def repair_values(
     repair: Repair,
     where: str,
     first_row: int = 0,
-) -> list[dict[str, Any]]:
+) -> list[dict[str, object]]:
     """Check for NaN and infinity outside gaps, shape ``(time, channel)``, and hold them in place where allowed.
 
     `first_row` is the row of the recording that `values` begin with.
@@ -135,7 +134,7 @@ def repair_values(
     Raises:
         DataError: there are some and `repair` does not allow them, or a channel starts with one.
     """
-    repairs: list[dict[str, Any]] = []
+    repairs: list[dict[str, object]] = []
     finite = np.isfinite(values)
     if finite.all():
         return repairs

@@ -33,6 +33,7 @@ from edp.logs.store.remote import is_remote_store, local_store
 from edp.logs.units import with_kinds, without_derived_kinds
 from edp.progress import SILENT, Progress
 from edp.recording import MACHINE, Recording
+from edp.settings.provenance import DataOrigin
 from edp.settings.tree import Table, build, plain_tree, read_toml
 from edp.signals import SignalMap
 from edp.storage.ledger import TrainingIdentity, WithState
@@ -161,9 +162,9 @@ class DataSource:
         """Folder of the store; for a store in a bucket, the folder of its copy."""
         return local_store(self.address) if self.address else self.path
 
-    def to_plain(self) -> dict[str, Any]:
+    def to_plain(self) -> Table:
         """Convert to a dictionary for provenance, with which the same data can be read again."""
-        plain: dict[str, Any] = {"path": self.address or str(full_path(self.path))}
+        plain: Table = {"path": self.address or str(full_path(self.path))}
         if self.signal_map is not None:
             # Kinds that units tell are written out: an entry without one was read by an earlier version.
             plain["map"] = plain_tree(with_kinds(self.signal_map))
@@ -176,18 +177,18 @@ class DataSource:
         return plain
 
     @staticmethod
-    def from_plain(plain: dict[str, Any]) -> DataSource:
+    def from_plain(plain: Table) -> DataSource:
         """Create the source that `to_plain` described."""
         signal_map = without_derived_kinds(build(SignalMap, plain["map"], "provenance map")) if "map" in plain else None
         repair = build(Repair, plain["repair"], "provenance repair") if "repair" in plain else None
         more = tuple(Path(path) for path in plain.get("more", ()))
         return DataSource(Path(plain["path"]), signal_map, repair, plain.get("at_most_h"), more)
 
-    def origin(self, recordings: Sequence[Recording]) -> dict[str, Any]:
+    def origin(self, recordings: Sequence[Recording]) -> DataOrigin:
         """Return the origin of recordings that were read from this source, for the provenance of a result."""
         digests = "".join(recording.digest for recording in recordings)
         digest = hashlib.blake2b(digests.encode(), digest_size=16).hexdigest()
-        return {"source": self.label, "reader": self.to_plain(), "digest": digest}
+        return DataOrigin(source=self.label, reader=self.to_plain(), digest=digest)
 
     def logs(self) -> list[Log]:
         """Return the unread logs of the source, each with its map; empty for a store."""

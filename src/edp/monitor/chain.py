@@ -164,7 +164,7 @@ class MonitorChain:
             state.since, state.sums, state.counts = number, np.zeros(len(row)), np.zeros(len(row))
         return verdict
 
-    def to_plain(self) -> dict[str, Any]:
+    def to_plain(self) -> dict[str, object]:
         """Plain values of its file."""
         return {
             "summaries": self.summaries.to_plain(),

@@ -337,7 +337,7 @@ def unseen_line(sizes: Sequence[FoundSize]) -> str:
     )
 
 
-def healthy_range(fitted: FittedChain) -> dict[str, Any]:
+def healthy_range(fitted: FittedChain) -> dict[str, object]:
     """Return how far means of residuals over healthy sessions reach, for `outside_line`.
 
     Returns:

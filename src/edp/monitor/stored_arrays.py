@@ -22,7 +22,7 @@ ARRAY_BYTES = 512 * 2**20
 ARRAYS = "arrays_blake2b"
 
 
-def write_stored(folder: Path, name: str, header: Mapping[str, Any], arrays: Arrays) -> None:
+def write_stored(folder: Path, name: str, header: Mapping[str, object], arrays: Arrays) -> None:
     """Write ``NAME.safetensors`` and ``NAME.json``; the header last.
 
     Raises:

@@ -68,7 +68,7 @@ def write_traces(folder: Path, traces: RunTraces) -> None:
     Raises:
         StorageError: a file cannot be written.
     """
-    entries: list[dict[str, Any]] = []
+    entries: list[dict[str, object]] = []
     arrays: dict[str, NDArray[Any]] = {}
     for n, trace in enumerate(traces.recordings):
         arrays[f"ratios_{n}"] = np.asarray(trace.ratios, dtype=np.float32)

@@ -50,7 +50,7 @@ class MlpHead:
         ConfigError: a width or depth below 1.
     """
 
-    space: ClassVar[dict[str, Any]] = {"hidden": (16, 32, 64, 128), "layers": (1, 2)}
+    space: ClassVar[dict[str, object]] = {"hidden": (16, 32, 64, 128), "layers": (1, 2)}
     hidden: int = 32
     layers: int = 1
 

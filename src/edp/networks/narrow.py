@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields, is_dataclass, replace
-from typing import Any
 
 from edp.errors import ConfigError
 from edp.networks.backbones import CommitteeSpec
@@ -40,7 +39,7 @@ def student(model: ModelSpec, units: int, levels: int | None = None) -> ModelSpe
     def narrower(width: int) -> int:
         return max(1, round(width * units / full))
 
-    changed: dict[str, Any] = {}
+    changed: dict[str, object] = {}
     names: set[str] = {entry.name for entry in fields(model.backbone)} if is_dataclass(model.backbone) else set()
     if "units" in names:
         changed["units"] = units

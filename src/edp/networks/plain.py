@@ -59,7 +59,7 @@ def model_to_plain(spec: ModelSpec) -> Table:
     return plain
 
 
-def model_from_plain(plain: Mapping[str, Any]) -> ModelSpec:
+def model_from_plain(plain: Mapping[str, object]) -> ModelSpec:
     """Create a network spec from JSON types; without ``physics`` it has no physics base.
 
     Raises:
@@ -78,7 +78,7 @@ def task_to_plain(task: Task) -> Table:
     return plain
 
 
-def task_from_plain(plain: Mapping[str, Any]) -> Task:
+def task_from_plain(plain: Mapping[str, object]) -> Task:
     """Create a task from JSON types.
 
     Raises:

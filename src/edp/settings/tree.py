@@ -7,6 +7,7 @@ registries by the names of these fields; `build` and `plain_tree` are those of a
 from __future__ import annotations
 
 import math
+import types
 import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
@@ -21,9 +22,9 @@ from edp import storage
 from edp.errors import ConfigError, closest
 from edp.registry import Registry
 from edp.settings.bounds import shown
+from edp.storage.reading import Table as Table
 
-Table = dict[str, Any]
-Change = str | Mapping[str, Any]
+Change = str | Mapping[str, object]
 """A change of settings: ``key.path=value``, or a table."""
 Parts = Mapping[str, Registry[type]]
 """Registries by the name of the field that holds one of their parts."""
@@ -65,7 +66,7 @@ def parse_toml(text: str, where: str) -> Table:
     return storage.parse_toml(text, where, ConfigError)
 
 
-def merged(base: Table, change: Mapping[str, Any]) -> Table:
+def merged(base: Table, change: Table) -> Table:
     """Return `base` updated recursively with `change`. A table of another kind replaces the old table as a whole.
 
     A table that names no kind has options of whichever kind is named later.
@@ -161,7 +162,7 @@ class SettingsTree:
         values = {entry.name: getattr(spec, entry.name) for entry in fields(spec)}
         return {name: self.plain(value, name) for name, value in values.items() if value is not None}
 
-    def build(self, cls: type[T], table: Mapping[str, Any], where: str, path: str = "") -> T:
+    def build(self, cls: type[T], table: Mapping[str, object], where: str, path: str = "") -> T:
         """Build a settings object from a table; missing keys take their defaults.
 
         Args:
@@ -244,10 +245,11 @@ class SettingsTree:
             return None
 
     def _value(self, name: str, hint: Any, value: Any, path: str, problems: list[str]) -> Any:
-        if value is None and type(None) in _leaves(hint):
+        if value is None and _allows_none(hint):
             return None  # JSON has a word for it; TOML leaves the key out
         if value is None and self.null_is_nan and hint is float:
             return math.nan
+        hint = _stated(hint)
         form = _form(hint)
         if name in self.parts:
             if form.sequence:
@@ -348,6 +350,20 @@ def _form(hint: Any) -> _Form:
 
 
 @cache
+def _allows_none(hint: Any) -> bool:
+    is_union = typing.get_origin(hint) in (typing.Union, types.UnionType)
+    return hint is type(None) or (is_union and type(None) in typing.get_args(hint))
+
+
+@cache
+def _stated(hint: Any) -> Any:
+    """Return the list or mapping in a hint that also allows None; other hints as they are."""
+    inner = [one for one in typing.get_args(hint) if one is not type(None)]
+    is_list = len(inner) == 1 and typing.get_origin(inner[0]) in (tuple, Mapping)
+    return inner[0] if is_list and _allows_none(hint) else hint
+
+
+@cache
 def _adapter(hint: Any) -> pydantic.TypeAdapter[Any]:
     # TOML has nan and inf; no setting means them.
     return pydantic.TypeAdapter(hint, config=pydantic.ConfigDict(allow_inf_nan=False))
@@ -363,7 +379,7 @@ def _scalar(hint: Any, value: Any, path: str, problems: list[str]) -> Any:
     """Check and convert a value or a nested list with pydantic; refuse silent coercions first."""
     leaves = _leaves(hint)
     # pydantic takes true for 1 and "3" for 3: a typing error would become a setting.
-    if _truth_in(value) and not leaves & {bool, Any}:
+    if _truth_in(value) and not leaves & {bool, Any, object}:
         problems.append(f"{path} = {shown(value)}: true and false are no numbers or names; write one")
         return None
     if leaves <= {bool, type(None)} and not isinstance(value, bool):

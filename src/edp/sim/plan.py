@@ -91,7 +91,7 @@ class DataSetSpec:
     step_s: float = 1e-3
     start_strokes: tuple[float, float] = START_STROKES
     sensor_noise: bool = True
-    sensors: Mapping[str, Any] = field(default_factory=dict)
+    sensors: Mapping[str, object] = field(default_factory=dict)
     faults: tuple[FaultSpec, ...] = ()
 
     def __post_init__(self) -> None:

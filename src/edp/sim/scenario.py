@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
 
 from edp.errors import ConfigError, EdpError
 from edp.sim.excitation import EXCITATIONS
@@ -59,7 +58,7 @@ class Scenario:
     name: str = ""
     material: str = ""
     start_strokes: tuple[float, float] = START_STROKES
-    sensors: Mapping[str, Any] = field(default_factory=dict)
+    sensors: Mapping[str, object] = field(default_factory=dict)
     faults: tuple[FaultSpec, ...] = ()
 
     def __post_init__(self) -> None:
@@ -113,7 +112,7 @@ class Scenario:
         return self.name or f"{load_machine(self.machine).name.lower()}_{self.excitation}_{self.seed}"
 
 
-def plain(scenario: Scenario) -> dict[str, Any]:
+def plain(scenario: Scenario) -> dict[str, object]:
     """Convert a scenario to JSON types; `Scenario(**plain(s)) == s`."""
     values = {entry.name: getattr(scenario, entry.name) for entry in fields(scenario)}
     values |= {"start_strokes": list(scenario.start_strokes), "sensors": dict(scenario.sensors)}

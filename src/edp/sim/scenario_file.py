@@ -47,7 +47,7 @@ _CHANGES = make_dataclass("ScenarioChanges", [(entry.name, _HINTS[entry.name], N
 """Some keys of a scenario file, without the checks of what belongs together: the file may hold the rest."""
 
 
-def read_scenario_file(path: str | Path) -> tuple[dict[str, Any], dict[str, str]]:
+def read_scenario_file(path: str | Path) -> tuple[dict[str, object], dict[str, str]]:
     """Read the stated values of a scenario file: fields of `DataSetSpec`, and the table ``[files]``.
 
     Paths of machine and material files are relative to the scenario file.
@@ -60,7 +60,7 @@ def read_scenario_file(path: str | Path) -> tuple[dict[str, Any], dict[str, str]
     return _stated(settings, table)
 
 
-def scenario_changes(overrides: Sequence[str]) -> tuple[dict[str, Any], dict[str, str]]:
+def scenario_changes(overrides: Sequence[str]) -> tuple[dict[str, object], dict[str, str]]:
     """Values of ``key.path=value`` overrides of a scenario file, in the form of `read_scenario_file`.
 
     Raises:
@@ -89,7 +89,7 @@ def _merged(overrides: Sequence[str]) -> Table:
     return combined([override(text) for text in overrides])
 
 
-def _stated(settings: Any, table: Table) -> tuple[dict[str, Any], dict[str, str]]:
+def _stated(settings: Any, table: Table) -> tuple[dict[str, object], dict[str, str]]:
     """Return the stated values of the data set and of the write options."""
     values = {key: getattr(settings, key) for key in table if key not in ("files", "limit")}
     return values, SCENARIO_FILE.plain(settings.files) if settings.files is not None else {}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -44,7 +43,8 @@ class Scores:
         return asdict(self)
 
 
-class Spread(TypedDict):
+@dataclass(frozen=True)
+class Spread:
     """Order statistics of repeated measurements, e.g. one score over seeds; `std` is None for a single value."""
 
     median: float

@@ -33,19 +33,18 @@ def digests_of(folder: str | Path, *names: str) -> dict[str, str]:
     return {name: digest_of_bytes(read_bytes(Path(folder, name), ARRAYS_BYTES)) for name in names}
 
 
-def check_files(content: Mapping[str, Any], folder: str | Path, advice: str) -> None:
+def check_files(files: Mapping[str, str], folder: str | Path, advice: str) -> None:
     """Raise an error if an accompanying file does not match its hash in the JSON file.
 
     Args:
-        content: of the JSON file; one of an earlier version states no hashes.
+        files: hashes by name, see `digests_of`; empty in a file of an earlier version.
         folder: of the JSON file.
         advice: what to do about it.
 
     Raises:
         StorageError: a file is missing, or was changed or replaced since.
     """
-    stated = content.get(FILES, {})
-    for name, digest in stated.items() if isinstance(stated, dict) else ():
+    for name, digest in files.items():
         file = Path(folder, Path(str(name)).name)  # never a path out of the folder
         if digest_of_bytes(read_bytes(file, ARRAYS_BYTES)) != digest:
             raise StorageError(f"'{file}' was changed since it was written with the result beside it; {advice}")
@@ -84,7 +83,7 @@ def is_whole(file: Path) -> bool:
     return True
 
 
-def _entries(header: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+def _entries(header: Mapping[str, object]) -> Iterator[Mapping[str, object]]:
     """Yield the entries that name a file of arrays: in the header, or in one of its parts."""
     parts = [value for value in header.values() if isinstance(value, dict)]
     within = [value for part in parts for value in part.values() if isinstance(value, dict)]

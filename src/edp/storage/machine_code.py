@@ -34,7 +34,7 @@ class Compiler:
     """
 
     def __init__(
-        self, part: str, sources: Callable[[], Sequence[Path]], options: Mapping[str, Any], facts: str = ""
+        self, part: str, sources: Callable[[], Sequence[Path]], options: Mapping[str, object], facts: str = ""
     ) -> None:
         self.part, self.sources, self.options, self.facts = part, sources, options, facts
 

@@ -21,6 +21,8 @@ from edp.errors import StorageError
 from edp.storage.portable import BINARY, QUIETLY
 from edp.storage.seals import unsealed
 
+Table = dict[str, Any]
+"""Table of a TOML file or object of a JSON file whose values nothing has checked yet."""
 JSON_BYTES = 64 * 2**20
 """Of a JSON file; larger ones are not EDP's own."""
 SETTINGS_BYTES = 4 * 2**20
@@ -105,7 +107,7 @@ def read_json(path: str | Path, where: str = "", error: type[Exception] = Storag
 
 def read_object(
     path: str | Path, keys: Iterable[str] = (), where: str = "", error: type[Exception] = StorageError
-) -> dict[str, Any]:
+) -> Table:
     """Read a JSON file that holds one object.
 
     Args:
@@ -121,7 +123,7 @@ def read_object(
     return object_with(read_json(path, where, error), keys, where, error)
 
 
-def object_with(value: Any, keys: Iterable[str], where: str, error: type[Exception] = StorageError) -> dict[str, Any]:
+def object_with(value: Any, keys: Iterable[str], where: str, error: type[Exception] = StorageError) -> Table:
     """`value`, which is checked to be an object with these keys.
 
     Raises:
@@ -162,7 +164,7 @@ def parse_json(text: str, where: str, error: type[Exception] = StorageError, fin
 
 def read_toml(
     path: str | Path, where: str = "", error: type[Exception] = StorageError, advice: str = ""
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Read a TOML file; see `parse_toml`.
 
     Args:
@@ -182,7 +184,7 @@ def read_toml(
     return parse_toml(text, where, error)
 
 
-def parse_toml(text: str, where: str, error: type[Exception] = StorageError) -> dict[str, Any]:
+def parse_toml(text: str, where: str, error: type[Exception] = StorageError) -> Table:
     """Parse a TOML text.
 
     Raises:
@@ -207,7 +209,7 @@ def _refuse_mark(text: str) -> None:
         raise ValueError("it begins with a byte-order mark; save it as UTF-8 without one")
 
 
-def _distinct(pairs: Collection[tuple[str, Any]]) -> dict[str, Any]:
+def _distinct(pairs: Collection[tuple[str, Any]]) -> Table:
     table = dict(pairs)
     if len(table) < len(pairs):
         twice = next(name for name, count in Counter(name for name, _ in pairs).items() if count > 1)

@@ -133,14 +133,14 @@ def _run(path: Path) -> ListedRun:
     )
 
 
-def _kind(path: Path, identity: Mapping[str, Any], status: Mapping[str, Any]) -> RunKind:
+def _kind(path: Path, identity: Mapping[str, object], status: Mapping[str, object]) -> RunKind:
     """Return the kind that a run states; runs of earlier versions are recognised by their result."""
     stated = RUN_KINDS.get(str(identity.get("kind") or status.get("kind")))
     results = (kind for kind in RUN_KINDS.values() if is_file_at(path / kind.result))
     return stated or next(results, RUN_KINDS["network"])
 
 
-def _state(path: Path, kind: RunKind, status: Mapping[str, Any]) -> str:
+def _state(path: Path, kind: RunKind, status: Mapping[str, object]) -> str:
     """Return the state of a run; a state that is not recorded follows from the result, which is written at the end."""
     if held_by(path / kind.lock):
         return "running"
@@ -175,7 +175,7 @@ def _damaged_parts(path: Path, finished: RunKind | None) -> list[str]:
     return damaged
 
 
-def _part(file: Path, damaged: list[str]) -> Mapping[str, Any]:
+def _part(file: Path, damaged: list[str]) -> Mapping[str, object]:
     """Read a JSON file of a run; empty if it is missing or damaged."""
     if not is_file_at(file):
         return {}

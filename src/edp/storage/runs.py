@@ -33,7 +33,7 @@ PARTS = "parts"
 """Folder of a run in which its single trainings stand, where it has several."""
 
 
-def run_key(config: Mapping[str, Any], data_digest: str) -> str:
+def run_key(config: Mapping[str, object], data_digest: str) -> str:
     """Content address of a run: equal settings, data and code version give an equal key."""
     plain = {"config": config, "data": data_digest, "edp": __version__}
     text = json.dumps(plain, sort_keys=True, allow_nan=False, separators=(",", ":"))
@@ -163,7 +163,7 @@ class Run:
             self.write_status(FINISHED)
         self.remove_parts()
 
-    def status(self) -> dict[str, Any]:
+    def status(self) -> dict[str, object]:
         """Return the recorded state of the run with its additional values; empty before the first one."""
         return _status_of(self.path)
 
@@ -172,7 +172,7 @@ class Run:
         # Not through a link: what it points to is not ours.
         shutil.rmtree(self.path / PARTS, ignore_errors=True)
 
-    def write_history(self, rows: list[dict[str, Any]]) -> None:
+    def write_history(self, rows: list[dict[str, object]]) -> None:
         """Write one line of JSON with a hash for each epoch."""
         check_held(self.file(".lock"), self._lock)
         write_bytes(self.file("history.jsonl"), "".join(map(sealed_line, rows)).encode())
@@ -187,7 +187,7 @@ def state_of(folder: str | Path) -> str:
     return str(_status_of(folder).get("status", ""))
 
 
-def _status_of(folder: str | Path) -> dict[str, Any]:
+def _status_of(folder: str | Path) -> dict[str, object]:
     file = Path(folder) / STATUS
     return read_object(file, ("status", "time")) if is_there(file) else {}
 

@@ -19,13 +19,13 @@ MAX_UNSEALED = 100
 _unsealed: dict[str, None] = {}
 
 
-def content_digest(content: Mapping[str, Any]) -> str:
+def content_digest(content: Mapping[str, object]) -> str:
     """Return the hash over all keys and values of an object except its own hash."""
     # One round through JSON: the hash is over what a reader will see, names of all kinds as text.
     return _digest_of_parsed(json.loads(json.dumps(dict(content), allow_nan=False)))
 
 
-def _digest_of_parsed(content: Mapping[str, Any]) -> str:
+def _digest_of_parsed(content: Mapping[str, object]) -> str:
     """Return the hash of an object that came from JSON: an index of a million entries is not copied once more."""
     rest = {key: value for key, value in content.items() if key != HASH}
     return digest_of_bytes(json.dumps(rest, sort_keys=True, separators=(",", ":"), allow_nan=False).encode())
@@ -36,7 +36,7 @@ def digest_of_bytes(data: bytes) -> str:
     return hashlib.blake2b(data, digest_size=16).hexdigest()
 
 
-def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
+def sealed(content: Mapping[str, object]) -> dict[str, object]:
     """Return an object with the hash of its content."""
     return {**content, HASH: content_digest(content)}
 
@@ -66,7 +66,7 @@ def unsealed(content: Any, where: str, error: type[Exception]) -> Any:
     return {key: value for key, value in content.items() if key != HASH}
 
 
-def sealed_line(row: Mapping[str, Any]) -> str:
+def sealed_line(row: Mapping[str, object]) -> str:
     """Return an object as a line of JSON that ends with the hash of the text before it; the object may hold NaN."""
     digest = digest_of_bytes(json.dumps(dict(row)).encode())
     return json.dumps({**row, HASH: digest}) + "\n"

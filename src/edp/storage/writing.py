@@ -12,7 +12,6 @@ import stat
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 from edp.errors import EdpError, StorageError
 from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_link_at, status_at
@@ -228,6 +227,6 @@ def write_bytes(path: str | Path, data: bytes) -> None:
         temporary.write_bytes(data)
 
 
-def write_json(path: str | Path, value: Mapping[str, Any]) -> None:
+def write_json(path: str | Path, value: Mapping[str, object]) -> None:
     """Write an object as JSON with the hash of its content (`edp.storage.seals`); NaN and infinity are refused."""
     write_bytes(path, (json.dumps(sealed(value), indent=1, allow_nan=False) + "\n").encode())

@@ -29,6 +29,8 @@ from edp.networks.integer import IntegerPredictor
 from edp.networks.plain import model_from_plain, model_to_plain, task_from_plain, task_to_plain, unknown_parts
 from edp.networks.predictor import Predictor
 from edp.registry import missing_parts, origins_in
+from edp.settings.provenance import Provenance
+from edp.settings.tree import Table
 from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, read_bytes, write_bytes, write_json
 from edp.storage.headers import ARRAYS_BYTES, read_header
@@ -71,8 +73,8 @@ class Bundle:
     inputs: tuple[Channel, ...]
     target_kinds: tuple[Kind, ...]
     descriptions: tuple[str, ...]
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-    scores: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=Provenance)
+    scores: Table = field(default_factory=dict)
     adaptation: Adaptation | None = None
 
     @property
@@ -82,10 +84,12 @@ class Bundle:
 
 
 def make_bundle(
-    predictor: Predictor, data: Prepared, provenance: Mapping[str, Any], scores: Mapping[str, Any] | None = None
+    predictor: Predictor, data: Prepared, provenance: Provenance | None = None, scores: Table | None = None
 ) -> Bundle:
     """Create a bundle of a predictor trained with `data`."""
-    return Bundle(predictor, data.inputs, data.target_kinds, data.descriptions, provenance, scores or {})
+    return Bundle(
+        predictor, data.inputs, data.target_kinds, data.descriptions, provenance or Provenance(), scores or {}
+    )
 
 
 def weights_digest(predictor: Predictor) -> str:
@@ -122,7 +126,7 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
     weights = f"weights-{digest[:12]}.safetensors"
     write_bytes(path / weights, data)
     task = bundle.task
-    header: dict[str, Any] = {
+    header: dict[str, object] = {
         "schema": INTEGER_SCHEMA if integer else SCHEMA,
         "edp": __version__,
         "task": task_to_plain(task),
@@ -135,7 +139,7 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
             for name, kind, text in zip(task.targets, bundle.target_kinds, bundle.descriptions, strict=True)
         ],
         "weights": {"file": weights, "blake2b": digest},
-        "provenance": dict(bundle.provenance),
+        "provenance": bundle.provenance.to_table(),
         "scores": dict(bundle.scores),
     }
     referenced = {weights}
@@ -188,13 +192,13 @@ def load_bundle(folder: str | Path) -> Bundle:
         return _assembled(header, path)
 
 
-def with_plugins(header: Mapping[str, Any]) -> dict[str, Any]:
+def with_plugins(header: Mapping[str, object]) -> dict[str, object]:
     """Return a header with the plug-ins whose parts it names."""
     plugins = origins_in(header)
     return {**header, PLUGINS: plugins} if plugins else dict(header)
 
 
-def check_hash(header: Mapping[str, Any], file: Path) -> None:
+def check_hash(header: Mapping[str, object], file: Path) -> None:
     """Raise BundleError if the hash does not match the header or a plug-in part is not registered.
 
     Raises:
@@ -231,7 +235,7 @@ def upgrade_bundle(folder: str | Path) -> Path:
     return path
 
 
-def _reworded(header: Mapping[str, Any]) -> dict[str, Any]:
+def _reworded(header: Mapping[str, Any]) -> dict[str, object]:
     """Convert the keys of an earlier header to this version."""
     reworded = {**header, "provenance": _renamed(header["provenance"], "lesson", "strategy")}
     if "adaptation" in header:
@@ -240,7 +244,7 @@ def _reworded(header: Mapping[str, Any]) -> dict[str, Any]:
     return reworded
 
 
-def _renamed(table: Mapping[str, Any], old: str, new: str) -> dict[str, Any]:
+def _renamed(table: Mapping[str, object], old: str, new: str) -> dict[str, object]:
     return {new if key == old else key: value for key, value in table.items()}
 
 
@@ -273,7 +277,7 @@ def as_damage(path: Path) -> Iterator[None]:
         raise BundleError(f"bundle '{path}' is damaged: {cause}; restore it or train again") from error
 
 
-def _read_header(path: Path) -> dict[str, Any]:
+def _read_header(path: Path) -> dict[str, object]:
     header = read_header(path / HEADER)
     if not isinstance(header, dict) or "schema" not in header:
         header = {"schema": None}
@@ -294,7 +298,7 @@ def _assembled(header: dict[str, Any], path: Path) -> Bundle:
         integers = {name: x.numpy() for name, x in load(read_arrays(path, header["integers"])).items()}
         predictor = IntegerPredictor(predictor, Formats(_formats(header["formats"]), integers))
     adaptation = _adaptation(header["adaptation"], task, path) if header["schema"] == ADAPTED_SCHEMA else None
-    provenance = object_with(header["provenance"], (), "its provenance")
+    provenance = Provenance.from_table(object_with(header["provenance"], (), "its provenance"), "its provenance")
     scores = object_with(header["scores"], (), "its scores")
     return Bundle(predictor.eval(), inputs, kinds, texts, provenance, scores, adaptation)
 

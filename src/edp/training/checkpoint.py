@@ -86,7 +86,7 @@ def save_checkpoint(
     write_bytes(path, _signed(save(tensors, metadata={"edp": json.dumps(header), "blake2b": BLANK})))
 
 
-def load_checkpoint(path: Path, key: str) -> tuple[TrainingPosition, Weights, dict[str, Any]] | None:
+def load_checkpoint(path: Path, key: str) -> tuple[TrainingPosition, Weights, dict[str, object]] | None:
     """Return progress, weights and optimiser state of the run `key`; None without a checkpoint.
 
     Raises:
@@ -113,7 +113,7 @@ def damaged(path: Path, error: Exception) -> StorageError:
 
 def _taken_apart(
     header: dict[str, Any], tensors: dict[str, Tensor]
-) -> tuple[TrainingPosition, Weights, dict[str, Any]]:
+) -> tuple[TrainingPosition, Weights, dict[str, object]]:
     plain = header["progress"]
     progress = TrainingPosition(**{**plain, "schedule": ScheduleState(**plain["schedule"])})
     groups: dict[str, dict[str, Tensor]] = {"current": {}, "average": {}, "best": {}}

@@ -95,7 +95,7 @@ class Delta:
     """
 
     base: str
-    facts: Mapping[str, Any]
+    facts: Mapping[str, object]
     vectors: Mapping[str, NDArray[np.float32]]
     whole: Mapping[str, Scaled]
     narrow: Mapping[str, tuple[Scaled, Scaled]]
@@ -121,7 +121,7 @@ class Delta:
 
 
 def delta_of(
-    base: Predictor, tuned: Predictor, facts: Mapping[str, Any] | None = None, most_bytes: int = DELTA_BYTES
+    base: Predictor, tuned: Predictor, facts: Mapping[str, object] | None = None, most_bytes: int = DELTA_BYTES
 ) -> Delta:
     """Return the change from a network to a fine-tuned one, within a number of bytes.
 
@@ -267,7 +267,9 @@ def delta_from_bytes(data: bytes, where: str) -> Delta:
     return Delta(str(head["base"]), head["facts"], vectors, parts["w"], narrow)
 
 
-def _scaled(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, Any], kind: str, where: str) -> dict[str, Scaled]:
+def _scaled(
+    arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, object], kind: str, where: str
+) -> dict[str, Scaled]:
     """Matrices of a kind by name, their shapes and types checked."""
     matrices = {}
     for name, data in arrays.items():

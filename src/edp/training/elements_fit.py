@@ -39,9 +39,9 @@ class ElementsFit:
     """Fitted elements: the twin, a row of history for each start, processor seconds, and rows of the datasheet."""
 
     twin: ElementsTwin
-    history: list[dict[str, Any]]
+    history: list[dict[str, object]]
     seconds: float
-    rows: list[dict[str, Any]]
+    rows: list[dict[str, object]]
 
 
 class _Problem:
@@ -215,7 +215,7 @@ def fit_elements(
     return ElementsFit(best, history, time.process_time() - began, _sheet(best, problem, information))
 
 
-def _sheet(twin: ElementsTwin, problem: _Problem, covariance: Doubles) -> list[dict[str, Any]]:
+def _sheet(twin: ElementsTwin, problem: _Problem, covariance: Doubles) -> list[dict[str, object]]:
     """Return one row per parameter with unit and interval, like `edp.networks.twin.grey.datasheet`."""
     rows = []
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))

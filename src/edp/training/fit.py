@@ -86,7 +86,7 @@ def fit(
     return replace(again, history=fitted.history, seconds=fitted.seconds + again.seconds)
 
 
-def _rows_of_refit(history: list[dict[str, Any]], best: int, spec: TrainingSpec) -> list[dict[str, Any]]:
+def _rows_of_refit(history: list[dict[str, object]], best: int, spec: TrainingSpec) -> list[dict[str, object]]:
     """Return a history row of the first training for each epoch of the refit; the last one covers additional epochs."""
     if spec.refit == "best":
         return history[:best]
@@ -313,7 +313,7 @@ class Loop:
         with torch.no_grad():
             torch._foreach_lerp_(targets, self.all, step)
 
-    def _close_epoch(self, loss: float, seconds: float) -> dict[str, Any] | None:
+    def _close_epoch(self, loss: float, seconds: float) -> dict[str, object] | None:
         """Validate and select after an epoch, and store the training position; return the history row."""
         progress = self.progress
         row = None
@@ -337,7 +337,7 @@ class Loop:
                 self.run.folder.write_history(progress.history)
         return row
 
-    def _judge_epoch(self, loss: float) -> dict[str, Any]:
+    def _judge_epoch(self, loss: float) -> dict[str, object]:
         """Validate the averaged weights and keep them if they are the best so far."""
         progress = self.progress
         score, report, validation_loss = self._validate()
@@ -377,7 +377,7 @@ class Loop:
                     parameter.copy_(current_weights[name])
 
     def _event(
-        self, epoch: int, update: int, rate: float, seconds: float, row: dict[str, Any] | None
+        self, epoch: int, update: int, rate: float, seconds: float, row: dict[str, object] | None
     ) -> TrainingProgress:
         done = (epoch - 1) * self.updates + update
         left = max(0, self.epochs * self.updates - done)

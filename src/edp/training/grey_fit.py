@@ -62,7 +62,7 @@ class GreyFit:
     """
 
     twin: GreyTwin
-    history: list[dict[str, Any]]
+    history: list[dict[str, object]]
     seconds: float
     information: Doubles
     theta: Doubles

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +33,7 @@ class FittedGround:
     explained: dict[str, float | None]
     seconds: float
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> dict[str, object]:
         """Return the provenance entries."""
         kind = GROUNDS.name_of(self.law)
         return {"ground": {"kind": kind, "explained": self.explained, "seconds": round(self.seconds, 2)}}

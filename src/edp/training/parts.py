@@ -87,7 +87,7 @@ def _epochs(loop: Loop, until: int | None, start: bytes | None) -> tuple[Fitted,
     return loop.finish(), state
 
 
-def _state_of_epochs(loop: Loop) -> dict[str, Any]:
+def _state_of_epochs(loop: Loop) -> dict[str, object]:
     """Return the state for later epochs, which seed their own random numbers.
 
     Without times, equal parts give equal bytes.
@@ -117,7 +117,7 @@ def _restore_epochs(loop: Loop, state: dict[str, Any]) -> None:
     loop.optimizer.load_state_dict(optimizer_state(state["optimizer"]))
 
 
-def _state(loop: Loop) -> dict[str, Any]:
+def _state(loop: Loop) -> dict[str, object]:
     """Return the state that the rest of a training depends on besides its settings.
 
     Without times, equal parts give equal bytes.

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from edp.data.prepared import Prepared
+from edp.data.series import Series
 from edp.logs.source import DataSource
-from edp.storage.provenance import new_provenance
-
-PARTS = ("train", "validation", "test")
+from edp.settings.provenance import DataOrigin, DataPart, Provenance, new_provenance
 
 
 def training_provenance(
@@ -18,8 +17,8 @@ def training_provenance(
     seed: int,
     threads: int,
     seconds: float,
-    frozen: Mapping[str, Any] | None = None,
-) -> dict[str, Any]:
+    frozen: Mapping[str, str] | None = None,
+) -> Provenance:
     """Return the provenance of a training.
 
     Args:
@@ -31,17 +30,18 @@ def training_provenance(
         frozen: digests and names of recordings that no later training may see.
     """
 
-    def part(name: str) -> dict[str, Any]:
-        series = getattr(data, name)
+    def part(series: Sequence[Series]) -> DataPart:
         hours = sum(entry.samples for entry in series) / data.task.rate_hz / 3600
-        return {"recordings": len(series), "hours": round(hours, 4), "names": [entry.name for entry in series]}
+        return DataPart(recordings=len(series), hours=round(hours, 4), names=tuple(entry.name for entry in series))
 
-    origin = {
-        "source": source.label,
-        "reader": source.to_plain(),
-        "rate_hz": data.task.rate_hz,
-        **{name: part(name) for name in PARTS},
-        "digest": data.digest,
-        **({"frozen": dict(frozen)} if frozen else {}),
-    }
-    return new_provenance(origin, threads) | {"seed": seed, "seconds": round(seconds, 2)}
+    origin = DataOrigin(
+        source=source.label,
+        reader=source.to_plain(),
+        rate_hz=data.task.rate_hz,
+        train=part(data.train),
+        validation=part(data.validation),
+        test=part(data.test),
+        digest=data.digest,
+        frozen=dict(frozen or {}),
+    )
+    return replace(new_provenance(origin, threads), seed=seed, seconds=round(seconds, 2))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from edp.data.series import Series
 from edp.networks.twin.residual import Residual, ResidualTwin
@@ -26,7 +25,7 @@ class ResidualFit:
     """
 
     twin: ResidualTwin
-    history: list[dict[str, Any]]
+    history: list[dict[str, object]]
     seconds: float
     grey_error: float
     error: float
@@ -36,7 +35,7 @@ class ResidualFit:
         """Whether the network has less error than the grey box alone; otherwise its output is zero."""
         return self.error < self.grey_error
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> dict[str, object]:
         """For provenance."""
         return {"helps": self.helps, "validation": self.error, "validation_grey_box": self.grey_error}
 

@@ -18,7 +18,8 @@ from edp.networks.twin import TWINS, FreeRunIntervals, Twin, TwinPlant, TwinScal
 from edp.networks.twin.grey.ground import GROUNDS, GroundLaw, check_grounded
 from edp.networks.twin.recurrent_cell import CellWeights
 from edp.settings.bounds import above
-from edp.settings.tree import SettingsTree
+from edp.settings.provenance import Provenance
+from edp.settings.tree import SettingsTree, Table
 from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, write_json
 from edp.storage.headers import read_header
@@ -63,8 +64,8 @@ class TwinBundle:
 
     spec: TwinSpec
     twin: Twin
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-    scores: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=Provenance)
+    scores: Table = field(default_factory=dict)
     intervals: FreeRunIntervals | None = None
     ground: GroundLaw | None = None
 
@@ -120,7 +121,7 @@ def save_twin(bundle: TwinBundle, folder: str | Path) -> Path:
         "channels": {part: [_plain(channel) for channel in getattr(channels, part)] for part in PARTS},
         "weights": entry,
         "intervals": None if bundle.intervals is None else bundle.intervals.to_plain(),
-        "provenance": dict(bundle.provenance),
+        "provenance": bundle.provenance.to_table(),
         "scores": dict(bundle.scores),
     }
     if bundle.ground is not None:
@@ -202,7 +203,7 @@ def _assembled(header: Mapping[str, Any], path: Path) -> TwinBundle:
             raise ValueError(f"'{name[:80]}' is {values.shape} {values.dtype}, not {expected[name]} float32")
         if not np.isfinite(values).all():
             raise ValueError(f"'{name[:80]}' holds a number that is not finite")
-    provenance = object_with(header["provenance"], (), "its provenance")
+    provenance = Provenance.from_table(object_with(header["provenance"], (), "its provenance"), "its provenance")
     scores = object_with(header["scores"], (), "its scores")
     widths = header.get("intervals") if header["schema"] > 1 else None
     intervals = None if widths is None else FreeRunIntervals.from_plain(widths, channels)

@@ -14,7 +14,7 @@ import torch
 from safetensors.numpy import save
 
 from edp.config.experiment import Experiment, build, experiment_toml, load_experiment, plain_tree
-from edp.data.frozen import frozen_before, frozen_of, refuse_frozen
+from edp.data.frozen import frozen_of, refuse_frozen
 from edp.data.prepared import Prepared, prepare
 from edp.errors import DataError
 from edp.evaluation.channel_importance import ChannelImportances, ChannelImportanceSpec, measure_channel_importance
@@ -33,7 +33,7 @@ from edp.evaluation.judge import (
     network_parts,
     score_network,
 )
-from edp.evaluation.scores_file import earlier_scores
+from edp.evaluation.scores_file import PREDICTIONS, DrawnSample, ModelScores, ScoresFile, earlier_scores
 from edp.jobs import IN_PROCESS, Workers
 from edp.jobs.packing import pack, unpack
 from edp.jobs.workers import UNITS, WorkUnit, forget_units
@@ -44,11 +44,13 @@ from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.report import build_report
 from edp.report.run.choice import FLOOR, note_test_result
+from edp.settings.provenance import Provenance, read_provenance
+from edp.settings.tree import Table
 from edp.storage import check_writable, make_folder, write_bytes, write_json
-from edp.storage.headers import FILES, digests_of
+from edp.storage.headers import digests_of
 from edp.storage.ledger import TrainingIdentity, WithState
 from edp.storage.paths import full_path, is_folder_at, is_there
-from edp.storage.provenance import read_provenance
+from edp.storage.provenance import PROVENANCE
 from edp.storage.runs import KeyedRun, Run, check_claimable, run_key
 from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle, make_bundle, save_bundle
 from edp.training.blas import one_blas_thread
@@ -107,7 +109,7 @@ class StrategyFactory:
         frozen: names by digest of sessions that stay frozen for what comes of the run, beside those of its split.
     """
 
-    facts: Mapping[str, Any]
+    facts: Table
     strategy: Callable[[Prepared], TrainingStrategy | DirectFit]
     frozen: Mapping[str, str] = field(default_factory=dict)
 
@@ -157,15 +159,16 @@ def train(
         except Diverged as end:
             if end.fitted is not None:
                 # Without weights from before the divergence there is nothing to keep.
-                provenance = _provenance(source, experiment, data, end.fitted.seconds, frozen) | taught
-                _keep(run, end.fitted, provenance | {"diverged": str(end)}, data)
+                provenance = _provenance(source, experiment, data, end.fitted.seconds, frozen)
+                _keep(run, end.fitted, provenance.with_entries(**taught, diverged=str(end)), data)
             run.write_status("diverged", message=str(end), **end.facts)
             raise
-        return _keep(run, fitted, _provenance(source, experiment, data, fitted.seconds, frozen) | taught, data)
+        provenance = _provenance(source, experiment, data, fitted.seconds, frozen).with_entries(**taught)
+        return _keep(run, fitted, provenance, data)
 
 
 def keep_fitted(
-    run: Run, source: DataSource, experiment: Experiment, data: Prepared, fitted: Fitted, facts: dict[str, Any]
+    run: Run, source: DataSource, experiment: Experiment, data: Prepared, fitted: Fitted, facts: Table
 ) -> Bundle:
     """Write what `train` writes into an open run, for a training that took place elsewhere.
 
@@ -179,12 +182,13 @@ def keep_fitted(
     """
     run.write_settings(experiment_toml(experiment))
     run.write_history(fitted.history)
-    return _keep(run, fitted, _provenance(source, experiment, data, fitted.seconds, {}) | facts, data)
+    provenance = _provenance(source, experiment, data, fitted.seconds, {}).with_entries(**facts)
+    return _keep(run, fitted, provenance, data)
 
 
-def _keep(run: Run, fitted: Fitted, provenance: dict[str, Any], data: Prepared) -> Bundle:
+def _keep(run: Run, fitted: Fitted, provenance: Provenance, data: Prepared) -> Bundle:
     """Write what a training leaves: provenance, footprint and the bundle."""
-    write_json(run.file("provenance.json"), provenance)
+    write_json(run.file(PROVENANCE), provenance.to_table())
     write_json(run.file("footprint.json"), footprint(fitted.predictor).to_json())
     bundle = make_bundle(fitted.predictor, data, provenance)
     save_bundle(bundle, run.file("bundle"))
@@ -207,11 +211,11 @@ def _refuse_diverged(run: Run) -> None:
 
 def _provenance(
     source: DataSource, experiment: Experiment, data: Prepared, seconds: float, frozen: Mapping[str, str]
-) -> dict[str, Any]:
+) -> Provenance:
     training = experiment.training
     sealed = {**frozen, **frozen_of(experiment.split)}
-    facts = {"regime": training.chunks.regime, "device": training.device}
-    return training_provenance(source, data, training.seed, thread_count(training), seconds, sealed) | facts
+    provenance = training_provenance(source, data, training.seed, thread_count(training), seconds, sealed)
+    return provenance.with_entries(regime=training.chunks.regime, device=training.device)
 
 
 @one_blas_thread()
@@ -263,14 +267,18 @@ def evaluate(
         at = EvaluatedRun(str(full_path(folder)), other, at_most_h)
         evaluation = _evaluate_models(bench, at, " ".join(judged), workers, progress, minutes)
         # Scores that lack a baseline are not kept for a call that asks for all.
-        sample = {} if drawn is None else {"drawn": {**asdict(drawn), "what": drawn.what}}
-        scores = evaluation.scores | sample | {"key": "" if "left_out" in evaluation.scores else key}
-        write_bytes(target / "predictions.safetensors", save(evaluation.tensors))
-        write_json(target / "scores.json", scores | {FILES: digests_of(target, "predictions.safetensors")})
+        write_bytes(target / PREDICTIONS, save(evaluation.tensors))
+        scores = replace(
+            evaluation.scores,
+            drawn=None if drawn is None else DrawnSample(**asdict(drawn), what=drawn.what),
+            key="" if evaluation.scores.left_out else key,
+            files=digests_of(target, PREDICTIONS),
+        )
+        scores.write(target)
     forget_units(folder / UNITS)
     if source is None:
         note_test_result(folder, scores, _floor_scores(folder, data, scores))
-        save_bundle(replace(bundle, scores=scores["models"]["network"]["overall"]), folder / "bundle")
+        save_bundle(replace(bundle, scores=dict(scores.models["network"].overall)), folder / "bundle")
     return target
 
 
@@ -309,7 +317,7 @@ def _evaluate_models(
             judged[arguments["model"]] = unpack(content, JudgedModel)
         if minutes is not None and len(measured) == parts and time.perf_counter() - began > 60 * minutes:
             break
-    label, seconds = describe(bench.predictor.spec), float(read_provenance(folder)["seconds"])
+    label, seconds = describe(bench.predictor.spec), read_provenance(folder).seconds or 0.0
     network = bench.network_of((measured[part] for part in range(parts)), label, seconds)
     models = {NETWORK: network} | {name: judged[name] for name in names if name in judged}
     return bench.together(models, [name for name in names if name not in judged])
@@ -342,9 +350,9 @@ def _open_bench(evaluated_run: EvaluatedRun, digest: str, spec: JudgeSpec) -> Mo
     return ModelBench(bundle.predictor, data, spec)
 
 
-def other_recordings(source: DataSource | None, provenance: Mapping[str, Any]) -> list[Recording] | None:
+def other_recordings(source: DataSource | None, provenance: Provenance) -> list[Recording] | None:
     """Other recordings, those without a map read with that of the run; None for the held-out ones."""
-    return None if source is None else read_as_before(source, provenance["data"]["reader"]).read()
+    return None if source is None else read_as_before(source, provenance.origin.reader).read()
 
 
 def _check_run_writable(folder: Path) -> None:
@@ -353,7 +361,7 @@ def _check_run_writable(folder: Path) -> None:
         check_writable(folder)
 
 
-def trained_run(folder: Path) -> tuple[Bundle, Experiment, dict[str, Any], Prepared]:
+def trained_run(folder: Path) -> tuple[Bundle, Experiment, Provenance, Prepared]:
     """Bundle, settings, provenance and data of a run, the data checked to be what it was trained on.
 
     Raises:
@@ -363,10 +371,10 @@ def trained_run(folder: Path) -> tuple[Bundle, Experiment, dict[str, Any], Prepa
     provenance = read_provenance(folder)
     experiment = load_experiment(folder / "config.toml", preset=None)
     torch.set_num_threads(thread_count(experiment.training))  # the ticks of a stream are too small to share
-    data = prepare_data(DataSource.from_plain(provenance["data"]["reader"]), experiment, frozen_before(provenance))
-    if data.digest != provenance["data"]["digest"]:
+    data = prepare_data(DataSource.from_plain(provenance.origin.reader), experiment, provenance.origin.frozen)
+    if data.digest != provenance.origin.digest:
         raise DataError(
-            f"the recordings in '{provenance['data']['source']}' changed since '{folder}' was trained; the held-out "
+            f"the recordings in '{provenance.origin.source}' changed since '{folder}' was trained; the held-out "
             "split would not be the same: train again, or judge other recordings with --data"
         )
     return bundle, experiment, provenance, data
@@ -406,12 +414,12 @@ def channel_importance(
     return importances, target / "channel_importance.json"
 
 
-def _floor_scores(folder: Path, data: Prepared, scores: Mapping[str, Any]) -> dict[str, Any] | None:
+def _floor_scores(folder: Path, data: Prepared, scores: ScoresFile) -> ModelScores | None:
     """Scores, on the same ticks, of what the preset auto tells its skill against; None where the run has none."""
     if not is_folder_at(folder / FLOOR):
         return None
     floor = load_bundle(folder / FLOOR).predictor
-    return score_network(floor, data, scores["task"]["skip"])
+    return score_network(floor, data, scores.task.skip)
 
 
 def judge_bundle(bundle: Bundle, data: Prepared, spec: JudgeSpec | None = None) -> Evaluation:

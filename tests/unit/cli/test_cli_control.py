@@ -7,6 +7,7 @@ import pytest
 from edp.config.control import load_control_experiment
 from edp.logs import read_recording
 from edp.networks.twin import TWINS
+from edp.settings.provenance import Provenance
 from edp.testing.control import sample_excavator_twin, sample_grey_box
 from edp.training.twin_bundle import TwinBundle, save_twin
 
@@ -135,7 +136,9 @@ def test_a_twin_of_another_rate_or_a_soil_is_refused(edp, tmp_path, twin_run):
 
 
 def test_a_twin_of_another_machine_is_refused(edp, tmp_path):
-    bundle = TwinBundle(TWINS["static"](), sample_excavator_twin(), {"full_strokes_m": [1.0, 1.0, 0.915]})
+    bundle = TwinBundle(
+        TWINS["static"](), sample_excavator_twin(), Provenance(more={"full_strokes_m": [1.0, 1.0, 0.915]})
+    )
     save_twin(bundle, tmp_path / "c14" / "twin")
     for words in (("--controller", "inversion", "--twin"), ("--plant",)):
         ended = edp("control", tmp_path / "run", "--seeds", 1, *LINE, *words, tmp_path / "c14")

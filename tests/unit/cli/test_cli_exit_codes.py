@@ -3,10 +3,13 @@
 import ast
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import typer
+from sample_scores import sample_errors, sample_free_run_scores
 from typer.main import get_command
 
 from edp.cli import app, console
@@ -24,6 +27,7 @@ from edp.evaluation.guard import (
     tuning_verdict,
     twin_verdict,
 )
+from edp.evaluation.scores_file import ModelScores, ScoredTarget, ScoredTask, ScoresFile
 from edp.report.transfer.facts import transfer_verdict
 
 ROOT = Path(__file__).parents[3]
@@ -65,12 +69,11 @@ def free_runs(ratios, judged):
     """Scores of free runs with error 1 of what is judged in each recording, and `ratios` of one floor."""
 
     def summary(error):
-        strokes = [{"at_s": at, "by_channel": {"v": error}} for at in (1.0, 10.0)]
-        return {"velocity_mae": {"by_channel": {"v": error}}, "stroke_error": strokes}
+        return sample_errors(error, error, error, times=(1.0, 10.0))
 
     def scored(errors):
         by_recording = {f"r{i}": summary(error) for i, error in enumerate(errors)}
-        return summary(sum(errors) / len(errors)) | {"by_recording": by_recording}
+        return sample_free_run_scores(summary(sum(errors) / len(errors)), by_recording)
 
     return {judged: scored([1.0] * len(ratios)), "Static map": scored(ratios)}
 
@@ -84,13 +87,14 @@ def adapted(*ratios):
 class Methods:
     """Scores of a fine-tuned network with error 1 beside one other method."""
 
-    horizons, methods, content = (1,), {"tuned": {"label": "Tuned"}, "direct": {"label": "Direct"}}, {"method": "tuned"}
+    horizons, content = (1,), SimpleNamespace(method="tuned")
 
     def __init__(self, ratios):
         self.ratios = ratios
+        self.methods = {"tuned": SimpleNamespace(label="Tuned"), "direct": SimpleNamespace(label="Direct")}
 
-    def score(self, name, horizon):
-        return {"mae": 1.0 if name == "tuned" else sum(self.ratios) / len(self.ratios)}
+    def mae(self, name, horizon):
+        return 1.0 if name == "tuned" else sum(self.ratios) / len(self.ratios)
 
     def recordings(self, name, horizon):
         return {f"r{i}": 1.0 if name == "tuned" else ratio for i, ratio in enumerate(self.ratios)}
@@ -169,9 +173,7 @@ def test_stretches_of_one_recording_are_one_unit():
 
 
 def test_scores_of_earlier_versions_without_recordings_have_no_interval():
-    old = free_runs((1.5, 1.6, 1.7), "twin")
-    for model in old.values():
-        del model["by_recording"]
+    old = {name: replace(one, by_recording={}) for name, one in free_runs((1.5, 1.6, 1.7), "twin").items()}
     assert "no interval: chance is not excluded" in twin_verdict(old).sentence()
     assert "no interval" in tuning_verdict({"before": 2.0, "after": 1.0}).sentence()
 
@@ -205,10 +207,10 @@ def scores(*ratios, horizons=(1,)):
     def model(label, errors):
         entry = {str(k): {"v": {"rmse": sum(errors) / len(errors)}} for k in horizons}
         by = {f"r{i}": {str(k): {"v": {"rmse": e}} for k in horizons} for i, e in enumerate(errors)}
-        return {"label": label, "overall": entry, "recordings": by}
+        return ModelScores(label=label, overall=entry, recordings=by)
 
     models = {"network": model("Network", [1.0] * len(ratios)), "ridge": model("Ridge", list(ratios))}
-    return {"models": models, "targets": [{"name": "v"}], "task": {"horizons": list(horizons)}}
+    return ScoresFile(task=ScoredTask(horizons=horizons), targets=(ScoredTarget(name="v"),), models=models)
 
 
 @pytest.mark.parametrize(

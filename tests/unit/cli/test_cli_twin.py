@@ -21,6 +21,7 @@ from edp.networks.backbones import HybridSpec
 from edp.networks.predictor import ModelSpec, build_model
 from edp.networks.twin import TWINS
 from edp.networks.twin.n4sid import N4sid
+from edp.settings.provenance import DataOrigin, DataPart, Provenance
 from edp.signals import Kind
 from edp.storage import read_object, write_json
 from edp.testing.twins import sample_actuators
@@ -110,7 +111,7 @@ def test_without_a_formulation_the_best_of_several_is_chosen_and_told(edp, logs,
     (kept,) = (row for row in rows if row["chosen"])
     assert f"chosen: {kept['label']}: on free runs that its fits had not seen" in shown
     bundle = load_twin(run)
-    assert bundle.provenance["chosen"] == kept["label"]
+    assert bundle.provenance.more["chosen"] == kept["label"]
     assert TWINS.name_of(bundle.spec) == kept["label"].split()[0]
     assert edp("report", run, "--out", page).code == 0
     text = page.read_text()
@@ -122,7 +123,7 @@ def test_without_a_formulation_the_best_of_several_is_chosen_and_told(edp, logs,
     content = read_object(run / "candidates.json")
     changed = [row | {"chosen": "yes"} if row["chosen"] else row for row in content["candidates"]]
     write_json(run / "candidates.json", content | {"candidates": changed})
-    assert "chosen is 'yes'; true or false must hold" in " ".join(edp("report", run).err.split())
+    assert "chosen = 'yes': write true or false" in " ".join(edp("report", run).err.split())
 
 
 def test_a_budget_is_that_of_a_choice(edp, logs, tmp_path):
@@ -154,11 +155,11 @@ HOSTILE = "</table><script>alert(1)</script>{{7*7}}[red]\x1b[31m"
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ('{"schema": 1, "candidates": [{"label": "x"}]}', "an object with the key 'error'"),
+        ('{"schema": 1, "candidates": [{"label": "x"}]}', "error' is missing"),
         ('{"schema": 1, "candidates": {}}', "a list must hold"),
         ('{"schema": 1, "candidates": [{"label": "x", "error": NaN}]}', "the number NaN is not finite"),
         (f'{{"schema": 1, "candidates": {"[" * 5000}{"]" * 5000}}}', "nested deeper than"),
-        (json.dumps({"schema": 1, "candidates": [candidate("x" * 3000)]}), "a text of at most 2,000 characters"),
+        (json.dumps({"schema": 1, "candidates": [candidate("x" * 3000)]}), "longer than 2,000 characters"),
     ],
 )
 def test_candidates_that_cannot_be_are_refused(edp, trained, tmp_path, content, message):
@@ -245,7 +246,7 @@ def test_a_twin_is_judged_anew_and_on_other_recordings_beside_a_predictor(edp, l
     task = Task(FeatureSet("speeds", (*speeds, "lever_1", "lever_2")), speeds, (1, 5), TargetMode.DELTA, 50.0)
     model = ModelSpec(backbone=HybridSpec(channels=(4,), kernel=3, units=4, dropout=0.0), window=20)
     data = prepare([recording] * 3, task, ByRecording(), 20)
-    names = {"data": {"train": {"names": [recording.name]}}}
+    names = Provenance(data=DataOrigin(train=DataPart(names=(recording.name,))))
     save_bundle(make_bundle(build_model(task, model, data.scaler(), 0).eval(), data, names), tmp_path / "predictor")
     before = read_object(run / "free_run.json")
     again = edp("evaluate", run, "--json").json
@@ -311,7 +312,8 @@ def test_the_page_of_a_twin_and_that_of_one_run(edp, logs, trained, tmp_path):
     assert "actuators_1 from 2 s" in file.read_text()
     assert "--limit" in edp("report", trained, "--limit", file).err
     (broken := shutil.copytree(trained, tmp_path / "broken") / "free_run.json").write_text('{"schema": 1}')
-    assert "of another version of EDP; run edp evaluate" in " ".join(edp("report", broken.parent).err.split())
+    refused = " ".join(edp("report", broken.parent).err.split())
+    assert "of another version of EDP: schema 1, expected 2; run edp evaluate" in refused
 
 
 def test_channels_that_stay_measured(edp, logs, trained, tmp_path):

@@ -28,8 +28,8 @@ def test_only_commands_that_leave_their_range_by_more_than_noise_are_named(machi
     inputs[:10, 1] = high + 0.5
     found = commands_beyond(ranges, channels, [inputs])
     assert set(found) == {"lever_2"}
-    assert found["lever_2"]["share"] == pytest.approx(10 / len(inputs))
-    assert found["lever_2"]["largest"] == pytest.approx(high + 0.5)
+    assert found["lever_2"].share == pytest.approx(10 / len(inputs))
+    assert found["lever_2"].largest == pytest.approx(high + 0.5)
     assert "lever_2" in beyond_sentence(found)
     assert beyond_sentence({}) == ""
 

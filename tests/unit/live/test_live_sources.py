@@ -59,7 +59,7 @@ def played(live: LiveRun) -> np.ndarray:
 def network(tiny, tiny_model, tmp_path):
     torch.manual_seed(0)
     predictor = Predictor(tiny.task, tiny_model, tiny.scaler()).eval()
-    return predictor, save_bundle(make_bundle(predictor, tiny, {}), tmp_path / "run" / "bundle").parent
+    return predictor, save_bundle(make_bundle(predictor, tiny), tmp_path / "run" / "bundle").parent
 
 
 def recording_of(tiny) -> Recording:

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -16,6 +17,7 @@ from edp.report.run.facts import (
 )
 from edp.report.run.outputs import judged_line
 from edp.report.run.tables import comparison_tables, key_figures
+from edp.settings.provenance import DataOrigin, DataPart, Provenance
 from edp.storage import write_json
 from edp.wording import decimals_for, duration, listed, number, percent, unbroken
 
@@ -45,13 +47,13 @@ def test_headline_states_the_scores_of_the_longest_horizon(run_folder):
 
 def test_comparison_sorts_by_error_and_relates_the_network_to_each_model(run_folder):
     rows = comparison_rows(read_facts(run_folder), horizon=5)
-    errors = [row["rmse"] for row in rows]
+    errors = [row.rmse for row in rows]
     assert errors == sorted(errors)
-    network = next(row for row in rows if row["is_network"])
-    assert network["change"] is None
+    network = next(row for row in rows if row.is_network)
+    assert network.change is None
     for row in rows:
-        if not row["is_network"]:
-            assert row["change"] == pytest.approx(network["rmse"] / row["rmse"] - 1)
+        if not row.is_network:
+            assert row.change == pytest.approx(network.rmse / row.rmse - 1)
 
 
 def test_a_network_worse_than_a_baseline_is_called_worse(run_folder):
@@ -61,7 +63,7 @@ def test_a_network_worse_than_a_baseline_is_called_worse(run_folder):
     edit_scores(run_folder, change)
     facts = read_facts(run_folder)
     assert "higher than the best baseline" in verdict_lines(facts)[0]
-    assert comparison_rows(facts)[-1]["model"] == NETWORK
+    assert comparison_rows(facts)[-1].model == NETWORK
 
 
 def test_outputs_in_different_units_have_no_common_unit(run_folder):
@@ -114,13 +116,14 @@ def test_the_headline_is_the_verdict_and_lost_outputs_are_named(run_folder):
 
 def test_test_logs_are_named_with_what_they_cannot_prove(run_folder):
     facts = read_facts(run_folder)
-    judged = list(facts.scores["models"][NETWORK]["recordings"])
+    judged = list(facts.scores.models[NETWORK].recordings)
     assert any(judged[0] in line and line.startswith("Judged on") for line in verdict_lines(facts))
 
     def scores(*names):
-        return {"models": {NETWORK: {"recordings": {name: {} for name in names}}}}
+        network = replace(facts.models[NETWORK], recordings={name: {} for name in names})
+        return replace(facts.scores, models={NETWORK: network})
 
-    trained = {"data": {"train": {"names": ["dig_1", "travel_1"]}}}
+    trained = Provenance(data=DataOrigin(train=DataPart(names=("dig_1", "travel_1"))))
     assert judged_line(scores(), trained) == ""
     assert "So few that one odd log decides" in judged_line(scores("dig_2", "dig_3"), trained)
     same = judged_line(scores("dig_2", "dig_3", "dig_4"), trained)
@@ -146,7 +149,7 @@ def test_recordings_won_counts_only_recordings_both_have(run_folder):
 
 def test_spread_is_a_sentence_with_the_median(run_folder):
     facts = read_facts(run_folder)
-    median = facts.models[NETWORK]["spread"]["10"]["median"]
+    median = facts.models[NETWORK].spread["10"]["median"]
     assert f"median of {median:.2f}" in spread_text(facts)
 
 

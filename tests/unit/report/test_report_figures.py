@@ -3,6 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from edp.evaluation.scores_file import ModelScores
 from edp.report.common.chart import BLUE, GREY
 from edp.report.common.interactive import plots
 from edp.report.run import figures
@@ -82,19 +83,13 @@ def test_residual_shares_and_what_lies_outside_add_up(facts):
 def test_horizon_curves_are_in_milliseconds(facts):
     curve = figures.horizon_curves(facts)[NETWORK]
     assert [x for x, _ in curve] == [10.0, 50.0, 100.0]
-    assert curve[-1][1] == facts.models[NETWORK]["overall"]["10"]["mean"]["rmse"]
+    assert curve[-1][1] == facts.models[NETWORK].overall["10"]["mean"]["rmse"]
 
 
 def test_recordings_are_sorted_by_the_networks_error(facts):
     order, errors = figures.recording_errors(facts, 10)
     assert errors[NETWORK] == sorted(errors[NETWORK])
-    assert sorted(order) == sorted(facts.models[NETWORK]["recordings"])
-
-
-def test_an_empty_speed_band_has_no_error(facts):
-    models = {"network": {"by_speed": {"10": [{"low": 0, "high": 5, "count": 0, "mae": 0.0}]}}}
-    facts = dataclasses.replace(facts, scores={**facts.scores, "models": models})
-    assert figures.speed_bands(facts, 10)[NETWORK][0]["mae"] is None
+    assert sorted(order) == sorted(facts.models[NETWORK].recordings)
 
 
 def test_the_best_epoch_is_the_last_one_marked(facts):
@@ -136,13 +131,15 @@ def test_each_choice_shows_one_recording_horizon_and_extent(facts):
 
 def test_many_recordings_become_a_rank_curve(facts):
     recordings = {f"r{i:03d}": {"10": {"mean": {"rmse": float(i)}}} for i in range(60)}
-    models = {"network": {"label": "N", "recordings": recordings}}
-    plot = plots_of(dataclasses.replace(facts, scores={**facts.scores, "models": models}))["recordings"]
+    models = {"network": ModelScores(label="N", overall={}, recordings=recordings)}
+    scores = dataclasses.replace(facts.scores, models=models)
+    plot = plots_of(dataclasses.replace(facts, scores=scores))["recordings"]
     assert list(plot.figure.data[0].x) == list(range(1, 61))
 
 
 def test_one_horizon_becomes_bars(facts):
-    scores = {**facts.scores, "task": {**facts.scores["task"], "horizons": [10]}}
+    task = dataclasses.replace(facts.scores.task, horizons=(10,))
+    scores = dataclasses.replace(facts.scores, task=task)
     plot = plots_of(dataclasses.replace(facts, scores=scores, predictions={}))["horizon"]
     assert plot.figure.data[0].type == "bar"
     assert len(plot.figure.data[0].x) == len(facts.models)

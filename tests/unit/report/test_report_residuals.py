@@ -21,7 +21,7 @@ def test_fit_is_that_of_system_identification(run_folder):
     facts = read_facts(run_folder)
     table = fit_table(facts)
     assert [column.heading for column in table.columns] == ["Output", "10 ms ahead", "50 ms ahead", "100 ms ahead"]
-    r2 = facts.models["network"]["overall"]["5"]["CylVels_2"]["r2"]
+    r2 = facts.models["network"].overall["5"]["CylVels_2"]["r2"]
     assert float(table.rows[1][2]) == pytest.approx(100 * (1 - math.sqrt(1 - r2)), abs=0.06)
 
 

@@ -6,7 +6,7 @@ import json
 import pytest
 
 from edp.errors import EdpError, StorageError
-from edp.evaluation.scores_file import read_scores
+from edp.evaluation.scores_file import ScoresFile
 from edp.report.run.facts import read_facts
 from edp.report.run.page import build_run_page
 from edp.storage import write_json
@@ -79,18 +79,19 @@ def test_any_change_is_one_error_or_a_page(drawn, step):
         (
             ("models", "network", "overall", "10", "mean", "mae"),
             "low",
-            r"models\.network\.overall\.10\.mean\.mae is 'l",
+            r"models\.network\.overall\.10\.mean\.mae = 'low': a text is no number",
         ),
-        (("models", "network"), [], r"models\.network is \[\]; an object must hold"),
-        (("models", "network", "overall"), KeyError, "an object with the key 'overall' must hold"),
-        (("targets",), {"name": "y"}, "targets is .*; a list must hold"),
-        (("targets", 0, "factor"), 0, r"targets\[0\]\.factor is 0; a number above 0"),
-        (("task", "horizons", 0), 1.5, r"task\.horizons\[0\] is 1\.5; an integer"),
+        (("models", "network"), [], r"models\.network: expected a table, got \[\]"),
+        (("models", "network", "overall"), KeyError, r"'models\.network\.overall' is missing"),
+        (("targets",), {"name": "y"}, "targets = .*: a list must hold"),
+        (("targets", 0, "factor"), 0, r"targets\[0\]: .*factor"),
+        (("targets", 0, "faktor"), 1.0, "unknown key 'targets.*faktor'; did you mean 'factor'"),
+        (("task", "horizons", 0), 1.5, r"task\.horizons = .*: an integer"),
     ],
 )
 def test_the_message_names_the_value_and_what_to_do(drawn, path, other, message):
     file = drawn / "scores.json"
     write_json(file, changed(json.loads(file.read_text()), path, other))
     with pytest.raises(StorageError, match=message) as caught:
-        read_scores(file)
+        ScoresFile.from_file(file)
     assert "remove it and run edp evaluate" in str(caught.value)

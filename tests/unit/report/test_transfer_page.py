@@ -45,6 +45,7 @@ def content():
             name: {
                 "label": {"direct": "Standard", "two_phase": "Fine-Tuned"}[name],
                 "learned": 0 if name == "direct" else 84_292,
+                "weights": None,
                 "domains": {"target": scores(rows), "source": scores(PRINTED["direct"])},
             }
             for name, rows in PRINTED.items()
@@ -134,6 +135,7 @@ def test_a_better_rival_is_named(folder):
     held["methods"]["full"] = {
         "label": "One rate",
         "learned": 84_292,
+        "weights": None,
         "domains": held["methods"]["two_phase"]["domains"],
     }
     held["methods"]["two_phase"] |= {

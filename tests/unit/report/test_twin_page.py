@@ -12,14 +12,16 @@ from safetensors.numpy import save
 from edp.data.twin_channels import TwinChannels
 from edp.errors import StorageError
 from edp.evaluation.free_run import FreeRunJudgeSpec, FreeRuns, free_run_scores
+from edp.evaluation.free_run_file import FreeRunFile
 from edp.networks.twin import calibrate
 from edp.report.common.interactive import plots
 from edp.report.twin.charts import twin_charts
 from edp.report.twin.facts import FreeRunFacts, free_run_tables, headline, read_free_runs, tiles, verdict
 from edp.report.twin.page import build_twin_page
+from edp.settings.provenance import Provenance
 from edp.signals import Channel, Kind
 from edp.storage import read_json, write_json
-from edp.workflows.twin.judge_twin import channel_facts, shown_runs, write_scores
+from edp.workflows.twin.judge_twin import reported_channels, shown_runs, write_scores
 
 HOSTILE = "</script><img src=x onerror=alert(1)>"
 SPEC = FreeRunJudgeSpec(at_s=(0.2, 1.0), covered_at_s=(0.2, 1.0))
@@ -45,8 +47,13 @@ def judged(strokes=True, name="boom", swing=False, kind=Kind.VELOCITY):
 
 def facts_of(**options):
     scores, runs, intervals = judged(**options)
-    content = {"schema": 2, "channels": channel_facts(runs.channels), "models": json.loads(json.dumps(scores))}
+    content = FreeRunFile(channels=reported_channels(runs.channels), models=scores)
     return FreeRunFacts("m22", content, shown_runs(runs, intervals))
+
+
+def grounded(ground, data=None):
+    more = {"ground": ground} | ({"ground_data": data} if data else {})
+    return replace(facts_of(), provenance=Provenance(more=more))
 
 
 @pytest.mark.parametrize(
@@ -57,7 +64,9 @@ def facts_of(**options):
     ],
 )
 def test_a_ground_is_told_with_what_it_explains(ground, says):
-    lines = verdict(replace(facts_of(), provenance={"ground": ground, "ground_data": {"source": "loam"}}))
+    lines = verdict(
+        replace(facts_of(), provenance=Provenance(more={"ground": ground, "ground_data": {"source": "loam"}}))
+    )
     (line,) = (one for one in lines if "ground" in one)
     assert says in line.replace("\xa0", " ")
     assert line.endswith("free runs and errors of this page are in free air.")
@@ -65,10 +74,12 @@ def test_a_ground_is_told_with_what_it_explains(ground, says):
 
 def test_a_ground_of_a_stranger_is_text():
     text = build_twin_page(
-        replace(facts_of(), provenance={"ground": {"kind": HOSTILE}, "ground_data": {"source": HOSTILE}})
+        replace(
+            facts_of(), provenance=Provenance(more={"ground": {"kind": HOSTILE}, "ground_data": {"source": HOSTILE}})
+        )
     ).html()
     assert "<img src=x" not in text
-    assert not any("ground" in line for line in verdict(replace(facts_of(), provenance={"ground": [HOSTILE]})))
+    assert not any("ground" in line for line in verdict(grounded([HOSTILE])))
 
 
 def plots_of(facts):
@@ -117,8 +128,8 @@ def test_tables_say_what_the_scores_hold():
     sheets = free_run_tables(facts)
     assert list(sheets) == ["models", "recordings", "driving", "situations", "intervals"]
     assert [row[0] for row in sheets["driving"].rows] == ["dig", "grade"]
-    assert sheets["models"].rows[0][2] == facts.twin["velocity_mae"]["mean"]
-    assert sheets["intervals"].rows[1][2] == facts.twin["intervals"]["at"][1]["velocities"]["half_width"]["mean"]
+    assert sheets["models"].rows[0][2] == facts.twin.velocity_mae.mean
+    assert sheets["intervals"].rows[1][2] == facts.twin.intervals.at[1].velocities.half_width.mean
     worst = [max(row[3:5]) for row in sheets["recordings"].rows]
     assert len(worst) == 2
 
@@ -158,9 +169,12 @@ def test_what_was_written_is_read(folder):
     ("change", "message"),
     [
         (lambda content: content.update(schema=1), "of another version of EDP"),
-        (lambda content: content["models"].pop("twin"), "the key 'twin'"),
+        (lambda content: content["models"].pop("twin"), "'models.twin' is missing"),
         (lambda content: content["models"]["twin"]["velocity_mae"].update(mean="low"), "models.twin.velocity_mae.mean"),
-        (lambda content: content["models"]["twin"]["stroke_error"][0].pop("unit"), "the key 'unit'"),
+        (
+            lambda content: content["models"]["twin"]["stroke_error"][0].pop("unit"),
+            r"stroke_error\[0\]\.unit'",
+        ),
         (lambda content: content["channels"]["pressures"].append({"name": 3}), "channels.pressures"),
         (lambda content: content["channels"]["pressures"].clear(), "does not fit its scores"),
     ],

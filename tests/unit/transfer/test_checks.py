@@ -91,7 +91,9 @@ def test_another_sign_is_found_by_correlation_with_the_pilot_pressure(refused, m
 def test_logs_of_another_sign_are_taken_where_that_is_asked_for(run, small, made_by, written, tmp_path):
     logs = DataSource.of(written(tmp_path / "logs", [made_by("a", 1, (0.3, 0.2))]))
     spec = dataclasses.replace(small, check_signs=False)
-    found = finetune(run, logs, FinetuneRequest(spec=spec, changes=("training.updates=2",)), tmp_path / "out")
+    found = finetune(
+        run, logs, FinetuneRequest(spec=spec, changes=("training.updates=2",)), tmp_path / "out"
+    ).to_table()
     assert found["notes"] == []
 
 

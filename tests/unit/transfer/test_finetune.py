@@ -41,7 +41,7 @@ BUFFERS = ("front.offset", "front.width", "code.offset", "code.width")
 def tuned(run, target, small, tmp_path_factory):
     folder = tmp_path_factory.mktemp("tuned") / "run"
     order = FinetuneRequest(spec=small, method="two_phase", baselines=tuple(METHODS), changes=UPDATES)
-    return folder, finetune(run, target, order, folder)
+    return folder, finetune(run, target, order, folder).to_table()
 
 
 class Pulled(Exception):
@@ -141,7 +141,7 @@ def test_a_stopped_fine_tuning_goes_on_to_the_same_bits(tuned, run, target, smal
 
         with pytest.raises(Pulled):
             finetune(run, target, order, tmp_path / "run", NotedProgress(pull))
-    found = finetune(run, target, order, tmp_path / "run")
+    found = finetune(run, target, order, tmp_path / "run").to_table()
     ends = [load_bundle(folder).predictor.state_dict() for folder in (whole, tmp_path / "run")]
     assert all(torch.equal(ends[0][key], ends[1][key]) for key in ends[0])
     assert set(found["methods"]) == {"two_phase", "direct"}
@@ -184,7 +184,7 @@ def test_a_bundle_alone_is_enough_but_its_world_is_not_judged(run, target, small
     notes = told.notes
     changes = ("training.updates=2", "training.chunks.length=32")
     order = FinetuneRequest(spec=small, method="two_phase", baselines=("adversarial",), changes=changes)
-    found = finetune(tmp_path / "alone", target, order, tmp_path / "run", told)
+    found = finetune(tmp_path / "alone", target, order, tmp_path / "run", told).to_table()
     assert list(found["methods"]["two_phase"]["domains"]) == ["target"]
     assert any("bundle without the run" in note for note in notes)
     assert any("sign of rise, turn was not checked" in note for note in notes)

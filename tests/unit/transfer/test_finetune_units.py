@@ -27,8 +27,8 @@ def without_times(value):
 @pytest.mark.processes
 def test_methods_trained_apart_are_judged_as_if_trained_here(run, target, small, tmp_path):
     order = FinetuneRequest(spec=small, method="full", baselines=("low_rank", "ridge_arx"))
-    there = finetune(run, target, order, tmp_path / "there", workers=Workers(count=2))
-    here = finetune(run, target, order, tmp_path / "here")
+    there = finetune(run, target, order, tmp_path / "there", workers=Workers(count=2)).to_table()
+    here = finetune(run, target, order, tmp_path / "here").to_table()
     assert json.dumps(without_times(there)) == json.dumps(without_times(here))
     with pytest.raises(BundleError):
         finetune(tmp_path / "nothing", target, order, tmp_path / "no", workers=Workers(count=2))
@@ -72,7 +72,7 @@ def test_all_models_are_scored_on_the_same_ticks(run):
     bench = judge.ModelBench(bundle.predictor, data, judge.JudgeSpec(baselines=("ridge_arx",), history=30))
     assert bench.skip == 30
     models = [bench.network("", 0.0), bench.baseline("ridge_arx")]
-    counts = [[scores["mean"]["count"] for scores in model.entry["overall"].values()] for model in models]
+    counts = [[scores["mean"]["count"] for scores in model.entry.overall.values()] for model in models]
     assert counts[0] == counts[1]
     assert judge.ModelBench(bundle.predictor, data, judge.JudgeSpec(baselines=())).skip == 10
 

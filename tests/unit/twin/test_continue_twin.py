@@ -65,16 +65,16 @@ def test_it_keeps_formulation_and_numbers_and_says_where_it_comes_from(base, oth
     trained = gone_on(other, base, tmp_path / "run")
     before, after = load_twin(base), load_twin(tmp_path / "run")
     assert after.spec == before.spec
-    assert after.provenance["from"]["hash"] == twin_hash(base)
-    assert after.provenance["from"]["data"] == before.provenance["data"]["digest"]
+    assert after.provenance.more["from"]["hash"] == twin_hash(base)
+    assert after.provenance.more["from"]["data"] == before.provenance.origin.digest
     assert np.array_equal(after.twin.scales.answer_width, before.twin.scales.answer_width)
     # The other machine's second stroke ends at 0.7, where it was more than once; the first was there once at most.
     assert after.twin.scales.high[2:4] == pytest.approx([1.0, 0.7], abs=0.02)
     assert after.intervals is not None
     rows = read_candidates(tmp_path / "run")
-    assert rows[0]["label"] == "the twin as it is"
-    assert [row["chosen"] for row in rows].count(True) == 1
-    assert min(row["error"] for row in rows) == next(row["error"] for row in rows if row["chosen"])
+    assert rows[0].label == "the twin as it is"
+    assert [row.chosen for row in rows].count(True) == 1
+    assert min(row.error for row in rows) == next(row.error for row in rows if row.chosen)
     again = gone_on(other, base, tmp_path / "run")
     assert not trained.resumed
     assert again.resumed
@@ -93,8 +93,8 @@ def test_longer_trainings_are_tried_while_they_help(base, other, tmp_path, monke
     monkeypatch.setattr(continue_twin.ContinuedTwin, "_error", lambda self, twin: next(errors))
     gone_on(other, base, tmp_path / "run")
     rows = read_candidates(tmp_path / "run")
-    assert [row["label"] for row in rows[1:]] == [f"{count} further updates" for count in (1, 3, 9)]
-    assert rows[-1]["chosen"]
+    assert [row.label for row in rows[1:]] == [f"{count} further updates" for count in (1, 3, 9)]
+    assert rows[-1].chosen
 
 
 @pytest.mark.parametrize("members", [1, 3])

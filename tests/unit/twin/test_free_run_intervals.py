@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from edp.evaluation.free_run import FreeRunJudgeSpec, FreeRuns, calibrated, coverage_of, free_run_scores, free_runs
 from edp.networks.twin import FreeRunIntervals, calibrate
 from edp.networks.twin.static_map import StaticMap
+from edp.settings.results import plain_value
 from edp.storage.seals import HASH, content_digest
 from edp.testing.twins import sample_series, sample_twin
 from edp.training.twin_bundle import HEADER, TwinBundle, load_twin, save_twin
@@ -86,7 +87,7 @@ def test_those_of_a_twin_hold_on_recordings_that_calibrated_nothing():
     spec = FreeRunJudgeSpec(seconds=5.0, calibration_starts=20, covered_at_s=(0.1, 1.0, 5.0, 60.0))
     intervals = calibrated([(twin, series[1:9])], spec)
     runs = free_runs(twin, series[9:], 5.0, 20)
-    scores = free_run_scores(runs, spec, intervals)["intervals"]
+    scores = plain_value(free_run_scores(runs, spec, intervals).intervals)
     assert [row["at_s"] for row in scores["at"]] == [0.1, 1.0, 5.0]
     assert all(0.75 <= row[part]["share"] <= 1.0 for row in scores["at"] for part in ("velocities", "strokes"))
     assert scores["calibrated_by"] > 80
@@ -105,7 +106,7 @@ def test_coverage_is_counted_by_channel_and_time():
     answers[0, 10:, 2] = 2.0  # beyond it later, in one run
     intervals = FreeRunIntervals(0.9, (1, 10), np.ones((2, 6), np.float32), 5)
     runs = FreeRuns(channels, tuple("abcd"), answers, truth, truth[:, 0], -np.ones(6), np.ones(6))
-    rows = coverage_of(runs, FreeRunJudgeSpec(covered_at_s=(0.1, 0.4)), intervals)["at"]
+    rows = plain_value(coverage_of(runs, FreeRunJudgeSpec(covered_at_s=(0.1, 0.4)), intervals))["at"]
     assert [row["calibrated"] for row in rows] == [True, False]
     assert rows[0]["velocities"]["by_channel"] == {"speed_1": 0.25, "speed_2": 1.0}
     assert rows[0]["velocities"]["share"] == 0.625
@@ -115,7 +116,7 @@ def test_coverage_is_counted_by_channel_and_time():
 def test_they_come_back_with_the_twin_and_earlier_twins_have_none(tmp_path):
     twin, series = twin_and_series()
     intervals = calibrated([(twin, series[:2])], FreeRunJudgeSpec(seconds=2.0))
-    save_twin(TwinBundle(StaticMap(prefix_ticks=10), twin, {}, {}, intervals), tmp_path)
+    save_twin(TwinBundle(StaticMap(prefix_ticks=10), twin, intervals=intervals), tmp_path)
     loaded = load_twin(tmp_path).intervals
     assert loaded.to_plain() == intervals.to_plain()
     save_twin(TwinBundle(StaticMap(prefix_ticks=10), twin), tmp_path)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sample_scores import sample_errors, sample_free_run_scores
 
 from edp.data.twin_channels import TwinChannels
 from edp.errors import DataError
@@ -11,6 +12,7 @@ from edp.evaluation.ahead import ahead_scores, look_ahead, predictor_scores
 from edp.evaluation.free_run import FreeRunJudgeSpec, FreeRuns, free_run_scores, free_runs
 from edp.evaluation.guard import twin_beaten_by
 from edp.networks.twin.static_map import StaticMap
+from edp.settings.results import plain_value
 from edp.signals import Channel, Kind
 from edp.testing.twins import sample_actuators, sample_twin
 
@@ -45,7 +47,7 @@ def runs(velocities=VELOCITIES, strokes=STROKES, pressures=PRESSURES):
 
 
 def test_errors_by_kind_and_time():
-    scores = free_run_scores(runs(), at(0.5, 2.0, 60.0))
+    scores = plain_value(free_run_scores(runs(), at(0.5, 2.0, 60.0)))
     assert scores["velocity_mae"]["unit"] == "mm/s"
     assert scores["velocity_mae"]["by_channel"] == pytest.approx({"v1": 3.0, "v2": 0.0}, abs=1e-3)
     assert scores["velocity_mae"]["mean"] == pytest.approx(1.5, abs=1e-3)
@@ -63,7 +65,9 @@ def test_without_strokes_velocities_are_integrated():
     channels = TwinChannels(COMMAND, VELOCITIES[:1], (), (), 2.0)
     truth = np.zeros((1, 4, 1), np.float32)
     answers = truth + np.float32(0.01)
-    scores = free_run_scores(FreeRuns(channels, ("a",), answers, truth, truth[:, 0], *ends(channels, 1)), at(2.0))
+    scores = plain_value(
+        free_run_scores(FreeRuns(channels, ("a",), answers, truth, truth[:, 0], *ends(channels, 1)), at(2.0))
+    )
     # Trapezoid of 0, 10, 10, 10, 10 mm/s over steps of 0.5 s.
     assert scores["stroke_error"][0]["mean"] == pytest.approx(17.5, rel=1e-5)
     assert scores["stroke_error"][0]["unit"] == "mm"
@@ -92,7 +96,7 @@ def test_what_rests_in_all_runs_is_not_astray_by_a_small_error():
 def test_units_are_never_mixed():
     mixed = (Channel("v1", Kind.VELOCITY), Channel("w", Kind.ANGULAR_VELOCITY))
     strokes = (Channel("x1", Kind.POSITION), Channel("q", Kind.ANGLE))
-    scores = free_run_scores(runs(mixed, strokes), at(1.0))
+    scores = plain_value(free_run_scores(runs(mixed, strokes), at(1.0)))
     assert scores["velocity_mae"]["mean"] is None
     assert scores["velocity_mae"]["by_channel"]["v1"] == pytest.approx(3.0, abs=1e-3)
     assert scores["stroke_error"][0]["median"] is None
@@ -126,7 +130,7 @@ def test_starts_beyond_an_end_stop_are_left_out():
 
 
 def test_errors_by_horizon_recording_and_way_of_driving():
-    scores = free_run_scores(runs(), at(0.5), labels={"a": "dig", "b": "grade"})
+    scores = plain_value(free_run_scores(runs(), at(0.5), labels={"a": "dig", "b": "grade"}))
     assert scores["by_horizon"]["seconds"] == [0.5, 1.0, 1.5, 2.0]
     assert scores["by_horizon"]["strokes"]["by_channel"]["x2"] == pytest.approx([1.0, 2.0, 3.0, 4.0], abs=1e-3)
     assert scores["by_horizon"]["velocities"]["mean"] == pytest.approx([1.5] * 4, abs=1e-3)
@@ -139,7 +143,7 @@ def test_errors_by_horizon_recording_and_way_of_driving():
         row["at_s"] for row in scores["by_recording"]["b"]["stroke_error"]
     }
     assert scores["by_driving"]["grade"] == scores["by_recording"]["b"]
-    assert free_run_scores(runs(), at(0.5), labels={"a": "dig"})["by_driving"] == {}
+    assert free_run_scores(runs(), at(0.5), labels={"a": "dig"}).by_driving == {}
 
 
 def test_errors_at_end_stops_at_rest_and_in_motion():
@@ -151,7 +155,9 @@ def test_errors_at_end_stops_at_rest_and_in_motion():
     truth[0, :, 4] = [1.0, -1.0, 1.0, -1.0]
     answers = truth + np.float32([1e-3, 2e-3, 3e-3, 4e-3, 0.5])
     answers[0, 2, 0] += 1.0
-    found = free_run_scores(FreeRuns(channels, ("a",), answers, truth, truth[:, 0], *ends(channels, 10)), at(0.5))
+    found = plain_value(
+        free_run_scores(FreeRuns(channels, ("a",), answers, truth, truth[:, 0], *ends(channels, 10)), at(0.5))
+    )
     rows = found["situations"]
     assert {name: (row["share"], row["machine_share"]) for name, row in rows.items()} == {
         "end_stops": (0.125, 0.25),
@@ -182,12 +188,12 @@ def test_a_look_ahead_is_measured_up_to_its_moment_and_told_the_commands_after_i
     place = counts[0] + 50
     np.testing.assert_allclose(ahead.answers[place], expected[0, -1], rtol=1e-4, atol=1e-6)
     assert np.array_equal(ahead.truth[place], part.targets[at + 7])
-    scores = ahead_scores(ahead)
+    scores = plain_value(ahead_scores(ahead))
     errors = np.abs(ahead.answers - ahead.truth).mean(axis=0)
     assert scores["velocity_mae"]["mean"] == pytest.approx(1e3 * errors[:2].mean(), rel=1e-4)
     assert scores["stroke_error"]["by_channel"]["stroke_2"] == pytest.approx(1e3 * errors[3], rel=1e-4)
     assert (scores["seconds"], scores["moments"]) == (0.14, sum(counts))
-    beside = predictor_scores(ahead, {"speed_2": ahead.truth[:, 1] + np.float32(2e-3)})
+    beside = plain_value(predictor_scores(ahead, {"speed_2": ahead.truth[:, 1] + np.float32(2e-3)}))
     assert set(beside) == {"velocities"}
     assert beside["velocities"]["predictor"]["mean"] == pytest.approx(2.0, rel=1e-3)
     assert beside["velocities"]["twin"]["mean"] == pytest.approx(1e3 * errors[1], rel=1e-4)
@@ -196,8 +202,7 @@ def test_a_look_ahead_is_measured_up_to_its_moment_and_told_the_commands_after_i
 
 
 def _scores(velocity, *strokes):
-    rows = [{"at_s": float(at), "by_channel": {"boom": value}} for at, value in enumerate(strokes, 1)]
-    return {"velocity_mae": {"by_channel": {"v": velocity}}, "stroke_error": rows}
+    return sample_free_run_scores(sample_errors(velocity, *strokes))
 
 
 def test_a_twin_that_a_floor_beats_is_told_by_how_much():

@@ -34,7 +34,7 @@ def test_free_runs_are_learned_far_better_than_the_static_map(data):
     result = fitted(data, validate_every=25, patience=0)
     floor = TWINS["static"]().start(channels, scales, train, 0)
     errors = [
-        free_run_scores(free_runs(twin, test, 8.0, 4), FreeRunJudgeSpec(at_s=(8.0,)))["velocity_mae"]["mean"]
+        free_run_scores(free_runs(twin, test, 8.0, 4), FreeRunJudgeSpec(at_s=(8.0,))).velocity_mae.mean
         for twin in (result.twin, floor)
     ]
     assert errors[0] < 0.6 * errors[1]

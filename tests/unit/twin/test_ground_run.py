@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sample_scores import sample_errors, sample_free_run_scores
 
 from edp.config.twin import load_twin_experiment
 from edp.control.plants import plant_of
@@ -15,6 +16,7 @@ from edp.logs.source import DataSource
 from edp.networks.twin.grey.ground_drag import DragLaw
 from edp.networks.twin.static_map import StaticMap
 from edp.report.twin.facts import ground_line
+from edp.settings.results import plain_value
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.storage import write_json
 from edp.testing.control import sample_excavator_twin, sample_grey_box
@@ -30,7 +32,8 @@ GROUND = ("ground=drag", "judge.floors=[]")
 def start(tmp_path_factory):
     """A run folder of a grey box that nobody fitted, with a datasheet of a row."""
     run = tmp_path_factory.mktemp("start")
-    save_twin(replace(sample_grey_box(), scores={"twin": {}}), run / "twin")
+    scores = plain_value({"twin": sample_free_run_scores(sample_errors(1.0, 1.0))})
+    save_twin(replace(sample_grey_box(), scores=scores), run / "twin")
     row = {"element": "pump", "name": "flow", "unit": "m^3/s", "value": 1.0, "low": 0.9, "high": 1.1, "excited": True}
     write_json(run / "datasheet.json", {"schema": 1, "basis": "", "numbers": [row]})
     for name in JUDGED:
@@ -57,8 +60,8 @@ def test_a_run_with_a_ground_keeps_equations_and_scores(grounded, start, loam):
     before, after = load_twin(start), load_twin(run)
     assert isinstance(after.ground, DragLaw)
     assert all((after.twin.arrays()[name] == values).all() for name, values in before.twin.arrays().items())
-    assert after.scores == before.scores == trained.scores
-    facts = after.provenance["ground"]["explained"]
+    assert after.scores == before.scores == plain_value(trained.scores)
+    facts = after.provenance.more["ground"]["explained"]
     assert set(facts) == {"train", "validation"}
     rows = json.loads((run / "datasheet.json").read_text())["numbers"]
     assert [row["element"] for row in rows] == ["pump", *["ground"] * 13]

@@ -136,7 +136,7 @@ def test_a_network_learns_what_the_equations_lack_and_is_kept(machine):
     assert fit.error < 0.8 * fit.grey_error
     judge = FreeRunJudgeSpec(at_s=(2.0,))
     with_network, alone = (
-        free_run_scores(free_runs(one, runs[2:3], 2.0, 32), judge)["velocity_mae"]["mean"]
+        free_run_scores(free_runs(one, runs[2:3], 2.0, 32), judge).velocity_mae.mean
         for one in (fit.twin, fit.twin.without_network())
     )
     assert with_network < 0.9 * alone

@@ -1,15 +1,14 @@
 """Step responses of a twin, and the figure of its page that shows them."""
 
-import json
-
 import numpy as np
 import pytest
 
 from edp.errors import StorageError
+from edp.evaluation.free_run_file import StepResponses
 from edp.evaluation.step_response import POINTS, step_responses
 from edp.networks.twin import TWINS
 from edp.report.twin.charts import steps_chart
-from edp.report.twin.facts import STEPS_FILE, read_steps
+from edp.report.twin.facts import read_steps
 from edp.storage import write_json
 from edp.testing.twins import sample_actuators, sample_twin
 
@@ -24,23 +23,23 @@ def content():
 
 def test_a_response_is_the_difference_between_two_free_runs(content):
     twin, series, found = content
-    assert found["moments"] > 1
-    assert len(found["seconds"]) <= POINTS
-    assert len(found["steps"]) == len(twin.channels.commands)
+    assert found.moments > 1
+    assert len(found.seconds) <= POINTS
+    assert len(found.steps) == len(twin.channels.commands)
     names = [channel.name for channel in twin.channels.answers]
-    for column, step in enumerate(found["steps"]):
-        assert [answer["name"] for answer in step["answers"]] == names
+    for column, step in enumerate(found.steps):
+        assert [answer.name for answer in step.answers] == names
         values = np.concatenate([part.inputs[:, column] for part in series])
         span = np.quantile(values, 0.95) - np.quantile(values, 0.05)
-        assert step["size"] > 0.0
+        assert step.size > 0.0
         assert span > 0.0
-        for answer in step["answers"]:
-            middle, low, high = (np.array(answer[key]) for key in ("median", "low", "high"))
+        for answer in step.answers:
+            middle, low, high = (np.array(getattr(answer, key)) for key in ("median", "low", "high"))
             assert np.isfinite(middle).all()
             assert (low <= high + 1e-9).all()
     # A static map of commands answers its own axis at once, and its stroke goes on from there.
-    own = found["steps"][0]["answers"]
-    velocity = np.abs(own[0]["median"])
+    own = found.steps[0].answers
+    velocity = np.abs(own[0].median)
     assert velocity[-1] > 0.0
 
 
@@ -49,19 +48,20 @@ def test_a_command_that_never_moves_has_no_response(content):
     from dataclasses import replace
 
     still = [replace(part, inputs=np.zeros_like(part.inputs)) for part in series]
-    assert step_responses(twin, still)["steps"] == []
-    assert steps_chart({"steps": []}) is None
+    found = step_responses(twin, still)
+    assert found.steps == ()
+    assert steps_chart(found) is None
 
 
 def test_what_is_on_disk_is_drawn_a_choice_for_each_command(content, tmp_path):
     _, _, found = content
-    assert read_steps(tmp_path) == {}
-    write_json(tmp_path / STEPS_FILE, found)
+    assert read_steps(tmp_path) is None
+    found.write(tmp_path)
     chart = steps_chart(read_steps(tmp_path))
-    assert [value for value, _ in chart.choices[0].options] == [step["command"] for step in found["steps"]]
-    assert len(chart.panels) == min(6, len(found["steps"][0]["answers"]))
-    damaged = json.loads(json.dumps(found))
+    assert [value for value, _ in chart.choices[0].options] == [step.command for step in found.steps]
+    assert len(chart.panels) == min(6, len(found.steps[0].answers))
+    damaged = found.to_table()
     damaged["steps"][0]["answers"][0]["median"].pop()
-    write_json(tmp_path / STEPS_FILE, damaged)
+    write_json(tmp_path / StepResponses.NAME, damaged)
     with pytest.raises(StorageError, match="other lengths"):
         read_steps(tmp_path)

@@ -78,8 +78,8 @@ class FmuEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._fmu = FmuInstance(archive, description)
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        self, *, seed: int | None = None, options: dict[str, object] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, object]]:
         """Begin an episode in steady state.
 
         Args:
@@ -102,7 +102,7 @@ class FmuEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._begun = True
         return row, self._info(row)
 
-    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, object]]:
         """Hold lever positions, shape (3,), for one tick.
 
         Raises:
@@ -167,7 +167,7 @@ class FmuEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             raise SimulationError(f"{self._where} answers '{name}' = {answers.min()} after {self._tick} ticks")
         return np.concatenate([answers, pilots]).astype(np.float32)
 
-    def _info(self, row: NDArray[np.float32]) -> dict[str, Any]:
+    def _info(self, row: NDArray[np.float32]) -> dict[str, object]:
         strokes = row[self._strokes].astype(float)
         tip = self._geometry.tip(strokes)
         return {"truth": dict(zip((*STROKES, *TIP), (*strokes.tolist(), *tip.tolist()), strict=True))}

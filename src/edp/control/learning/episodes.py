@@ -69,7 +69,7 @@ class TaskEpisodes:
         observations = gymnasium.spaces.Box(-MOST, MOST, (len(self.features.names),), np.float32)
         return observations, gymnasium.spaces.Box(-1.0, 1.0, (AXES,), np.float32)
 
-    def begin(self, lane: int, seed: int | None, rng: np.random.Generator) -> dict[str, Any]:
+    def begin(self, lane: int, seed: int | None, rng: np.random.Generator) -> dict[str, object]:
         """Begin an episode of one environment and return its description.
 
         Args:

@@ -49,7 +49,9 @@ class TaskEnvironment(gymnasium.Env[Row, Row]):
         self.observation_space, self.action_space = self._episodes.spaces
         self._under_way = False
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Row, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, object] | None = None
+    ) -> tuple[Row, dict[str, object]]:
         """Begin an episode.
 
         Args:
@@ -69,7 +71,7 @@ class TaskEnvironment(gymnasium.Env[Row, Row]):
         self._under_way = True
         return self._episodes.observation()[0], facts | {"position_m": float(self._episodes.position_m[0])}
 
-    def step(self, action: Any) -> tuple[Row, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Row, float, bool, bool, dict[str, object]]:
         """Hold an action, shape (3,), for `hold` ticks.
 
         Returns:
@@ -85,7 +87,7 @@ class TaskEnvironment(gymnasium.Env[Row, Row]):
         asked = finite_actions(action, (AXES,))
         rewards, lost, truncated = self._episodes.act(asked[None], np.ones(1, dtype=np.bool_))
         self._under_way = not bool(lost[0] or truncated[0])
-        info: dict[str, Any] = {"position_m": float(self._episodes.position_m[0])}
+        info: dict[str, object] = {"position_m": float(self._episodes.position_m[0])}
         if not self._under_way:
             info["score"] = dict(self._episodes.score(0))
         return self._episodes.observation()[0], float(rewards[0]), bool(lost[0]), bool(truncated[0]), info
@@ -115,7 +117,7 @@ def check_render(mode: Any) -> None:
         raise ConfigError(f"task environment: render_mode = {mode!r}; there is nothing to render, leave it out")
 
 
-def check_options(options: dict[str, Any] | None) -> None:
+def check_options(options: dict[str, object] | None) -> None:
     """Raise an error for options of a reset, since an episode follows from its seed.
 
     Raises:

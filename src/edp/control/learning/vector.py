@@ -78,8 +78,8 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv[Rows, Rows, NDArray[Any]]
         self._begun, self._ended = np.zeros(num_envs, dtype=np.bool_), np.zeros(num_envs, dtype=np.bool_)
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Rows, dict[str, Any]]:
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, object] | None = None
+    ) -> tuple[Rows, dict[str, object]]:
         """Begin episodes.
 
         Args:
@@ -103,7 +103,7 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv[Rows, Rows, NDArray[Any]]
         infos = self._begin(mask, seeds)
         return self._episodes.observation(), infos | {"position_m": self._episodes.position_m.copy()}
 
-    def step(self, actions: Any) -> tuple[Rows, Array, Bools, Bools, dict[str, Any]]:
+    def step(self, actions: Any) -> tuple[Rows, Array, Bools, Bools, dict[str, object]]:
         """Hold actions, shape (num_envs, 3), for `hold` ticks.
 
         Raises:
@@ -118,7 +118,7 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv[Rows, Rows, NDArray[Any]]
         again = self._ended.copy()
         rewards, lost, truncated = self._episodes.act(asked, ~again)
         self._ended = lost | truncated
-        infos: dict[str, Any] = {}
+        infos: dict[str, object] = {}
         for lane in np.flatnonzero(self._ended).tolist():
             infos = self._add_info(infos, {"score": dict(self._episodes.score(lane))}, lane)
         if again.any():
@@ -129,7 +129,9 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv[Rows, Rows, NDArray[Any]]
             infos = self._next_at_once(self._ended.copy(), infos)
         return self._episodes.observation(), rewards, lost, truncated, infos | {"position_m": position}
 
-    def _begin(self, mask: Bools, seeds: Sequence[int | None], infos: dict[str, Any] | None = None) -> dict[str, Any]:
+    def _begin(
+        self, mask: Bools, seeds: Sequence[int | None], infos: dict[str, object] | None = None
+    ) -> dict[str, object]:
         """Begin the masked episodes; returns what began."""
         infos = infos or {}
         for lane in np.flatnonzero(mask).tolist():
@@ -141,7 +143,7 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv[Rows, Rows, NDArray[Any]]
             self._begun[lane], self._ended[lane] = True, False
         return infos
 
-    def _next_at_once(self, ended: Bools, infos: dict[str, Any]) -> dict[str, Any]:
+    def _next_at_once(self, ended: Bools, infos: dict[str, object]) -> dict[str, object]:
         """Begin the next episodes in the step in which the last ones ended, and keep what these showed last."""
         last = np.full(self.num_envs, None, dtype=object)
         rows = self._episodes.observation()

@@ -290,7 +290,7 @@ class ScreeningResult:
     clusters: tuple[Cluster, ...]
     flags: tuple[Flag, ...]
     proposal: Proposal
-    options: dict[str, Any]
+    options: dict[str, object]
     seconds: dict[str, float]
 
     def curve(self, channel: str, target: str) -> LagCurve:
@@ -315,7 +315,7 @@ class ScreeningResult:
                 rows.append(LagRange(group, min(lags), max(lags), tuple(c.channel for c in sure), others))
         return tuple(rows)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Plain JSON values: arrays as lists, a number that is not finite as None."""
         plain: dict[str, Any] = _plain(self)
         plain["lag_table"] = _plain(self.lag_table())

@@ -142,7 +142,9 @@ class Network:
 class _Part:
     """Layer under construction: options, constants, and states of this and the other layers."""
 
-    def __init__(self, options: Mapping[str, Any], w: Mapping[str, np.ndarray], everything: dict[str, Held], own: Held):
+    def __init__(
+        self, options: Mapping[str, object], w: Mapping[str, np.ndarray], everything: dict[str, Held], own: Held
+    ):
         self.options, self.w, self.everything, self.m = options, w, everything, own
 
     def __getattr__(self, name: str) -> Any:

@@ -6,7 +6,6 @@ import io
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -76,7 +75,7 @@ class CasadiTarget:
         return write_export(folder, files)
 
 
-def content(described: Description) -> dict[str, Any]:
+def content(described: Description) -> dict[str, object]:
     """Return the description of the network in JSON types: common part, layers, states and rules."""
     graph = described.graph
     return described.content() | {
@@ -96,7 +95,7 @@ def arrays(graph: Graph) -> dict[str, np.ndarray]:
     return tensors | {"start": start(graph)}
 
 
-def _layer(layer: Layer) -> dict[str, Any]:
+def _layer(layer: Layer) -> dict[str, object]:
     if type(layer) not in KNOWN:
         raise ExportError(
             f"layer '{layer.name}' is a {type(layer).__name__}, which has no form in CasADi; "

@@ -38,7 +38,9 @@ def notes(described: Description) -> dict[str, str]:
     }
 
 
-def content(described: Description, files: Mapping[str, bytes], states: Sequence[State], opset: int) -> dict[str, Any]:
+def content(
+    described: Description, files: Mapping[str, bytes], states: Sequence[State], opset: int
+) -> dict[str, object]:
     """Return the description of the graphs in JSON types; `files` are the graphs, by kind."""
     graphs = {kind: _graph(described, kind, data, opset) for kind, data in files.items()}
     if "step" in graphs:
@@ -49,7 +51,7 @@ def content(described: Description, files: Mapping[str, bytes], states: Sequence
     return described.content() | {"rules": RULES, "graphs": graphs}
 
 
-def with_full_starts(about: dict[str, Any], states: Sequence[State]) -> dict[str, Any]:
+def with_full_starts(about: dict[str, Any], states: Sequence[State]) -> dict[str, object]:
     """`content` with whole arrays as the starts of states, for MATLAB."""
     # MATLAB has no rule for the short form of a start.
     step = about["graphs"]["step"]
@@ -57,7 +59,7 @@ def with_full_starts(about: dict[str, Any], states: Sequence[State]) -> dict[str
     return about | {"graphs": about["graphs"] | {"step": step | {"states": full}}}
 
 
-def _graph(described: Description, kind: str, data: bytes, opset: int) -> dict[str, Any]:
+def _graph(described: Description, kind: str, data: bytes, opset: int) -> dict[str, object]:
     ticks = described.graph.window if kind == "window" else 1
     return {
         "file": f"{described.name}_{kind}.onnx",

@@ -67,7 +67,7 @@ class Ros2Target:
         return write_export(folder, {file: text.encode() for file, text in files.items()})
 
 
-def _content(described: Description) -> dict[str, Any]:
+def _content(described: Description) -> dict[str, object]:
     """Return the description with names valid for parameters and messages.
 
     They are `shown_names` without ``=``, which ends the name in a parameter, and do not begin as a formula of a

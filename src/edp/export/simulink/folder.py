@@ -89,10 +89,10 @@ class Folder:
             about[side] = [entry | {"field": field} for entry, field in zip(about[side], fields, strict=True)]
         return about | {"rules": RULES, "status": list(STATUS)}
 
-    def tables(self) -> dict[str, Any]:
+    def tables(self) -> dict[str, object]:
         """Return the content of the MAT file without the golden recording."""
         low, high = input_limits(self.model.bundle.predictor)
-        tables: dict[str, Any] = {"edp": self.content()}
+        tables: dict[str, object] = {"edp": self.content()}
         if self.native is not None:
             ends = {"low": low, "high": high}
             tables |= {side: values.astype(np.float32).reshape(-1, 1) for side, values in ends.items()}

@@ -97,7 +97,7 @@ class Native:
         """Return the state of a layer."""
         return f"s.{self._fields[layer, part]}"
 
-    def weights(self) -> dict[str, Any]:
+    def weights(self) -> dict[str, object]:
         """All constants by field."""
         tensors = {
             (layer.name, part): values for layer in self.graph.layers for part, values in self.laid(layer).items()

@@ -89,9 +89,9 @@ def pieces(recordings: Sequence[NDArray[np.floating]], ticks: int) -> list[NDArr
     return cut
 
 
-def _before_weights(graph: Graph, rows: NDArray[np.floating]) -> dict[str, Any]:
+def _before_weights(graph: Graph, rows: NDArray[np.floating]) -> dict[str, object]:
     inside = integer_part(graph)
-    values: dict[str, Any] = {INPUT: np.asarray(rows, dtype=np.float32)[:, None]}
+    values: dict[str, object] = {INPUT: np.asarray(rows, dtype=np.float32)[:, None]}
     for layer in graph.layers:
         inputs_computed = layer.inputs and set(layer.inputs) <= set(values)
         if inputs_computed and layer.name not in inside and type(layer) in OVER_TIME:

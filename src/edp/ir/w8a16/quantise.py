@@ -75,7 +75,7 @@ class _Work:
 
     def gates(self, layer: Any, input_frac: int) -> dict[str, Any]:
         """Integer matrices of a recurrent layer."""
-        gate_constants: dict[str, Any] = {}
+        gate_constants: dict[str, object] = {}
         for side, frac in (("x", input_frac), ("h", fixed.UNIT_FRAC)):
             made_of = to_gates(f"{layer.name}/{side}", getattr(layer, f"weight_{side}"), frac, self.rounding)
             gate_constants |= {f"{key}_{side}": values for key, values in made_of.items()}

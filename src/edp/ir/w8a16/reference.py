@@ -62,7 +62,7 @@ class Integers:
         ticks = [self._together(inputs[at : at + 1]) for at in range(len(inputs))]
         return {name: np.concatenate([tick[name] for tick in ticks]) for name in (ticks[0] if ticks else ())}
 
-    def _together(self, inputs: NDArray[np.floating]) -> dict[str, Any]:
+    def _together(self, inputs: NDArray[np.floating]) -> dict[str, object]:
         """All ticks at once, layer by layer."""
         values: dict[str, Any] = {INPUT: np.asarray(inputs, dtype=np.float32)}
         for layer in self.graph.layers:

@@ -19,7 +19,9 @@ MOST_COARSE = 4.0
 """Times its own scale that a row may take, two bits of its weights; beyond, the network is refused."""
 
 
-def rows(matrix: str, weight: Array, bias: Array, formats: tuple[int, int], rounding: WeightRounding) -> dict[str, Any]:
+def rows(
+    matrix: str, weight: Array, bias: Array, formats: tuple[int, int], rounding: WeightRounding
+) -> dict[str, object]:
     """Weights ``(..., out, terms ...)``, biases ``(..., out)``, and the way from accumulators to `frac`.
 
     Args:

@@ -20,7 +20,7 @@ class EdpMetadata:
     rate_hz: float | None = None
     name: str | None = None
     source: str = ""
-    meta: Mapping[str, Any] = field(default_factory=dict)
+    meta: Mapping[str, object] = field(default_factory=dict)
     channels: Mapping[str, Channel] = field(default_factory=dict)
     truth: Mapping[str, Channel] = field(default_factory=dict)
     digest: str | None = None

@@ -35,7 +35,7 @@ class MatLayout:
     variable: str = "log"
     stamps: str = ""
 
-    def variables(self, recording: Recording) -> dict[str, Any]:
+    def variables(self, recording: Recording) -> dict[str, object]:
         """Return the variables of a file."""
         mat_values = {self.variable: self.build(recording)}
         return mat_values | {self.stamps: _time(recording)} if self.stamps else mat_values
@@ -46,7 +46,7 @@ LAYOUTS: Registry[MatLayout] = Registry("MAT layout")
 
 def _struct(recording: Recording) -> Any:
     """Return a struct of column vectors: ``log.time`` in seconds and one field per channel in SI units."""
-    fields: dict[str, Any] = {"time": _time(recording)}
+    fields: dict[str, object] = {"time": _time(recording)}
     for name in recording.channel_names:
         fields[name] = np.ascontiguousarray(recording.column(name)).reshape(-1, 1)
     return fields
@@ -144,7 +144,7 @@ def _dataset_of(recording: Recording, signals: list[tuple[str, str, Any]]) -> An
     return _saved(_DATASET, {"Name": np.array([""]), "Version": np.array([[3.0]]), "Storage": storage})
 
 
-def _saved(classname: str, fields: dict[str, Any]) -> MatlabOpaque:
+def _saved(classname: str, fields: dict[str, object]) -> MatlabOpaque:
     """Return an object as its ``saveobj`` stores it: a single property ``any`` with a struct."""
     struct = np.empty((1, 1), dtype=[(name, object) for name in fields])
     for name, value in fields.items():

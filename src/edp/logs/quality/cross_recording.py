@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import numpy as np
 
@@ -53,7 +52,7 @@ class DataQuality:
         every = [finding for report in self.reports for finding in report.findings]
         return verdict_of([*every, *self.findings])
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Plain values."""
         return {
             "verdict": self.verdict,

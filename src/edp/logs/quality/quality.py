@@ -110,9 +110,9 @@ class QualityReport:
         """Verdict: ``unusable``, ``check`` or ``good``."""
         return verdict_of(self.findings)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Plain JSON values; a number that is not finite becomes None."""
-        result: dict[str, Any] = plain({**asdict(self), "verdict": self.verdict})
+        result: dict[str, object] = plain({**asdict(self), "verdict": self.verdict})
         return result
 
 

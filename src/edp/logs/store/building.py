@@ -411,7 +411,7 @@ def _records_beside(top: Path, index: StoreIndex) -> Iterator[dict[str, Any]]:
                 yield record
 
 
-def _with_record(index: StoreIndex, record: dict[str, Any], logs: dict[str, StoredLog]) -> StoreIndex:
+def _with_record(index: StoreIndex, record: dict[str, object], logs: dict[str, StoredLog]) -> StoreIndex:
     """Return the index extended by the requested recordings of a batch."""
     batch = index_of(record, "record of a batch of the store")
     lists = list(index.lists)

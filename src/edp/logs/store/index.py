@@ -8,7 +8,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from edp.errors import ConfigError, DataError
 from edp.logs.formats.base import check_names
@@ -181,7 +180,7 @@ def checked_index(text: str, where: str) -> StoreIndex:
     return index
 
 
-def without_seal(table: dict[str, Any], where: str) -> dict[str, Any]:
+def without_seal(table: dict[str, object], where: str) -> dict[str, object]:
     """Return an index or the record of a batch without its hash, which is checked.
 
     Raises:
@@ -189,11 +188,11 @@ def without_seal(table: dict[str, Any], where: str) -> dict[str, Any]:
     """
     if table.get("schema") != UNSEALED_SCHEMA and HASH not in table:
         raise DataError(f"{where} is damaged: it lacks its hash ({HASH}); copy the store again, or {BUILD_AGAIN}")
-    plain: dict[str, Any] = unsealed(table, where, DataError)
+    plain: dict[str, object] = unsealed(table, where, DataError)
     return plain
 
 
-def index_of(table: dict[str, Any], where: str) -> StoreIndex:
+def index_of(table: dict[str, object], where: str) -> StoreIndex:
     """Build an index from JSON types, checking each type.
 
     Raises:
@@ -208,13 +207,13 @@ def index_of(table: dict[str, Any], where: str) -> StoreIndex:
     return index
 
 
-def plain_index(index: StoreIndex) -> dict[str, Any]:
+def plain_index(index: StoreIndex) -> dict[str, object]:
     """Convert an index to JSON types."""
-    plain: dict[str, Any] = _TREE.plain(index)
+    plain: dict[str, object] = _TREE.plain(index)
     return plain
 
 
-def write_plain(path: Path, plain: dict[str, Any]) -> None:
+def write_plain(path: Path, plain: dict[str, object]) -> None:
     """Write an index or the record of a batch under a hash, whole or not at all."""
     write_bytes(path, json.dumps(sealed(plain), allow_nan=False, separators=(",", ":")).encode())
 

@@ -70,7 +70,7 @@ def fit_dictionary(
     classes: Sequence[FaultClass],
     faults: Sequence[SimulatedFault],
     healthy: Sequence[Array],
-    provenance: Mapping[str, Any],
+    provenance: Mapping[str, object],
     seed: int = 0,
 ) -> Dictionary:
     """Fit signatures to all sessions; choose temperature, change fraction and bounds on left-out sessions.
@@ -112,7 +112,7 @@ def _dictionary(
     classes: Sequence[FaultClass],
     faults: Sequence[SimulatedFault],
     scatter: Scatter,
-    provenance: Mapping[str, Any],
+    provenance: Mapping[str, object],
 ) -> Dictionary:
     changes = np.array([fault.change for fault in faults]) @ scatter.matrix
     owner, sizes = [fault.owner for fault in faults], [fault.size for fault in faults]

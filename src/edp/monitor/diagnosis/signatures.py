@@ -52,7 +52,7 @@ class Dictionary:
     temperature: float = 4.0
     strange: float = 10.0
     confusions: tuple[Confusion, ...] = ()
-    provenance: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Mapping[str, object] = field(default_factory=dict)
 
     def rows_of(self, number: int) -> NDArray[np.int64]:
         """Signatures of a fault, the smallest size first."""

@@ -304,7 +304,7 @@ def rows_of(recording: Recording, names: Sequence[str]) -> Rows:
     return values
 
 
-def residual_labels(plain: Mapping[str, Any]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def residual_labels(plain: Mapping[str, object]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return inputs and units of a source from its plain values.
 
     Raises:

@@ -20,8 +20,9 @@ from edp.networks.heads import LinearHead
 from edp.networks.losses.mse import MeanSquared
 from edp.networks.predictor import ModelSpec
 from edp.settings.bounds import MOST_ROWS, MOST_UNITS, above, check_bounds, check_count, integer
+from edp.settings.provenance import Provenance
 from edp.training.bagging.spec import BaggingSpec
-from edp.training.bundle import Bundle
+from edp.training.bundle import Bundle, make_bundle
 from edp.training.fit import TrainingSpec, fit
 
 FOLDS = 2
@@ -78,8 +79,7 @@ class CommitteeOptions:
         bagging = BaggingSpec(folds=FOLDS, steps=steps, batch=BATCH, rows=self.rows, checks=5)
         training = TrainingSpec(loss=MeanSquared(), bagging=bagging, seed=material.seed, device="cpu")
         fitted = fit(data, model, training)
-        facts = {"seconds": fitted.seconds}
-        return Bundle(fitted.predictor, data.inputs, data.target_kinds, data.descriptions, facts), data
+        return make_bundle(fitted.predictor, data, Provenance(seconds=fitted.seconds)), data
 
 
 def constant_channels(material: FitMaterial) -> set[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as functional
@@ -40,7 +40,7 @@ class AttentionBridge:
     """
 
     slot: ClassVar[BlockSlot] = BlockSlot.CHANNELS
-    space: ClassVar[dict[str, Any]] = {"heads": (2, 4)}
+    space: ClassVar[dict[str, object]] = {"heads": (2, 4)}
     heads: int = 4
 
     def __post_init__(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from torch import Tensor, nn
 
@@ -23,7 +23,7 @@ class CrossCylinderAttention:
     """
 
     slot: ClassVar[BlockSlot] = BlockSlot.MIX
-    space: ClassVar[dict[str, Any]] = {}
+    space: ClassVar[dict[str, object]] = {}
 
     def conflicts(self, model: ModelView, task: TaskView) -> str | None:
         """Return the conflict with a single output, which has no other output to attend to."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -30,7 +30,7 @@ class CylinderGate:
     """
 
     slot: ClassVar[BlockSlot] = BlockSlot.GATE
-    space: ClassVar[dict[str, Any]] = {"form": ("diagonal", "linear")}
+    space: ClassVar[dict[str, object]] = {"form": ("diagonal", "linear")}
     form: str = "diagonal"
 
     def __post_init__(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from torch import Tensor, nn
 
@@ -23,7 +23,7 @@ class GlobalAveragePooling:
     """
 
     slot: ClassVar[BlockSlot] = BlockSlot.FEATURES
-    space: ClassVar[dict[str, Any]] = {}
+    space: ClassVar[dict[str, object]] = {}
 
     def extra(self, width: int) -> int:
         """Features added for recurrent states of `width`."""

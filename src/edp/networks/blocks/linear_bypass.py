@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as functional
@@ -36,7 +36,7 @@ class LinearBypass:
     """
 
     slot: ClassVar[BlockSlot] = BlockSlot.BYPASS
-    space: ClassVar[dict[str, Any]] = {"taps": (5, 50), "start": STARTS}
+    space: ClassVar[dict[str, object]] = {"taps": (5, 50), "start": STARTS}
     taps: int = 25
     start: str = "ridge"
     trained: bool = True

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -36,7 +36,7 @@ class MachineCode:
     """
 
     slot: ClassVar[BlockSlot] = BlockSlot.CHANNELS
-    space: ClassVar[dict[str, Any]] = {}
+    space: ClassVar[dict[str, object]] = {}
     size: int = 16
 
     def __post_init__(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -30,7 +30,7 @@ class MultiScaleTcn:
     """
 
     slot: ClassVar[BlockSlot] = BlockSlot.BRANCHES
-    space: ClassVar[dict[str, Any]] = {"first_dilations": ((1, 4), (1, 8))}
+    space: ClassVar[dict[str, object]] = {"first_dilations": ((1, 4), (1, 8))}
     first_dilations: tuple[int, ...] = (1, 4)
 
     def __post_init__(self) -> None:

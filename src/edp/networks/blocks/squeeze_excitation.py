@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -32,7 +32,7 @@ class SqueezeExcitation:
     """
 
     slot: ClassVar[BlockSlot] = BlockSlot.CHANNELS
-    space: ClassVar[dict[str, Any]] = {"reduction": (2, 4, 8)}
+    space: ClassVar[dict[str, object]] = {"reduction": (2, 4, 8)}
     reduction: int = 4
 
     def __post_init__(self) -> None:

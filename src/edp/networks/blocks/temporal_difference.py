@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ class TemporalDifference:
     """Concatenate ``h_t - h_{t-1}`` to the representation; before the first tick h is zero, as at reset."""
 
     slot: ClassVar[BlockSlot] = BlockSlot.FEATURES
-    space: ClassVar[dict[str, Any]] = {}
+    space: ClassVar[dict[str, object]] = {}
 
     def extra(self, width: int) -> int:
         """Features added for recurrent states of `width`."""

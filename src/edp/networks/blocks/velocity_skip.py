@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -23,7 +23,7 @@ class VelocitySkip:
     """
 
     slot: ClassVar[BlockSlot] = BlockSlot.BYPASS
-    space: ClassVar[dict[str, Any]] = {}
+    space: ClassVar[dict[str, object]] = {}
 
     def conflicts(self, model: ModelView, task: TaskView) -> str | None:
         """Delta mode and a physics base add the velocity already, and its present value must be known."""

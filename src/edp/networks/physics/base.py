@@ -6,7 +6,7 @@ import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -50,7 +50,7 @@ class PhysicsSpec(ABC):
         ConfigError: another pose.
     """
 
-    space: ClassVar[dict[str, Any]] = {}
+    space: ClassVar[dict[str, object]] = {}
     machine: str = "M22"
     pose: str = "angles"
 

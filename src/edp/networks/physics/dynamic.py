@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -40,7 +40,7 @@ class DynamicSpec(PhysicsSpec):
         ConfigError: an unknown load or a negative time.
     """
 
-    space: ClassVar[dict[str, Any]] = {"load": LOADS, "fade_s": (0.0, 0.2)}
+    space: ClassVar[dict[str, object]] = {"load": LOADS, "fade_s": (0.0, 0.2)}
     load: str = "all"
     # 0.03 s: measured compromise between boom and bucket at k = 10 (docs/findings.md, fading acceleration).
     fade_s: float = 0.03

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -31,7 +31,7 @@ class HybridPhysicsSpec(DynamicSpec):
         ConfigError: coupled without the whole load.
     """
 
-    space: ClassVar[dict[str, Any]] = {**DynamicSpec.space, "coupled": (False, True)}
+    space: ClassVar[dict[str, object]] = {**DynamicSpec.space, "coupled": (False, True)}
     coupled: bool = False
 
     def __post_init__(self) -> None:

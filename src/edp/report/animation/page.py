@@ -267,7 +267,7 @@ def side_view(scene: Scene) -> Markup:
     return Markup(template("side_view.jinja").module.side_view(**animation_parts(scene)))  # type: ignore[attr-defined]
 
 
-def _plain(scene: Scene) -> dict[str, Any]:
+def _plain(scene: Scene) -> dict[str, object]:
     machine = scene.machine
     return {
         "rate": FRAMES_PER_S,
@@ -302,7 +302,7 @@ def _gappy(values: Array | None) -> list[float | None] | None:
     return [round(float(v), places) if math.isfinite(v) else None for v in values]
 
 
-def geometry_of(machine: Machine) -> dict[str, Any]:
+def geometry_of(machine: Machine) -> dict[str, object]:
     """What ``side_view.js`` draws a machine from: lengths (m) and angles (degrees) as plain JSON values."""
     return {
         "length": machine.bodies.length,

@@ -45,7 +45,7 @@ LEGENDS = {
     "right": {"orientation": "v", "x": 1.01, "y": 1, "yref": "paper", "xanchor": "left"},
     "none": {},
 }
-Trace = dict[str, Any]
+Trace = dict[str, object]
 """A trace in plotly's words."""
 _FIELD = re.compile(r"\{(x|y|z|label)(?::([^{}]*?)(g?))?\}")
 
@@ -58,7 +58,7 @@ class Plot:
     figure: go.Figure
     controls: tuple[Control, ...] = ()
 
-    def spec(self) -> dict[str, Any]:
+    def spec(self) -> dict[str, object]:
         """What the page's script needs, ready for JSON."""
         keeps = {control.key: control.keeps_zoom for control in self.controls}
         return {"name": self.name, "figure": json.loads(self.figure.to_json()), "controls": keeps}
@@ -112,7 +112,7 @@ def plot(chart: Chart, title: str = "") -> Plot:
     return Plot(chart.name, figure, tuple(c for c in chart.choices if len(c.options) > 1 or c.alone))
 
 
-def _put(table: dict[str, Any], changes: Mapping[str, Any]) -> None:
+def _put(table: dict[str, Any], changes: Mapping[str, object]) -> None:
     """Changes into a table, key by key; a table in it keeps what is not changed."""
     for key, value in changes.items():
         if isinstance(value, dict) and isinstance(table.get(key), dict):
@@ -144,7 +144,7 @@ def _grid(chart: Chart) -> go.Figure:
     )  # fmt: skip
 
 
-def _frame(chart: Chart) -> dict[str, Any]:
+def _frame(chart: Chart) -> dict[str, object]:
     """What all panels share."""
     top = (46 if any(panel.title for panel in chart.panels) else 26) + (0 if chart.legend == "none" else 20)
     return {
@@ -163,8 +163,8 @@ def _frame(chart: Chart) -> dict[str, Any]:
     }
 
 
-def _axis(axis: ChartAxis, upright: bool) -> dict[str, Any]:
-    options: dict[str, Any] = {
+def _axis(axis: ChartAxis, upright: bool) -> dict[str, object]:
+    options: dict[str, object] = {
         "visible": axis.shown,
         "gridcolor": RULE,
         "linecolor": FRAME,
@@ -191,12 +191,12 @@ def _axis(axis: ChartAxis, upright: bool) -> dict[str, Any]:
     return options | ({"tickangle": -axis.slant} if axis.slant else {})
 
 
-def _rule(rule: GuideLine, across: str, upwards: str) -> dict[str, Any]:
+def _rule(rule: GuideLine, across: str, upwards: str) -> dict[str, object]:
     """A line or a stripe through a panel, from edge to edge, as a shape."""
     way, other = ("x", "y") if rule.x is not None else ("y", "x")
     at = rule.x if rule.x is not None else rule.y
     refs = {"x": across, "y": upwards}
-    shape: dict[str, Any] = {
+    shape: dict[str, object] = {
         f"{way}0": at, f"{way}1": at if rule.to is None else rule.to, f"{way}ref": refs[way],
         f"{other}0": 0, f"{other}1": 1, f"{other}ref": f"{refs[other]} domain",
     }  # fmt: skip
@@ -258,7 +258,7 @@ def _(mark: Bars) -> list[Trace]:
 def _(mark: Cells) -> list[Trace]:
     rounded = [[finite_or_none(value) for value in row] for row in np.asarray(mark.values, dtype=float).tolist()]
     steps = np.linspace(0.0, 1.0, len(mark.scale)).tolist()
-    bar: dict[str, Any] = {
+    bar: dict[str, object] = {
         "title": {"text": _text(mark.unit), "font": {"size": 12, "color": SOFT}},
         "tickfont": {"size": 11, "color": INK},
         "thickness": 10,
@@ -290,7 +290,7 @@ def _(mark: Texts) -> list[Trace]:
     }]  # fmt: skip
 
 
-def _hover(mark: Mark) -> dict[str, Any]:
+def _hover(mark: Mark) -> dict[str, object]:
     """The text at a point, in plotly's form."""
     if mark.hover is None:
         return {"hoverinfo": "skip"}
@@ -309,7 +309,7 @@ def _hover(mark: Mark) -> dict[str, Any]:
     return options
 
 
-def _interval(values: Any, low: Any, high: Any, colour: str) -> dict[str, Any]:
+def _interval(values: Any, low: Any, high: Any, colour: str) -> dict[str, object]:
     up = [None if h is None or v is None else max(h - v, 0.0) for v, h in zip(values, high, strict=True)]
     down = [None if w is None or v is None else max(v - w, 0.0) for v, w in zip(values, low, strict=True)]
     thin = {"thickness": 1.4, "width": 3.5}
@@ -321,7 +321,7 @@ def finite_or_none(value: float) -> float | None:
     return round(value, 4) if math.isfinite(value) else None
 
 
-def _along(x: Positions | Evenly) -> dict[str, Any]:
+def _along(x: Positions | Evenly) -> dict[str, object]:
     return {"x0": x.start, "dx": x.step} if isinstance(x, Evenly) else {"x": _escaped(x)}
 
 

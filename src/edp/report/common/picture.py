@@ -166,7 +166,7 @@ def draw(figure: Figure, chart: Chart) -> None:
         figure.suptitle(chart.title, x=0.01, ha="left", fontsize=11, weight="bold")
 
 
-def _panel(axes: Axes, panel: Panel, entries: dict[str, Any]) -> None:
+def _panel(axes: Axes, panel: Panel, entries: dict[str, object]) -> None:
     second: Any = axes.twinx() if panel.second is not None else None
     names = {way: _names(panel, way) for way in "xy"}
     beside = [mark for mark in panel.marks if isinstance(mark, Bars)]

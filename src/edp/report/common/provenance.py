@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from edp.errors import count_of
+from edp.settings.provenance import Provenance
 from edp.wording import count_text, duration, figure, moment
 
 _TEXTS = (
@@ -15,33 +15,30 @@ _TEXTS = (
 )  # fmt: skip
 
 
-def provenance_rows(provenance: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+def provenance_rows(provenance: Provenance | None) -> list[tuple[str, str]]:
     """Return label and text of each stated part of a provenance; empty without a provenance."""
-    source = provenance or {}
-    contact, data = (_table(source.get(name)) for name in ("ground_data", "data"))
-    seconds, parameters, rate = source.get("seconds"), source.get("parameters"), data.get("rate_hz")
-    rows: list[tuple[str, Any]] = [("Created", moment(source.get("created")))]
-    rows += [(label, source.get(name)) for label, name in _TEXTS]
+    if provenance is None:
+        return []
+    data, more, seconds = provenance.origin, provenance.more, provenance.seconds
+    contact, parameters = more.get("ground_data"), more.get("parameters")
+    texts = {"command": provenance.command, "edp_version": provenance.edp_version, "seed": provenance.seed, **more}
+    rows: list[tuple[str, Any]] = [("Created", moment(provenance.created))]
+    rows += [(label, texts.get(name)) for label, name in _TEXTS]
     rows += [
-        ("Training time", duration(seconds) if isinstance(seconds, int | float) else ""),
+        ("Training time", "" if seconds is None else duration(seconds)),
         ("Parameters", "" if parameters is None else count_text(parameters)),
-        ("Data", data.get("source")),
-        ("Data with ground contact", contact.get("source")),
-        ("Data digest", data.get("digest")),
-        ("Rate", f"{figure(rate)} Hz" if isinstance(rate, int | float) else ""),
+        ("Data", data.source),
+        ("Data with ground contact", contact.get("source") if isinstance(contact, dict) else None),
+        ("Data digest", data.digest),
+        ("Rate", "" if data.rate_hz is None else f"{figure(data.rate_hz)} Hz"),
     ]
-    for part in ("train", "validation", "test"):
-        facts = _table(data.get(part))
-        if facts:
-            length = "" if facts.get("hours") is None else f", {_length_text(facts['hours'])}"
-            rows.append((part.capitalize(), f"{count_of(facts.get('recordings'), 'recording')}{length}"))
-    rows += [(key.replace("_", " ").capitalize(), value) for key, value in _table(source.get("environment")).items()]
+    for name in ("train", "validation", "test"):
+        part = data.part(name)
+        if part is not None:
+            rows.append((name.capitalize(), f"{count_of(part.recordings, 'recording')}, {_length_text(part.hours)}"))
+    rows += [(key.replace("_", " ").capitalize(), value) for key, value in provenance.environment.items()]
     return [(label, str(value)) for label, value in rows if value is not None and value != ""]
 
 
 def _length_text(hours: float) -> str:
     return f"{figure(hours, 3)} h" if hours >= 0.1 else f"{figure(60 * hours, 3)} min"
-
-
-def _table(value: Any) -> Mapping[str, Any]:
-    return value if isinstance(value, Mapping) else {}

@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError, DataError, count_of
+from edp.evaluation.free_run_file import TWIN, ChannelErrors
 from edp.report.run.facts import NETWORK, TRUTH, Facts, label_of, read_facts, read_history
-from edp.report.twin.facts import TWIN, holds_free_runs, read_free_runs
+from edp.report.twin.facts import holds_free_runs, read_free_runs
+from edp.settings.provenance import Provenance
 from edp.storage import read_object
 from edp.storage.paths import full_path, is_file_at
 from edp.storage.runs import unfinished_text
@@ -79,7 +81,7 @@ class ComparedRun:
     kind: str
     label: str
     errors: Mapping[Measure, Mapping[str, float]]
-    curves: Mapping[str, tuple[Sequence[float], Sequence[float]]] = field(default_factory=dict)
+    curves: Mapping[str, tuple[Sequence[float], Sequence[float | None]]] = field(default_factory=dict)
     history: tuple[Mapping[str, Any], ...] = ()
     costs: Mapping[str, float] = field(default_factory=dict)
     digest: str = ""
@@ -153,7 +155,7 @@ def _network(path: Path, name: str) -> ComparedRun:
         whole = read_facts(full_path(path).parent)
     errors: dict[Measure, dict[str, float]] = {}
     horizons = {str(horizon) for horizon in facts.horizons}
-    for recording, by_horizon in facts.models[NETWORK].get("recordings", {}).items():
+    for recording, by_horizon in facts.models[NETWORK].recordings.items():
         for horizon, scores in by_horizon.items():
             for output, unit in _outputs(facts) if horizon in horizons else ():
                 alone = output == MEAN or len(facts.targets) == 1
@@ -176,7 +178,7 @@ def _network(path: Path, name: str) -> ComparedRun:
         targets=tuple((target.name, target.factor) for target in facts.targets),
         horizons=facts.horizons,
         rate_hz=facts.rate_hz,
-        skip=int((facts.scores or {}).get("task", {}).get("skip", 0)),
+        skip=facts.scores.task.skip,
     )
 
 
@@ -188,9 +190,8 @@ def _outputs(facts: Facts) -> list[tuple[str, str]]:
     return [(MEAN, facts.unit), *outputs] if facts.averaged else outputs
 
 
-def _digest(provenance: Mapping[str, Any] | None) -> str:
-    data = (provenance or {}).get("data", {})
-    return str(data.get("digest") or "") if isinstance(data, Mapping) else ""
+def _digest(provenance: Provenance | None) -> str:
+    return "" if provenance is None else provenance.origin.digest or ""
 
 
 def _costs(facts: Facts) -> dict[str, float]:
@@ -220,12 +221,12 @@ def _twin(path: Path, name: str) -> ComparedRun:
     facts = read_free_runs(path)
     twin = facts.twin
     errors: dict[Measure, dict[str, float]] = {}
-    for recording, scores in twin["by_recording"].items():
-        for end in scores["stroke_error"]:
-            _add(errors, end, recording, f"stroke error after {figure(end['at_s'])} s", float(end["at_s"]))
-        _add(errors, scores["velocity_mae"], recording, "velocity error over the run", float(twin["seconds"]))
-    strokes = twin["by_horizon"]["strokes"]["by_channel"]
-    curves = {output: (twin["by_horizon"]["seconds"], values) for output, values in strokes.items()}
+    for recording, scores in twin.by_recording.items():
+        for end in scores.stroke_error:
+            _add(errors, end, recording, f"stroke error after {figure(end.at_s)} s", end.at_s)
+        _add(errors, scores.velocity_mae, recording, "velocity error over the run", twin.seconds)
+    horizons = twin.by_horizon
+    curves = {output: (horizons.seconds, values) for output, values in horizons.strokes.by_channel.items()}
     history = path / "history.jsonl"
     return ComparedRun(
         name=name,
@@ -235,7 +236,7 @@ def _twin(path: Path, name: str) -> ComparedRun:
         errors=errors,
         curves=curves,
         history=read_history(history) if is_file_at(history) else (),
-        costs=_positive({"Parameters": facts.provenance.get("parameters")}),
+        costs=_positive({"Parameters": facts.provenance.more.get("parameters")}),
         digest=_digest(facts.provenance),
     )
 
@@ -244,14 +245,12 @@ def _has_header(path: Path) -> bool:
     return is_file_at(path / HEADER)
 
 
-def _add(errors: dict[Measure, dict[str, float]], row: Mapping[str, Any], recording: str, what: str, at: float) -> None:
+def _add(errors: dict[Measure, dict[str, float]], row: ChannelErrors, recording: str, what: str, at: float) -> None:
     """The errors of one recording: their mean, where the channels share a unit, and each channel's own."""
-    shared = str(row["unit"] or "")
-    values = ({MEAN: row["mean"]} if shared and len(row["by_channel"]) > 1 else {}) | dict(row["by_channel"])
+    values = ({MEAN: row.mean} if row.unit and len(row.by_channel) > 1 else {}) | dict(row.by_channel)
     for output, value in values.items():
         if value is not None:
-            unit = str(row.get("units", {}).get(output) or shared)
-            errors.setdefault(Measure(output, at, unit, what), {})[recording] = float(value)
+            errors.setdefault(Measure(output, at, row.unit_of(output), what), {})[recording] = value
 
 
 def recording_that_differs(first: ComparedRun, second: ComparedRun, names: set[str]) -> str:

@@ -37,7 +37,7 @@ class ControlFacts:
     @property
     def loops(self) -> Sequence[Mapping[str, Any]]:
         """Name, seed, score, times and events of each loop."""
-        loops: Sequence[Mapping[str, Any]] = self.content["loops"]
+        loops: Sequence[Mapping[str, object]] = self.content["loops"]
         return loops
 
 

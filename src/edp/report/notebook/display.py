@@ -33,13 +33,13 @@ class NotebookFigure(go.Figure):  # type: ignore[misc]  # plotly has no types
     def _repr_html_(self) -> None:
         """Return None, since converters prefer HTML to the picture, and plotly's HTML loads a script."""
 
-    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None, **options: Any) -> dict[str, Any]:
+    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None, **options: Any) -> dict[str, object]:
         """Return the figure for plotly's extension, and a form that every other reader of the notebook shows.
 
         Figures of EDP have a picture. One that was changed since has HTML with plotly's script within.
         """
         content = self.to_json()
-        bundle: dict[str, Any] = {PLOTLY: json.loads(content), "text/plain": type(self).__name__}
+        bundle: dict[str, object] = {PLOTLY: json.loads(content), "text/plain": type(self).__name__}
         if self._chart is not None and content == self._unchanged:
             bundle["image/png"] = base64.b64encode(draw_png(self._chart, DPI)).decode("ascii")
         else:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from edp.evaluation.guard import MEASURE_NAME
-from edp.evaluation.scores_file import nearest_to_shown
+from edp.evaluation.scores_file import SpeedBin, nearest_to_shown
 from edp.report.common.chart import (
     BLUE,
     GREY,
@@ -70,8 +70,8 @@ def name_of(facts: Facts, model: str) -> str:
 
 def interval_name(facts: Facts) -> str:
     """The interval that is drawn, in a legend."""
-    rows = facts.models.get(NETWORK, {}).get("intervals", {}).get(str(main_horizon(facts)), ())
-    coverages = [row["coverage"] for row in rows]
+    rows = facts.models[NETWORK].intervals.get(str(main_horizon(facts)), ()) if NETWORK in facts.models else ()
+    coverages = [row.coverage for row in rows]
     return f"{100 * coverages[nearest_to_shown(coverages)]:.0f} % interval" if coverages else "Interval"
 
 
@@ -99,7 +99,7 @@ def _horizons(facts: Facts, horizons: Sequence[int], keeps_zoom: bool = False) -
     )
 
 
-def _network_last(models: Mapping[str, Any]) -> list[str]:
+def _network_last(models: Mapping[str, object]) -> list[str]:
     """Models in the order in which they are drawn: the network above all others."""
     return sorted(models, key=lambda name: name == NETWORK)
 
@@ -193,8 +193,8 @@ def horizon_chart(facts: Facts) -> Chart | None:
     return Chart("horizon", (Panel(tuple(marks), across, _error_axis(facts)),), height=340, together=True)
 
 
-def _band(row: Mapping[str, Any]) -> str:
-    return f"{row['low']:.3g}–{row['high']:.3g}"
+def _band(row: SpeedBin) -> str:
+    return f"{row.low:.3g}–{row.high:.3g}"
 
 
 def speed_chart(facts: Facts) -> Chart | None:
@@ -208,12 +208,16 @@ def speed_chart(facts: Facts) -> Chart | None:
         bands, when = figures.speed_bands(facts, horizon), {"horizon": str(horizon)}
         for name in _network_last(bands):
             labels = [_band(row) for row in bands[name]]
-            errors.append(DataSeries(x=labels, y=[row["mae"] for row in bands[name]], when=when, **_look(facts, name)))
+            errors.append(
+                DataSeries(
+                    x=labels, y=[row.mae if row.count else None for row in bands[name]], when=when, **_look(facts, name)
+                )
+            )
         rows = next(iter(bands.values()))
-        total = sum(row["count"] or 0 for row in rows) or 1
+        total = sum(row.count for row in rows) or 1
         counts.append(Bars(
             positions=[_band(row) for row in rows], colours=["#d3dae1"] * len(rows), when=when,
-            values=[100 * (row["count"] or 0) / total for row in rows], hover="{y:.3g} % of the samples", remark="",
+            values=[100 * row.count / total for row in rows], hover="{y:.3g} % of the samples", remark="",
         ))  # fmt: skip
     across = ChartAxis(with_unit("Speed band", facts.unit), kind="names")
     panels = (
@@ -282,21 +286,21 @@ def learning_chart(facts: Facts) -> Chart | None:
 def signal_chart(facts: Facts) -> Chart | None:
     """The inputs over the time of one recording, a panel a unit; None where none were kept."""
     name = signals_of(facts)
-    channels = (facts.scores or {}).get(INPUTS, ())
+    channels = () if facts.scores is None else facts.scores.inputs
     if not name or not channels:
         return None
     values, rate = facts.predictions[name][INPUTS], facts.rate_hz or 1.0
     by_unit: dict[str, list[int]] = {}
     for column, channel in enumerate(channels):
         # Numbers without a unit have no common axis: each stands alone.
-        by_unit.setdefault(channel["unit"] if channel["unit"] != "1" else f"1 {column}", []).append(column)
-    panels, names = [], short_labels(channel["name"] for channel in channels)
+        by_unit.setdefault(channel.unit if channel.unit != "1" else f"1 {column}", []).append(column)
+    panels, names = [], short_labels(channel.name for channel in channels)
     for columns in list(by_unit.values())[:MOST_PANELS]:
-        unit = channels[columns[0]]["unit"]
+        unit = channels[columns[0]].unit
         marks: list[Mark] = []
         labels = [names[column] for column in columns[:MOST_SERIES]]
         for label, column, colour in zip(labels, columns, (BLUE, *SHADES)):
-            y = np.asarray(values[:, column] * channels[column]["factor"] + display_offset(unit), dtype=np.float32)
+            y = np.asarray(values[:, column] * channels[column].factor + display_offset(unit), dtype=np.float32)
             selected = figures.downsample(y, POINTS)
             x = (selected / rate).astype(np.float32)
             marks.append(DataSeries(x=x, y=y[selected], name=label, colour=colour, width=1.2))

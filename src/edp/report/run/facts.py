@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +12,13 @@ from numpy.typing import NDArray
 
 from edp.errors import DataError, StorageError, count_of
 from edp.evaluation.guard import MEASURE, MEASURE_NAME, network_verdict
-from edp.evaluation.scores_file import read_scores
+from edp.evaluation.scores_file import MEAN, ModelScores, ScoredTarget, ScoresFile, error_at
 from edp.report.run.outputs import by_output, judged_line, losses_line, minutes_of, situation_line
-from edp.signals import display_offset
+from edp.settings.provenance import DataOrigin, Provenance
 from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, parse_toml, read_json, read_object, read_text
 from edp.storage.headers import check_files
 from edp.storage.paths import is_file_at, is_folder_at
+from edp.storage.provenance import PROVENANCE
 from edp.storage.runs import unfinished_text
 from edp.storage.seals import HASH, check_sealed_line, is_sealed_line
 from edp.wording import decimals_for, figure, interval, interval_decimals, listed, number, percent, unit_text
@@ -45,24 +45,6 @@ METRICS = ("rmse", "mae", "p95", "p99", "r2", "bias", "composite")
 
 
 @dataclass(frozen=True)
-class Target:
-    """One output of the model.
-
-    Values in `unit` are SI values times `factor` plus `offset`; differences have no offset.
-    """
-
-    name: str
-    description: str
-    unit: str
-    factor: float
-
-    @property
-    def offset(self) -> float:
-        """See `edp.signals.display_offset`."""
-        return display_offset(self.unit)
-
-
-@dataclass(frozen=True)
 class Facts:
     """What a run folder holds; a part that is missing is None or empty, and `absent` names its file.
 
@@ -76,9 +58,9 @@ class Facts:
 
     folder: Path
     config: str | None = None
-    provenance: Mapping[str, Any] | None = None
+    provenance: Provenance | None = None
     history: tuple[Mapping[str, Any], ...] = ()
-    scores: Mapping[str, Any] | None = None
+    scores: ScoresFile | None = None
     footprint: Mapping[str, Any] | None = None
     predictions: Mapping[str, Mapping[str, NDArray[np.floating]]] = field(default_factory=dict)
     absent: tuple[str, ...] = ()
@@ -86,32 +68,27 @@ class Facts:
     foundation: Mapping[str, Any] | None = None
 
     @property
-    def targets(self) -> tuple[Target, ...]:
+    def targets(self) -> tuple[ScoredTarget, ...]:
         """The outputs, in the order of the arrays."""
-        rows = (self.scores or {}).get("targets", ())
-        return tuple(
-            Target(
-                row["name"], row.get("description") or row["name"], row.get("unit", ""), float(row.get("factor", 1.0))
-            )
-            for row in rows
-        )
+        targets = () if self.scores is None else self.scores.targets
+        return tuple(replace(target, description=target.description or target.name) for target in targets)
 
     @property
     def horizons(self) -> tuple[int, ...]:
         """Samples ahead, in the order of the arrays."""
-        return tuple(int(k) for k in (self.scores or {}).get("task", {}).get("horizons", ()))
+        return () if self.scores is None else self.scores.task.horizons
 
     @property
     def rate_hz(self) -> float | None:
         """Samples per second, or None where the run does not say."""
-        task_rate = (self.scores or {}).get("task", {}).get("rate_hz")
-        rate = task_rate or (self.provenance or {}).get("data", {}).get("rate_hz")
+        task_rate = None if self.scores is None else self.scores.task.rate_hz
+        rate = task_rate or (None if self.provenance is None else self.provenance.origin.rate_hz)
         return float(rate) if rate else None
 
     @property
-    def models(self) -> dict[str, Mapping[str, Any]]:
+    def models(self) -> dict[str, ModelScores]:
         """Scored models by name, the network first."""
-        models = dict((self.scores or {}).get("models", {}))
+        models = {} if self.scores is None else self.scores.models
         return {name: models[name] for name in sorted(models, key=lambda name: name != NETWORK)}
 
     @property
@@ -156,13 +133,13 @@ def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts
     def json_part(name: str) -> Any:
         return None if name in absent else read_object(folder / name)
 
-    provenance = json_part("provenance.json")
+    provenance = None if PROVENANCE in absent else Provenance.read(folder)
     facts = Facts(
         folder=folder,
         config=None if "config.toml" in absent else read_settings(folder / "config.toml"),
         provenance=provenance,
         history=() if "history.jsonl" in absent else read_history(folder / "history.jsonl"),
-        scores=None if "scores.json" in absent else read_scores(folder / "scores.json"),
+        scores=None if "scores.json" in absent else ScoresFile.read(folder),
         footprint=json_part("footprint.json"),
         predictions={} if "predictions.safetensors" in absent else _read_predictions(folder),
         absent=absent,
@@ -170,7 +147,7 @@ def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts
         foundation=_read_foundation(folder),
     )
     if facts.scores is not None and facts.predictions:
-        check_files(facts.scores, folder, f"write it again with `edp evaluate {folder}`")
+        check_files(facts.scores.files, folder, f"write it again with `edp evaluate {folder}`")
     _check_predictions(facts)
     return facts
 
@@ -217,15 +194,15 @@ def read_history(path: Path) -> tuple[Mapping[str, Any], ...]:
     return tuple(epochs)
 
 
-def read_limit(path: Path | None, provenance: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+def read_limit(path: Path | None, provenance: Provenance | None) -> Mapping[str, Any] | None:
     """The limit in a file, or in the folder that the run's data came from; None where there is none.
 
     Raises:
         StorageError: the file that was named is missing, or a limit is damaged.
     """
     if path is None:
-        data = (provenance or {}).get("data", {})
-        source = Path(str((data.get("reader") or {}).get("path") or data.get("source") or ""))
+        origin = DataOrigin() if provenance is None else provenance.origin
+        source = Path(str(origin.reader.get("path") or origin.source or ""))
         path = source / LIMIT_FILE
         if not is_folder_at(source) or not is_file_at(path):
             return None
@@ -273,7 +250,7 @@ def _check_predictions(facts: Facts) -> None:
         truth = parts[TRUTH]
         for name, array in parts.items():
             expected_shape = (
-                (len(truth), len(facts.targets if name == TRUTH else facts.scores.get("inputs", ())))
+                (len(truth), len(facts.targets if name == TRUTH else facts.scores.inputs))
                 if name in (TRUTH, INPUTS)
                 else (
                     len(truth),
@@ -300,39 +277,77 @@ def main_horizon(facts: Facts) -> int | None:
     return max(facts.horizons, default=None)
 
 
-def score(model: Mapping[str, Any], horizon: int, metric: str = MEASURE, output: str = "mean") -> float | None:
-    """One overall score of a model, or None where it was not computed."""
-    value = model.get("overall", {}).get(str(horizon), {}).get(output, {}).get(metric)
-    return None if value is None or not math.isfinite(value) else float(value)
+def score(model: ModelScores | None, horizon: int, metric: str = MEASURE, output: str = MEAN) -> float | None:
+    """Return an overall score of a model, or None where it was not computed."""
+    return None if model is None else error_at(model.overall, horizon, output, metric)
 
 
 def label_of(facts: Facts, name: str) -> str:
     """How the report calls a model."""
-    return str(facts.models.get(name, {}).get("label") or name.replace("_", " "))
+    model = facts.models.get(name)
+    return (model.label if model else "") or name.replace("_", " ")
 
 
-def comparison_rows(facts: Facts, horizon: int | None = None) -> list[dict[str, Any]]:
-    """One row per scored model, least error (`MEASURE`) first, in report units.
+@dataclass(frozen=True, kw_only=True)
+class ComparisonRow:
+    """A scored model in a comparison, in report units.
 
-    Keys: `model`, `label`, `is_network`, each of `METRICS`, `change` (network's error against this model's, -0.45
-    is 45 % lower; None for the network itself), `outputs` (name -> error) and `seconds` of fitting.
+    Attributes:
+        model: name.
+        label: name in tables.
+        rmse, mae, p95, p99, r2, bias, composite: means over outputs; None where not computed.
+        change: relative change of the network's error against this model's (-0.45 is 45 % lower); None for the network.
+        outputs: error by name of the output.
+        seconds: training time.
     """
+
+    model: str
+    label: str
+    rmse: float
+    mae: float | None
+    p95: float | None
+    p99: float | None
+    r2: float | None
+    bias: float | None
+    composite: float | None
+    change: float | None
+    outputs: Mapping[str, float | None]
+    seconds: float | None
+
+    @property
+    def is_network(self) -> bool:
+        """Whether the model is the network."""
+        return self.model == NETWORK
+
+    def metric(self, name: str) -> float | None:
+        """Return one of `METRICS`."""
+        value: float | None = getattr(self, name)
+        return value
+
+
+def comparison_rows(facts: Facts, horizon: int | None = None) -> list[ComparisonRow]:
+    """Return one row per scored model, least error (`MEASURE`) first."""
     samples = main_horizon(facts) if horizon is None else horizon
     if samples is None:
         return []
-    ours = score(facts.models.get(NETWORK, {}), samples)
-    rows: list[dict[str, Any]] = []
+    ours = score(facts.models.get(NETWORK), samples)
+    rows = []
     for name, model in facts.models.items():
         error = score(model, samples)
         if error is None:
             continue
-        row: dict[str, Any] = {"model": name, "label": label_of(facts, name), "is_network": name == NETWORK}
-        row |= {metric: score(model, samples, metric) for metric in METRICS}
-        row["change"] = ours / error - 1 if ours is not None and error > 0 and name != NETWORK else None
-        row["outputs"] = {target.name: score(model, samples, output=target.name) for target in facts.targets}
-        row["seconds"] = model.get("seconds")
-        rows.append(row)
-    return sorted(rows, key=lambda row: row[MEASURE])
+        rows.append(
+            ComparisonRow(
+                model=name,
+                label=label_of(facts, name),
+                rmse=error,
+                **{name: score(model, samples, name) for name in METRICS if name != MEASURE},
+                change=ours / error - 1 if ours is not None and error > 0 and name != NETWORK else None,
+                outputs={target.name: score(model, samples, output=target.name) for target in facts.targets},
+                seconds=model.seconds,
+            )
+        )
+    return sorted(rows, key=lambda row: row.rmse)
 
 
 def headline(facts: Facts) -> str:
@@ -342,7 +357,7 @@ def headline(facts: Facts) -> str:
     """
     samples = main_horizon(facts)
     rows = comparison_rows(facts)
-    if samples is None or not any(row["is_network"] for row in rows):
+    if samples is None or not any(row.is_network for row in rows):
         missing = f"This run has no scores yet; `edp evaluate {facts.folder}` makes them"
         return f"{unfinished_text(facts.folder) or missing}."
     judged = network_verdict(facts.scores, minutes_of(facts.folder)) if facts.scores else None
@@ -350,14 +365,14 @@ def headline(facts: Facts) -> str:
     return figures if judged is None else judged.headline(figures)
 
 
-def _figures(facts: Facts, rows: Sequence[Mapping[str, Any]], samples: int) -> str:
+def _figures(facts: Facts, rows: Sequence[ComparisonRow], samples: int) -> str:
     if not facts.averaged and facts.scores:
         targets = [(target.name, target.description, target.unit) for target in facts.targets]
         return by_output(facts.scores, samples, targets, horizon_text(facts, samples))
     unit = facts.unit
-    values = {row["model"]: score(facts.models[row["model"]], samples) for row in rows}
+    values = {row.model: row.rmse for row in rows}
     places = min(max(decimals_for(values.values(), significant=2), 1), 4 if unit else 8)
-    parts = [f"{row['label']} {number(values[row['model']], places)}" for row in rows if not row["is_network"]]
+    parts = [f"{row.label} {number(row.rmse, places)}" for row in rows if not row.is_network]
     shown = parts if len(parts) <= 4 else [*parts[:3], f"{len(parts) - 3} more above that"]
     ours = f"{number(values[NETWORK], places)} {unit}".rstrip()
     start = f"At {horizon_text(facts, samples)} ahead the network is off by {ours}"
@@ -388,16 +403,15 @@ def verdict_lines(facts: Facts) -> list[str]:
     """What the headline means: against the best baseline, over the recordings, against the hardware budget."""
     lines = []
     rows = comparison_rows(facts)
-    baselines = [row for row in rows if row["change"] is not None]
-    if baselines and facts.averaged:
-        best = baselines[0]
-        lower = best["change"] < 0
+    best = next((row for row in rows if row.change is not None), None)
+    if best is not None and best.change is not None and facts.averaged:
+        lower = best.change < 0
         # The headline compares each output by itself, this line all outputs together.
         lines.append(
-            f"Over all outputs together its RMSE is {percent(abs(best['change']))} {'lower' if lower else 'higher'} "
-            f"than the best baseline, {best['label']}{'' if lower else ': the network does not pay for itself here'}."
+            f"Over all outputs together its RMSE is {percent(abs(best.change))} {'lower' if lower else 'higher'} "
+            f"than the best baseline, {best.label}{'' if lower else ': the network does not pay for itself here'}."
         )
-        won, both = recordings_won(facts, best["model"])
+        won, both = recordings_won(facts, best.model)
         if both:
             lines.append(f"It is the better of the two on {won} of {count_of(both, 'test recording')}.")
     lines += [line for line in (losses_line(facts.scores) if facts.scores else "",) if line]
@@ -434,8 +448,8 @@ def recordings_won(facts: Facts, baseline: str) -> tuple[int, int]:
     samples = str(main_horizon(facts))
 
     def errors(name: str) -> dict[str, float]:
-        scored = facts.models.get(name, {}).get("recordings", {})
-        recording_errors = {key: value.get(samples, {}).get("mean", {}).get(MEASURE) for key, value in scored.items()}
+        scored = facts.models[name].recordings if name in facts.models else {}
+        recording_errors = {key: value.get(samples, {}).get(MEAN, {}).get(MEASURE) for key, value in scored.items()}
         return {key: value for key, value in recording_errors.items() if value is not None}
 
     ours, theirs = errors(NETWORK), errors(baseline)
@@ -445,8 +459,7 @@ def recordings_won(facts: Facts, baseline: str) -> tuple[int, int]:
 
 def spread_text(facts: Facts) -> str:
     """How the network's error spreads over the test recordings, as a sentence; empty where it was not computed."""
-    samples = main_horizon(facts)
-    spread = facts.models.get(NETWORK, {}).get("spread", {}).get(str(samples)) if samples is not None else None
+    spread = facts.models[NETWORK].spread.get(str(main_horizon(facts))) if NETWORK in facts.models else None
     if (
         not facts.averaged
         or not spread

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from tsdownsample import MinMaxLTTBDownsampler
 
 from edp.evaluation.guard import MEASURE
+from edp.evaluation.scores_file import MEAN, ModelScores, SpeedBin, error_at
 from edp.report.run.facts import HIGH, INPUTS, LOW, NETWORK, NO_MODELS, TRUTH, Facts, main_horizon, score
 
 WHOLE, EXCERPT = "whole", "excerpt"
@@ -230,34 +230,21 @@ def horizon_curves(facts: Facts) -> dict[str, list[tuple[float, float]]]:
     return curves
 
 
-def speed_bands(facts: Facts, horizon: int) -> dict[str, list[dict[str, float | None]]]:
-    """Error of each model by speed band: name -> rows of `low`, `high`, `count`, `mae` (None in an empty band)."""
-    bands: dict[str, list[dict[str, float | None]]] = {}
-    for name, model in facts.models.items():
-        rows = model.get("by_speed", {}).get(str(horizon), [])
-        if rows:
-            bands[name] = [
-                {
-                    "low": row["low"],
-                    "high": row["high"],
-                    "count": row["count"],
-                    "mae": row.get("mae") if row["count"] else None,
-                }
-                for row in rows
-            ]
-    return bands
+def speed_bands(facts: Facts, horizon: int) -> dict[str, tuple[SpeedBin, ...]]:
+    """Return the errors of each model by speed."""
+    bands = {name: model.by_speed.get(str(horizon), ()) for name, model in facts.models.items()}
+    return {name: rows for name, rows in bands.items() if rows}
 
 
 def recording_errors(facts: Facts, horizon: int) -> tuple[list[str], dict[str, list[float | None]]]:
     """Recordings, the network's worst last, and each model's error on them in that order."""
 
-    def error(model: Mapping[str, Any], recording: str) -> float | None:
-        value = model.get("recordings", {}).get(recording, {}).get(str(horizon), {}).get("mean", {}).get(MEASURE)
-        return None if value is None or not math.isfinite(value) else float(value)
+    def error(model: ModelScores, recording: str) -> float | None:
+        return error_at(model.recordings.get(recording, {}), horizon, MEAN, MEASURE)
 
-    scored = {name: model for name, model in facts.models.items() if model.get("recordings")}
-    lead = scored.get(NETWORK) or next(iter(scored.values()), {})
-    keys = [(error(lead, recording), recording) for recording in lead.get("recordings", {})]
+    scored = {name: model for name, model in facts.models.items() if model.recordings}
+    lead = scored.get(NETWORK) or next(iter(scored.values()), None)
+    keys = [] if lead is None else [(error(lead, recording), recording) for recording in lead.recordings]
     order = [recording for _, recording in sorted((value, key) for value, key in keys if value is not None)]
     return order, {name: [error(model, recording) for recording in order] for name, model in scored.items()}
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from edp.data.splits import kind_of_name
 from edp.errors import count_of
 from edp.evaluation.guard import MEASURE, MEASURE_NAME, NETWORK, lost_outputs
+from edp.evaluation.scores_file import DataSituation, ScoresFile, TargetChange, error_at
+from edp.settings.provenance import Provenance
 from edp.storage import read_object
 from edp.storage.paths import is_file_at
-from edp.storage.provenance import recording_names
 from edp.wording import behind, listed, number, percent
 
 SHOWN = 4
@@ -23,35 +23,35 @@ FEW = 3
 """Test logs below which one odd log decides the figure."""
 
 
-def losses_line(scores: Mapping[str, Any]) -> str:
+def losses_line(scores: ScoresFile) -> str:
     """The outputs on which a baseline has less error at some horizon, worst first; empty where there are none."""
     losses = lost_outputs(scores)
     if not losses:
         return ""
-    several = len(scores["task"]["horizons"]) > 1
+    several = len(scores.task.horizons) > 1
     parts = [
         f"{loss.target}{f' at k = {loss.horizon}' if several else ''} "
         f"({loss.label}: {percent(loss.less)} less {MEASURE_NAME})"
         for loss in losses[:SHOWN]
     ]
     more = f" and {len(losses) - SHOWN} more" if len(losses) > SHOWN else ""
-    outputs = count_of(len(scores["targets"]), "output")
+    outputs = count_of(len(scores.targets), "output")
     return f"At some time ahead a baseline has less error on {len(losses)} of {outputs}: {listed(parts)}{more}."
 
 
-def judged_line(scores: Mapping[str, Any], provenance: Mapping[str, Any] | None) -> str:
+def judged_line(scores: ScoresFile, provenance: Provenance | None) -> str:
     """Which logs were judged, and a warning where they are few or all of one kind; empty where scores name none.
 
     Args:
         scores: the content of ``scores.json``.
         provenance: of the run; None where it is unknown what trained.
     """
-    judged = list(scores["models"].get(NETWORK, {}).get("recordings", {}))
+    judged = list(scores.models[NETWORK].recordings) if NETWORK in scores.models else []
     if not judged:
         return ""
     shown = listed(judged[:SHOWN]) if len(judged) <= SHOWN else f"{', '.join(judged[:SHOWN])} and others"
     line = f"Judged on {count_of(len(judged), 'test log')}: {shown}."
-    trained = recording_names(provenance or {}, "train")
+    trained = set() if provenance is None else provenance.recording_names("train")
     kinds = {kind_of_name(name) for name in judged}
     others = {kind_of_name(name) for name in trained} - kinds
     if len(judged) < FEW:
@@ -68,14 +68,14 @@ def minutes_of(folder: Path) -> float | None:
     return float(minutes) if isinstance(minutes, int | float) else None
 
 
-def situation_line(scores: Mapping[str, Any]) -> str:
+def situation_line(scores: ScoresFile) -> str:
     """Where the judged recordings are another situation than the training; empty where they are not."""
-    situation = scores.get("situation") or {"outside": (), "changes": ()}
-    most = sorted(situation["changes"], key=lambda row: abs(math.log(row["ratio"])))
-    changes = {row["target"]: row for row in most}  # of each target the horizon that differs most
+    situation = scores.situation or DataSituation(outside=(), changes=())
+    most = sorted(situation.changes, key=lambda row: abs(math.log(row.ratio)))
+    changes = {row.target: row for row in most}  # of each target the horizon that differs most
     parts = [
-        f"{row['channel']} is outside of its range in training in {percent(row['share'])} of the ticks"
-        for row in situation["outside"]
+        f"{row.channel} is outside of its range in training in {percent(row.share)} of the ticks"
+        for row in situation.outside
     ]
     parts += [_changed(row) for row in changes.values()]
     if not parts:
@@ -87,15 +87,15 @@ def situation_line(scores: Mapping[str, Any]) -> str:
     )
 
 
-def _changed(row: Mapping[str, Any]) -> str:
+def _changed(row: TargetChange) -> str:
     """A target that changes otherwise than in training, in words."""
-    ahead = f"{row['target']} in {count_of(row['horizon'], 'tick')}"
-    if 1 / NOTED <= row["ratio"] <= NOTED:
-        return f"{percent(row['beyond'])} of the changes of {ahead} are larger than any in training"
-    return f"changes of {ahead} are {row['ratio']:.2g} times as large as in training"
+    ahead = f"{row.target} in {count_of(row.horizon, 'tick')}"
+    if 1 / NOTED <= row.ratio <= NOTED:
+        return f"{percent(row.beyond)} of the changes of {ahead} are larger than any in training"
+    return f"changes of {ahead} are {row.ratio:.2g} times as large as in training"
 
 
-def by_output(scores: Mapping[str, Any], horizon: int, targets: Sequence[tuple[str, str, str]], ahead: str) -> str:
+def by_output(scores: ScoresFile, horizon: int, targets: Sequence[tuple[str, str, str]], ahead: str) -> str:
     """The headline where outputs have no common unit: each with its own error, and the best baseline's.
 
     Args:
@@ -107,14 +107,14 @@ def by_output(scores: Mapping[str, Any], horizon: int, targets: Sequence[tuple[s
     parts = []
     for name, description, unit in targets[:SHOWN]:
         errors = {
-            str(model["label"]): model["overall"].get(str(horizon), {}).get(name, {}).get(MEASURE)
-            for key, model in scores["models"].items()
+            model.label: error_at(model.overall, horizon, name, MEASURE)
+            for key, model in scores.models.items()
             if key != NETWORK
         }
-        ours = scores["models"][NETWORK]["overall"].get(str(horizon), {}).get(name, {}).get(MEASURE)
+        ours = error_at(scores.models[NETWORK].overall, horizon, name, MEASURE)
         if ours is None:
             continue
-        finite = {label: error for label, error in errors.items() if error is not None and math.isfinite(error)}
+        finite = {label: error for label, error in errors.items() if error is not None}
         best = min(finite, key=lambda label: finite[label], default=None)
         beside = "" if best is None else f" ({best} {number(finite[best], _places(finite[best]))})"
         of_unit = behind(unit)

@@ -64,10 +64,10 @@ def build_run_page(facts: run.Facts, title: str | None = None) -> Page:
     """Return the page of a run; its title is the task's name if none is given."""
     drawn = (signal_chart(facts), *run_charts(facts), correlogram(facts))
     charts = {chart.name: chart for chart in drawn if chart is not None}
-    task, name = (facts.scores or {}).get("task", {}), full_path(facts.folder).name
-    title = title or task.get("name") or name
+    name = full_path(facts.folder).name
+    title = title or (facts.scores.task.name if facts.scores else "") or name
     network = run.label_of(facts, run.NETWORK) if run.NETWORK in facts.models else ""
-    created = moment((facts.provenance or {}).get("created"))
+    created = moment(facts.provenance.created if facts.provenance else None)
     return Page(
         title=title,
         kind="report",
@@ -174,15 +174,15 @@ def _comparisons(facts: run.Facts) -> list[Part | None]:
 
 def _choice(facts: run.Facts) -> list[Part | None]:
     """Return what the preset auto chose; empty for any other run."""
-    content = read_choice(facts.folder)
-    if content is None:
+    choice = read_choice(facts.folder)
+    if choice is None:
         return []
-    why = unbroken(" ".join(filter(None, (content["sentence"], *content.get("notes", ()), promise_line(content)))))
-    models = model_tables(facts, content)
+    why = unbroken(" ".join(filter(None, (choice.sentence, *(choice.notes or ()), promise_line(choice)))))
+    models = model_tables(facts, choice)
     return [
         f"{why} The test recordings played no part in the choice.",
-        candidates_table(content),
-        promise_table(facts, content),
+        candidates_table(choice),
+        promise_table(facts, choice),
         Fold("Every model, output by output", [MODELS, *models], is_open=len(models) <= MOST_OPEN),
     ]
 
@@ -204,7 +204,8 @@ def _unseen(facts: run.Facts) -> list[Part | None]:
 
 def _errors(facts: run.Facts, charts: Mapping[str, Chart]) -> list[Part | None]:
     """Return the errors by horizon, speed, situation and recording."""
-    ranked = len((facts.models.get(run.NETWORK) or {}).get("recordings", ())) > DOTS_AT_MOST
+    network = facts.models.get(run.NETWORK)
+    ranked = network is not None and len(network.recordings) > DOTS_AT_MOST
     horizons = len(tables.comparison_tables(facts)) > 1
     how = "How fast the error grows with the horizon; " if horizons else "This run predicts one fixed time ahead; "
     by_recording = (

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from edp.evaluation.guard import NETWORK
+from edp.evaluation.scores_file import ModelScores, ScoresFile, error_at
 from edp.table import Column, Table, Value, figures, plainly
 from edp.wording import figure, percent
 
@@ -23,47 +24,42 @@ WORDS = {
 """How a table calls what `edp.evaluation.by_situation` tells apart."""
 
 
-def situation_table(scores: Mapping[str, Any], horizon: int) -> Table | None:
+def situation_table(scores: ScoresFile, horizon: int) -> Table | None:
     """The network's error by situation beside the best baseline's, most of the error first; None without such scores.
 
     Args:
         scores: the content of ``scores.json``.
         horizon: samples ahead.
     """
-    models = scores["models"]
-    ours = models.get(NETWORK, {}).get("by_situation", {}).get(str(horizon), [])
+    models = scores.models
+    ours = models[NETWORK].by_situation.get(str(horizon), ()) if NETWORK in models else ()
     if not ours:
         return None
-    targets = scores["targets"]
-    shown = [t for t in targets if any(row["mae"].get(t["name"]) is not None for row in ours)]
-    best = _best_baseline(models, horizon, [t["name"] for t in shown])
-    beside = {
-        row["situation"]: row for row in models.get(best, {}).get("by_situation", {}).get(str(horizon), [])
-    }  # fmt: skip
+    shown = [t for t in scores.targets if any(row.mae.get(t.name) is not None for row in ours)]
+    best = _best_baseline(models, horizon, [t.name for t in shown])
+    baseline = {row.situation: row.mae for row in models[best].by_situation.get(str(horizon), ())} if best else {}
     rows = []
-    for row in sorted(ours, key=lambda row: -row["of_error"]):
-        name = row["situation"]
-        errors = [row["mae"].get(t["name"]) for t in shown]
-        theirs = [beside.get(name, {"mae": {}})["mae"].get(t["name"]) for t in shown] if best else []
-        ratio = _ratio(errors, theirs)
-        cells = [WORDS.get(name, name), percent(row["share"]), percent(row["of_error"]), *errors]
+    for row in sorted(ours, key=lambda row: -row.of_error):
+        errors = [row.mae.get(t.name) for t in shown]
+        ratio = _ratio(errors, [baseline.get(row.situation, {}).get(t.name) for t in shown])
+        cells = [WORDS.get(row.situation, row.situation), percent(row.share), percent(row.of_error), *errors]
         rows.append((*cells, *((percent(ratio),) if best else ())))
-    errors_of = [Column(t["name"], t.get("unit", ""), figures(r[3 + i] for r in rows)) for i, t in enumerate(shown)]
-    label = str(models[best].get("label") or best) if best else ""
+    errors_of = [Column(t.name, t.unit, figures(r[3 + i] for r in rows)) for i, t in enumerate(shown)]
+    label = models[best].label or best if best else ""
     relative = (Column("Relative to", label),) if best else ()
     columns = (Column("Situation"), Column("Of the time"), Column("Of the error"), *errors_of, *relative)
     return Table("Mean absolute error by what the axis does", columns, tuple(rows), name="situations")
 
 
-def _best_baseline(models: Mapping[str, Any], horizon: int, targets: list[str]) -> str:
+def _best_baseline(models: Mapping[str, ModelScores], horizon: int, targets: list[str]) -> str:
     """The baseline with the least sum of errors, each in those of the network; empty where there is none."""
-    ours = models[NETWORK]["overall"].get(str(horizon), {})
-    sums: dict[str, float] = {}
+    network, sums = models[NETWORK], dict[str, float]()
     for name, model in models.items():
-        theirs = model["overall"].get(str(horizon), {})
-        pairs = [(theirs.get(t, {}).get("mae"), ours.get(t, {}).get("mae")) for t in targets]
-        if name != NETWORK and model.get("by_situation") and all(a is not None and b for a, b in pairs):
-            sums[name] = sum(a / b for a, b in pairs)
+        if name != NETWORK and model.by_situation:
+            errors = [[error_at(one.overall, horizon, t, "mae") for t in targets] for one in (model, network)]
+            ratios = [a / b for a, b in zip(*errors, strict=True) if a is not None and b]
+            if len(ratios) == len(targets):
+                sums[name] = sum(ratios)
     return min(sums, key=lambda name: sums[name], default="")
 
 

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from markupsafe import Markup
 
 from edp.errors import count_of
-from edp.evaluation.guard import MEASURE, MEASURE_NAME
-from edp.report.run.facts import NETWORK, Facts, budget_rows, comparison_rows, horizon_text, label_of, main_horizon
+from edp.evaluation.guard import MEASURE_NAME
+from edp.evaluation.scores_file import MEAN
+from edp.report.run.facts import (
+    NETWORK,
+    ComparisonRow,
+    Facts,
+    budget_rows,
+    comparison_rows,
+    horizon_text,
+    label_of,
+    main_horizon,
+)
 from edp.report.run.figures import recording_errors
 from edp.table import Column, Table, Value
 from edp.wording import MISSING, count_text, decimals_for, duration, number, percent, unit_text
@@ -34,7 +43,7 @@ def _comparison(facts: Facts, horizon: int) -> Table:
     rows = comparison_rows(facts, horizon)
     unit = facts.unit
     shown = [metric for metric in ("rmse", "mae", "p95", "p99", "composite") if _any(rows, metric)]
-    places = {metric: decimals_for(row[metric] for row in rows) for metric in shown}
+    places = {metric: decimals_for(row.metric(metric) for row in rows) for metric in shown}
     names = {"mae": "MAE", "rmse": "RMSE", "p95": "P95", "p99": "P99", "composite": "Composite"}
     with_bias, with_r2, with_time = _any(rows, "bias"), _any(rows, "r2"), _any(rows, "seconds")
     columns = [Column("Model"), *(Column(names[metric], unit) for metric in shown)]
@@ -42,18 +51,18 @@ def _comparison(facts: Facts, horizon: int) -> Table:
     columns += [Column("Network relative to it", MEASURE_NAME)] + [Column("Fitted in")] * with_time
     lines = []
     for row in rows:
-        cells = [row["label"], *(number(row[metric], places[metric]) for metric in shown)]
-        cells += [number(row["bias"], places["mae"], signed=True)] * with_bias
-        cells += [number(row["r2"], 4)] * with_r2
-        cells += [percent(row["change"], signed=True)]
-        cells += [duration(row["seconds"])] * with_time
+        cells = [row.label, *(number(row.metric(metric), places[metric]) for metric in shown)]
+        cells += [number(row.bias, places["mae"], signed=True)] * with_bias
+        cells += [number(row.r2, 4)] * with_r2
+        cells += [percent(row.change, signed=True)]
+        cells += [duration(row.seconds)] * with_time
         lines.append(tuple(cells))
-    marked = frozenset(index for index, row in enumerate(rows) if row["is_network"])
+    marked = frozenset(index for index, row in enumerate(rows) if row.is_network)
     return Table(f"{horizon_text(facts, horizon)} ahead", tuple(columns), tuple(lines), marked)
 
 
-def _any(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
-    return any(row[key] is not None for row in rows)
+def _any(rows: Sequence[ComparisonRow], key: str) -> bool:
+    return any(row.metric(key) is not None for row in rows)
 
 
 def output_table(facts: Facts) -> Table | None:
@@ -66,36 +75,36 @@ def _by_output(facts: Facts, horizon: int | None) -> Table | None:
     if horizon is None or not rows or len(facts.targets) < 2:
         return None
     names = [target.name for target in facts.targets]
-    places = {name: decimals_for(row["outputs"][name] for row in rows) for name in names}
-    lines = tuple((row["label"], *(number(row["outputs"][name], places[name]) for name in names)) for row in rows)
+    places = {name: decimals_for(row.outputs[name] for row in rows) for name in names}
+    lines = tuple((row.label, *(number(row.outputs[name], places[name]) for name in names)) for row in rows)
     units = [unit_text(target.unit) for target in facts.targets]
     columns = (Column("Model"), *(Column(target.description, unit) for target, unit in zip(facts.targets, units)))
-    marked = frozenset(index for index, row in enumerate(rows) if row["is_network"])
+    marked = frozenset(index for index, row in enumerate(rows) if row.is_network)
     return Table(f"{MEASURE_NAME} by output, {horizon_text(facts, horizon)} ahead", columns, lines, marked)
 
 
 def interval_table(facts: Facts) -> Table | None:
     """What share of the truth the network's intervals hold, and how wide they are; None where it states none."""
-    intervals = facts.models.get(NETWORK, {}).get("intervals", {})
-    rows = [(k, row) for k in facts.horizons for row in intervals.get(str(k), ())]
-    if not rows:
+    network = facts.models.get(NETWORK)
+    rows = [] if network is None else [(k, row) for k in facts.horizons for row in network.intervals.get(str(k), ())]
+    if network is None or not rows:
         return None
-    places = decimals_for(row["width"]["mean"] for _, row in rows)
+    places = decimals_for(row.width[MEAN] for _, row in rows)
     lines = tuple(
         (
             f"{horizon_text(facts, k)} ahead",
-            percent(row["coverage"]),
-            percent(row["covered"]["mean"]),
-            number(row["width"]["mean"], places),
+            percent(row.coverage),
+            percent(row.covered[MEAN]),
+            number(row.width[MEAN], places),
         )
         for k, row in rows
     )
     columns = (Column("Interval"), Column("Meant to hold"), Column("Holds"), Column("Mean width", facts.unit))
     caption = "The network's intervals: share of the truth inside, mean over outputs"
-    scores = facts.models[NETWORK].get("weighted_interval_score", {})
+    scores = network.weighted_interval_score
     if scores:
         listed = ", ".join(
-            f"{number(scores[str(k)]['mean'], places)} {facts.unit} {horizon_text(facts, k)} ahead".replace("  ", " ")
+            f"{number(scores[str(k)][MEAN], places)} {facts.unit} {horizon_text(facts, k)} ahead".replace("  ", " ")
             for k in facts.horizons
             if str(k) in scores
         )
@@ -198,26 +207,24 @@ def key_figures(facts: Facts) -> list[tuple[str, str, str]]:
     """The tiles under the headline: (figure, unit, what it is)."""
     rows = comparison_rows(facts)
     tiles: list[tuple[str, str, str]] = []
-    ours = next((row for row in rows if row["is_network"]), None)
+    ours = next((row for row in rows if row.is_network), None)
     if not facts.averaged and ours:
         for target in facts.targets[:_TILES]:
-            tiles.append(
-                (number(ours["outputs"][target.name]), unit_text(target.unit), f"{MEASURE_NAME}, {target.name}")
-            )
+            tiles.append((number(ours.outputs[target.name]), unit_text(target.unit), f"{MEASURE_NAME}, {target.name}"))
         ours = None
     if ours:
-        tiles.append((number(ours[MEASURE]), facts.unit, f"{MEASURE_NAME} (root mean square of errors)"))
-        if ours["p95"] is not None:
-            tiles.append((number(ours["p95"]), facts.unit, "95 % of errors are below"))
-    best = next((row for row in rows if row["change"] is not None), None)
+        tiles.append((number(ours.rmse), facts.unit, f"{MEASURE_NAME} (root mean square of errors)"))
+        if ours.p95 is not None:
+            tiles.append((number(ours.p95), facts.unit, "95 % of errors are below"))
+    best = next((row for row in rows if row.change is not None), None)
     if best and facts.averaged:
-        tiles.append((percent(best["change"], signed=True), "", f"error against {best['label']}, the best baseline"))
-    elif ours and ours["r2"] is not None:
-        tiles.append((number(ours["r2"], 4), "", "R²"))
+        tiles.append((percent(best.change, signed=True), "", f"error against {best.label}, the best baseline"))
+    elif ours and ours.r2 is not None:
+        tiles.append((number(ours.r2, 4), "", "R²"))
     checks = budget_rows(facts.footprint)
     if checks:
         fitting = sum(bool(check["fits"]) for check in checks)
         tiles.append((f"{fitting} of {len(checks)}", "", "budget limits met"))
-    elif (facts.provenance or {}).get("parameters") is not None:
-        tiles.append((count_text((facts.provenance or {})["parameters"]), "", "parameters"))
+    elif facts.provenance is not None and facts.provenance.more.get("parameters") is not None:
+        tiles.append((count_text(facts.provenance.more["parameters"]), "", "parameters"))
     return [tile for tile in tiles if tile[0] != MISSING]

@@ -32,7 +32,7 @@ def build_screening_page(
     screening: ScreeningResult,
     title: str,
     quality: DataQuality | None = None,
-    trials: Mapping[str, Any] | None = None,
+    trials: Mapping[str, object] | None = None,
     notes: Sequence[str] = (),
 ) -> Page:
     """Return the page of a screening.

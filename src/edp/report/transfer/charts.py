@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
+from edp.evaluation.scores_file import ScoredTarget, metric
+from edp.evaluation.transfer_file import SOURCE, TARGET
 from edp.report.common.chart import (
     BLUE,
     GREY,
@@ -23,7 +24,7 @@ from edp.report.common.chart import (
     Texts,
     with_unit,
 )  # fmt: skip
-from edp.report.transfer.facts import SOURCE, TARGET, Transfer
+from edp.report.transfer.facts import Transfer
 from edp.signals import display_offset
 from edp.wording import label_by_name
 
@@ -35,7 +36,7 @@ def picture_charts(facts: Transfer) -> list[Chart]:
     """The figures of the thesis, one for before and one for after; predictions of the first recording."""
     charts = []
     for method in facts.pair:
-        label = facts.methods[method]["label"]
+        label = facts.methods[method].label
         course = prediction_chart(facts, (method,))
         name = course.choices[0].options[0][0]
         panels = tuple(panel.of({RECORDING: name}) for panel in course.panels)
@@ -47,15 +48,15 @@ def picture_charts(facts: Transfer) -> list[Chart]:
 
 def _look(facts: Transfer, method: str) -> tuple[str, str, float]:
     """Name, colour and width of a method's curve."""
-    label = facts.methods[method]["label"]
-    return (label, BLUE, 1.6) if method == facts.content["method"] else (label, MUTED[0], 1.4)
+    label = facts.methods[method].label
+    return (label, BLUE, 1.6) if method == facts.content.method else (label, MUTED[0], 1.4)
 
 
 def _horizons(facts: Transfer) -> Control:
     return Control(AHEAD, "Horizon", tuple((horizon, facts.ahead(horizon)) for horizon in facts.horizons))
 
 
-def _label(facts: Transfer, target: Mapping[str, Any]) -> str:
+def _label(facts: Transfer, target: ScoredTarget) -> str:
     return label_by_name(facts.name(one) for one in facts.targets)[facts.name(target)]
 
 
@@ -67,14 +68,14 @@ def prediction_chart(facts: Transfer, methods: Sequence[str]) -> Chart:
     for column, target in enumerate(facts.targets):
         marks: list[Mark] = []
         for name in names:
-            time_s = Evenly(float(facts.shown[f"{name}/start"][0]), 1 / facts.content["task"]["rate_hz"])
+            time_s = Evenly(float(facts.shown[f"{name}/start"][0]), 1 / facts.content.task.rate_hz)
             for order, horizon in enumerate(facts.horizons):
                 for key, (label, colour, width) in curves:
-                    values = facts.shown[f"{name}/{key}"][:, order, column] * target["factor"]
-                    values = (values + display_offset(target["unit"])).round(3)
+                    values = facts.shown[f"{name}/{key}"][:, order, column] * target.factor
+                    values = (values + display_offset(target.unit)).round(3)
                     when = {RECORDING: name, AHEAD: horizon}
                     marks.append(DataSeries(x=time_s, y=values, name=label, colour=colour, width=width, when=when))
-        title = with_unit(_label(facts, target), target["unit"])
+        title = with_unit(_label(facts, target), target.unit)
         panels.append(Panel(tuple(marks), ChartAxis("Time in the test part [s]"), title=title))
     choice = Control(RECORDING, "Recording", tuple((name, name) for name in names), alone=True)
     return Chart(
@@ -88,25 +89,26 @@ def error_chart(facts: Transfer, methods: Sequence[str]) -> Chart:
     panels: list[Panel] = []
     for target in facts.targets:
         marks: list[Mark] = []
-        for horizon, by_target in facts.content["distributions"].items():
-            distribution, when = by_target[target["name"]], {AHEAD: horizon}
-            edges = np.array(distribution["edges"])
+        for horizon, by_target in facts.content.distributions.items():
+            distribution, when = by_target[target.name], {AHEAD: horizon}
+            edges = np.array(distribution.edges)
             for method in methods:
-                scores, (label, colour, width) = facts.score(method, horizon, target["name"]), _look(facts, method)
-                shares = (100 * np.array(distribution["shares"][method])).round(4)
-                remark = f"{label}, bias {scores['bias']:.3g}, skew {scores['skew']:.2f}"
+                scores, (label, colour, width) = facts.score(method, horizon, target.name), _look(facts, method)
+                shares = (100 * np.array(distribution.shares[method])).round(4)
+                bias, skew = metric(scores, "bias"), metric(scores, "skew")
+                remark = f"{label}, bias {bias:.3g}, skew {skew:.2f}"
                 marks.append(DataSeries(
                     x=((edges[:-1] + edges[1:]) / 2).round(4), y=shares, name=label, colour=colour, width=width,
                     step="middle", filled=True, when=when, hover="{x:.3g}: {y:.2f} %", remark=remark,
                 ))  # fmt: skip
                 marks.append(DataSeries(
-                    x=[scores["bias"]] * 2, y=[0.0, float(shares.max())], colour=colour, width=1.2, dash="dot",
+                    x=[bias] * 2, y=[0.0, float(shares.max())], colour=colour, width=1.2, dash="dot",
                     group=label, when=when, hover=None,
                 ))  # fmt: skip
                 if len(methods) == 1:
-                    words = f"bias {scores['bias']:.2f}\nskew {scores['skew']:.2f}"
+                    words = f"bias {bias:.2f}\nskew {skew:.2f}"
                     marks.append(Texts(x=[edges[0]], y=[0.92 * shares.max()], texts=[words], when=when))
-        across = ChartAxis(with_unit("Error", target["unit"]))
+        across = ChartAxis(with_unit("Error", target.unit))
         up = ChartAxis("" if panels else "Share of samples [%]", from_zero=True)
         panels.append(Panel(tuple(marks), across, up, _label(facts, target)))
     return Chart(
@@ -121,10 +123,10 @@ def method_chart(facts: Transfer) -> Chart:
     for domain in facts.domains:
         marks: list[Mark] = []
         for horizon in facts.horizons:
-            order = sorted(facts.methods, key=lambda name: facts.score(name, horizon)["mae"])
-            labels = [facts.methods[name]["label"] for name in order]
+            order = sorted(facts.methods, key=lambda name: facts.mae(name, horizon))
+            labels = [facts.methods[name].label for name in order]
             for index, target in enumerate(facts.targets):
-                values = [facts.score(name, horizon, target["name"], domain)["mae"] for name in order]
+                values = [facts.mae(name, horizon, target.name, domain) for name in order]
                 marks.append(Bars(
                     positions=labels, values=values, colours=[MUTED[index % len(MUTED)]] * len(values),
                     name=_label(facts, target), when={AHEAD: horizon},

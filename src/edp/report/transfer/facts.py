@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +14,14 @@ from safetensors.numpy import load_file
 
 from edp.errors import StorageError, count_of
 from edp.evaluation.guard import ErrorRatios, ErrorVerdict, best_verdict, by_recording
-from edp.storage import read_json
+from edp.evaluation.scores_file import MEAN, Metrics, ScoredTarget, metric
+from edp.evaluation.transfer_file import SOURCE, TARGET, MethodScores, TransferFile
 from edp.storage.headers import check_files
 from edp.storage.paths import is_file_at
 from edp.table import Column, Table, Value, figures
 from edp.wording import listed, number, percent, quantity, unit_text
 
-RESULT, SHOWN, SCHEMA = "transfer.json", "transfer_predictions.safetensors", 2
-TARGET, SOURCE, MEAN = "target", "source", "mean"
+SHOWN = "transfer_predictions.safetensors"
 SIGNIFICANT = 0.05
 """Share of the MAE from which a bias is named."""
 
@@ -32,70 +31,71 @@ class Transfer:
     """Content of ``transfer.json`` and of the excerpts beside it.
 
     Attributes:
-        content: plain values.
+        content: of the file.
         shown: truth and predictions of excerpts by ``NAME/truth`` and ``NAME/METHOD``, ``(time, horizon, target)``, SI.
         folder: where they lie.
     """
 
-    content: Mapping[str, Any]
+    content: TransferFile
     shown: Mapping[str, NDArray[np.float32]]
     folder: Path
 
     @property
     def horizons(self) -> list[str]:
         """Look-aheads in samples, as keys of scores."""
-        return [str(horizon) for horizon in self.content["task"]["horizons"]]
+        return [str(horizon) for horizon in self.content.task.horizons]
 
     @property
-    def targets(self) -> Sequence[Mapping[str, Any]]:
-        """Name, description, unit and factor of each target."""
-        targets: Sequence[Mapping[str, Any]] = self.content["targets"]
-        return targets
+    def targets(self) -> Sequence[ScoredTarget]:
+        """Targets, in the order of the arrays."""
+        return self.content.targets
 
     @property
     def unit(self) -> str:
         """The unit that all targets share."""
-        units = {target["unit"] for target in self.targets}
+        units = {target.unit for target in self.targets}
         return unit_text(units.pop()) if len(units) == 1 else "mixed units"
 
     @property
-    def methods(self) -> Mapping[str, Mapping[str, Any]]:
+    def methods(self) -> Mapping[str, MethodScores]:
         """All methods by name."""
-        methods: Mapping[str, Mapping[str, Any]] = self.content["methods"]
-        return methods
+        return self.content.methods
 
     @property
     def pair(self) -> tuple[str, str]:
         """Names of the methods that stand for before and after."""
-        return self.content["before"], self.content["method"]
+        return self.content.before, self.content.method
 
     @property
     def domains(self) -> list[str]:
         """Where methods were judged: on the target, and on the source where its recordings are at hand."""
-        return list(self.methods[self.content["method"]]["domains"])
+        return list(self.methods[self.content.method].domains)
 
-    def score(self, method: str, horizon: str, target: str = MEAN, domain: str = TARGET) -> Mapping[str, Any]:
-        """Scores of a method."""
-        scores: Mapping[str, Any] = self.methods[method]["domains"][domain][horizon][target]
-        return scores
+    def score(self, method: str, horizon: str, target: str = MEAN, domain: str = TARGET) -> Metrics:
+        """Return the metrics of a method."""
+        return self.content.score(method, horizon, target, domain)
+
+    def mae(self, method: str, horizon: str, target: str = MEAN, domain: str = TARGET) -> float:
+        """Return the mean absolute error of a method."""
+        return metric(self.score(method, horizon, target, domain), "mae")
 
     def recordings(self, method: str, horizon: str) -> dict[str, float]:
         """Return the mean absolute error over targets of each log of the target; empty for earlier versions."""
-        by_log = self.methods[method].get("recordings", {})
-        return {name: float(errors[horizon]) for name, errors in by_log.items() if errors.get(horizon) is not None}
+        errors = {name: by_horizon.get(horizon) for name, by_horizon in self.methods[method].recordings.items()}
+        return {name: error for name, error in errors.items() if error is not None}
 
     def gain(self, horizon: str) -> float:
         """Share of the MAE of direct transfer that is gone."""
-        before, after = (float(self.score(name, horizon)["mae"]) for name in self.pair)
+        before, after = (self.mae(name, horizon) for name in self.pair)
         return 1 - after / before
 
     def ahead(self, horizon: str) -> str:
         """A horizon in words."""
-        return f"{1e3 * int(horizon) / self.content['task']['rate_hz']:.0f} ms ahead (k = {horizon})"
+        return f"{1e3 * int(horizon) / self.content.task.rate_hz:.0f} ms ahead (k = {horizon})"
 
-    def name(self, target: Mapping[str, Any]) -> str:
+    def name(self, target: ScoredTarget) -> str:
         """What a target is called."""
-        return str(target["description"] or target["name"])
+        return target.description or target.name
 
 
 def read_transfer(folder: str | Path) -> Transfer:
@@ -104,13 +104,10 @@ def read_transfer(folder: str | Path) -> Transfer:
     Raises:
         StorageError: nothing, something of another version, or damaged excerpts.
     """
-    file = Path(folder) / RESULT
-    if not is_file_at(file):
-        raise StorageError(f"'{folder}' holds no {RESULT}; give the folder of edp finetune")
-    content = read_json(file)
-    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
-        raise StorageError(f"'{file}' is of another version of EDP; run edp finetune again")
-    check_files(content, folder, "run edp finetune again")
+    if not is_file_at(Path(folder) / TransferFile.NAME):
+        raise StorageError(f"'{folder}' holds no {TransferFile.NAME}; give the folder of edp finetune")
+    content = TransferFile.read(folder)
+    check_files(content.files, folder, TransferFile.ADVICE)
     try:
         shown = load_file(Path(folder) / SHOWN)
     except (OSError, SafetensorError) as error:
@@ -128,9 +125,9 @@ def pair_table(facts: Transfer, horizon: str) -> Table:
     rows: list[tuple[Value, ...]] = []
     for method in facts.pair:
         for target in facts.targets:
-            scores = facts.score(method, horizon, target["name"])
+            scores = facts.score(method, horizon, target.name)
             keys = ("mse", "mae", "r2", "p95", "p99", "bias", "skew")
-            rows.append((facts.methods[method]["label"], facts.name(target), *(scores[key] for key in keys)))
+            rows.append((facts.methods[method].label, facts.name(target), *(scores[key] for key in keys)))
     unit = facts.unit
     square = unit if unit in ("", "mixed units") else f"({unit})²"
     heads = (("MSE", square), ("MAE", unit), ("R²", ""), ("P95", unit), ("P99", unit), ("Bias", unit), ("Skew", ""))
@@ -149,25 +146,25 @@ def pair_table(facts: Transfer, horizon: str) -> Table:
 
 def method_table(facts: Transfer, horizon: str) -> Table:
     """All methods on the same ticks, least error first, in both domains where both were judged."""
-    direct = float(facts.score(facts.content["before"], horizon)["mae"])
+    direct = facts.mae(facts.content.before, horizon)
     both = SOURCE in facts.domains
     rows: list[tuple[Value, ...]] = []
-    names = sorted(facts.methods, key=lambda name: facts.score(name, horizon)["mae"])
+    names = sorted(facts.methods, key=lambda name: facts.mae(name, horizon))
     for name in names:
         scores = facts.score(name, horizon)
-        each = [facts.score(name, horizon, target["name"]) for target in facts.targets]
+        each = [facts.score(name, horizon, target.name) for target in facts.targets]
         r2_values = [row["r2"] for row in each if row["r2"] is not None]
         rows.append(
             (
-                facts.methods[name]["label"],
+                facts.methods[name].label,
                 scores["mae"],
-                100 * (scores["mae"] / direct - 1),
+                100 * (facts.mae(name, horizon) / direct - 1),
                 min(r2_values, default=None),
                 scores["p95"],
                 scores["p99"],
-                max((row["bias"] for row in each), key=abs),
-                facts.methods[name]["learned"],
-                *([facts.score(name, horizon, domain=SOURCE)["mae"]] if both else []),
+                max((metric(row, "bias") for row in each), key=abs),
+                facts.methods[name].learned,
+                *([facts.mae(name, horizon, domain=SOURCE)] if both else []),
             )
         )
     unit = facts.unit
@@ -182,16 +179,16 @@ def method_table(facts: Transfer, horizon: str) -> Table:
         Column("Learned", "parameters", figures([], decimals=0)),
         *([Column("MAE on the source", unit, figures([row[8] for row in rows]))] if both else []),
     )
-    mark = frozenset({names.index(facts.content["method"])})
+    mark = frozenset({names.index(facts.content.method)})
     return Table(f"{facts.ahead(horizon)}, means over targets", columns, tuple(rows), mark, name=f"methods_k{horizon}")
 
 
 def transfer_verdict(facts: Transfer) -> ErrorVerdict | None:
     """Return the verdict on the fine-tuned network against the best other method at the furthest horizon."""
-    horizon, method = facts.horizons[-1], facts.content["method"]
-    own, ratios = float(facts.score(method, horizon)["mae"]), []
+    horizon, method = facts.horizons[-1], facts.content.method
+    own, ratios = facts.mae(method, horizon), []
     for name in facts.methods:
-        error = float(facts.score(name, horizon)["mae"])
+        error = facts.mae(name, horizon)
         if name != method and own > 0 < error:
             theirs = facts.recordings(name, horizon)
             logs = {
@@ -200,7 +197,7 @@ def transfer_verdict(facts: Transfer) -> ErrorVerdict | None:
                 if mae > 0 < theirs.get(recording, 0.0)
             }
             by_output = {MEAN: [math.log(own / error)]}
-            ratios.append(ErrorRatios(facts.methods[name]["label"], by_output, by_recording(logs)))
+            ratios.append(ErrorRatios(facts.methods[name].label, by_output, by_recording(logs)))
     verdict = best_verdict(ratios, ErrorVerdict("", 0.0, (), "fine-tuned network"))
     if verdict is None:
         return None
@@ -218,31 +215,31 @@ def headline(facts: Transfer) -> str:
 
 def _figures(facts: Transfer) -> str:
     horizon = facts.horizons[-1]
-    before, after = (facts.score(name, horizon)["mae"] for name in facts.pair)
+    before, after = (facts.mae(name, horizon) for name in facts.pair)
     gain = facts.gain(horizon)
     if not gain:
         return "No epoch was better on the validation part than the source's network as it is, so that one is kept"
     how = f"{percent(abs(gain))} {'less' if gain > 0 else 'more'}"
     words = f"{number(after)} instead of {quantity(before, facts.unit)}"
-    return f"{facts.methods[facts.content['method']]['label']}: {how} error than direct transfer, {words}"
+    return f"{facts.methods[facts.content.method].label}: {how} error than direct transfer, {words}"
 
 
 def verdict(facts: Transfer) -> list[str]:
     """Sentences under the headline: R2 and bias of each target, the best baseline, the domain of the source."""
-    horizon, method = facts.horizons[-1], facts.content["method"]
-    each = {facts.name(target): facts.score(method, horizon, target["name"]) for target in facts.targets}
+    horizon, method = facts.horizons[-1], facts.content.method
+    each = {facts.name(target): facts.score(method, horizon, target.name) for target in facts.targets}
     r2_texts = listed(f"{number(row['r2'], 4)} ({name})" for name, row in each.items())
     lines = [f"R² is {r2_texts}."]
-    leaning = [name for name, row in each.items() if abs(row["bias"]) > SIGNIFICANT * row["mae"]]
+    leaning = [name for name, row in each.items() if abs(metric(row, "bias")) > SIGNIFICANT * metric(row, "mae")]
     if leaning:
         lines.append(f"The errors of {listed(leaning)} have a bias above {percent(SIGNIFICANT)} of their MAE.")
     baselines = [name for name in facts.methods if name != method]
-    best = min(baselines, key=lambda name: facts.score(name, horizon)["mae"])
-    if facts.score(best, horizon)["mae"] < facts.score(method, horizon)["mae"]:
-        better = facts.methods[best]["label"]
-        lines.append(f"{better} has less: {quantity(facts.score(best, horizon)['mae'], facts.unit)}.")
+    best = min(baselines, key=lambda name: facts.mae(name, horizon))
+    if facts.mae(best, horizon) < facts.mae(method, horizon):
+        better = facts.methods[best].label
+        lines.append(f"{better} has less: {quantity(facts.mae(best, horizon), facts.unit)}.")
     if SOURCE in facts.domains:
-        was, now = (facts.score(name, horizon, domain=SOURCE)["mae"] for name in facts.pair)
+        was, now = (facts.mae(name, horizon, domain=SOURCE) for name in facts.pair)
         change = percent(now / was - 1, signed=True)
         lines.append(f"On the source's own test part the error is {quantity(now, facts.unit)}, {change}.")
     return lines
@@ -250,15 +247,15 @@ def verdict(facts: Transfer) -> list[str]:
 
 def caveats(facts: Transfer) -> list[str]:
     """What the figures can and cannot show."""
-    minutes = facts.content["data"]["minutes"]
+    minutes = facts.content.data.minutes
     return [
-        f"Trained on {minutes['train']:.1f} min, epochs chosen on {minutes['validation']:.1f} min, judged on "
-        f"{minutes['test']:.1f} min: the end of each of {count_of(facts.content['data']['recordings'], 'log')}, a "
+        f"Trained on {minutes.train:.1f} min, epochs chosen on {minutes.validation:.1f} min, judged on "
+        f"{minutes.test:.1f} min: the end of each of {count_of(facts.content.data.recordings, 'log')}, a "
         "gap of W + k "
         "apart.",
         "The test part holds the conditions of the logs, not others: another load or temperature is not in it.",
         "One training each: differences of a percent between methods may be chance.",
-        *facts.content["notes"],
+        *facts.content.notes,
     ]
 
 
@@ -271,5 +268,5 @@ def tiles(facts: Transfer) -> list[tuple[str, str, str]]:
         (number(was["mae"]), facts.unit, "MAE of direct transfer"),
         (percent(facts.gain(horizon)), "", "less error"),
         (number(now["p99"]), facts.unit, "99th percentile of the error"),
-        (f"{facts.content['data']['minutes']['train']:.1f}", "min", "of logs trained on"),
+        (f"{facts.content.data.minutes.train:.1f}", "min", "of logs trained on"),
     ]

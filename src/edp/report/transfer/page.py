@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from edp.evaluation.transfer_file import SOURCE
 from edp.report.common.page import Page, Points, Section, write_report
 from edp.report.transfer import facts as words
 from edp.report.transfer.charts import error_chart, method_chart, picture_charts, prediction_chart
@@ -33,7 +34,7 @@ def build_transfer_page(facts: Transfer) -> Page:
     return Page(
         title=full_path(facts.folder).name,
         kind="transfer",
-        about=["transfer", facts.content["network"]],
+        about=["transfer", facts.content.network],
         headline=words.headline(facts),
         verdict=words.verdict(facts),
         tiles=words.tiles(facts),
@@ -65,7 +66,7 @@ def build_transfer_page(facts: Transfer) -> Page:
                 "methods",
                 "All methods",
                 [
-                    f"Same logs, same split, same ticks.{both if words.SOURCE in facts.domains else ''}",
+                    f"Same logs, same split, same ticks.{both if SOURCE in facts.domains else ''}",
                     method_chart(facts),
                     *(words.method_table(facts, horizon) for horizon in horizons),
                 ],

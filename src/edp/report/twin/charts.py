@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.evaluation.free_run_file import PARTS, TWIN, StepResponses
 from edp.recording import Recording
 from edp.report.common.chart import (
     BLUE,
@@ -27,7 +26,7 @@ from edp.report.common.chart import (
     with_unit,
 )  # fmt: skip
 from edp.report.common.picture import write_pictures
-from edp.report.twin.facts import PARTS, TWIN, FreeRunFacts
+from edp.report.twin.facts import FreeRunFacts
 from edp.signals import KINDS, Kind, display_offset
 from edp.wording import figure, label_by_name
 
@@ -48,12 +47,12 @@ KINDS_DRAWN = {
 def twin_charts(facts: FreeRunFacts) -> list[Chart]:
     """Every figure of the page: ``runs_velocities`` and so on, ``horizon``, and ``steps``."""
     runs = [runs_chart(facts, part) for part in PARTS if facts.channels(part) and facts.names]
-    steps = steps_chart(facts.steps)
+    steps = None if facts.steps is None else steps_chart(facts.steps)
     return [*runs, horizon_chart(facts), *([] if steps is None else [steps])]
 
 
 def _labels(facts: FreeRunFacts) -> dict[str, str]:
-    return label_by_name(channel["name"] for part in PARTS for channel in facts.channels(part))
+    return label_by_name(channel.name for part in PARTS for channel in facts.channels(part))
 
 
 def runs_chart(facts: FreeRunFacts, part: str) -> Chart:
@@ -65,8 +64,8 @@ def runs_chart(facts: FreeRunFacts, part: str) -> Chart:
     for channel, column in zip(facts.channels(part), facts.columns(part), strict=True):
         marks: list[Mark] = []
         for name in facts.names:
-            when, factor = {RECORDING: name}, channel["factor"]
-            offset = display_offset(channel["unit"])
+            when, factor = {RECORDING: name}, channel.factor
+            offset = display_offset(channel.unit)
             answers, truth = (factor * facts.shown[f"{name}/{key}"][:, column] + offset for key in ("answers", "truth"))
             if half is not None:
                 reach = factor * half[:, column]
@@ -75,7 +74,7 @@ def runs_chart(facts: FreeRunFacts, part: str) -> Chart:
             marks.append(DataSeries(x=time_s, y=_short(truth), name="Measured", colour=GREY, width=2.6, when=when))
             label = "Twin, on commands alone"
             marks.append(DataSeries(x=time_s, y=_short(answers), name=label, width=1.4, when=when))
-        title = with_unit(labels[channel["name"]], channel["unit"])
+        title = with_unit(labels[channel.name], channel.unit)
         panels.append(Panel(tuple(marks), ChartAxis("Time since the last measured tick [s]"), title=title))
     choice = Control(RECORDING, "Recording", tuple((name, name) for name in facts.names))
     return Chart(f"runs_{part}", tuple(panels), choices=(choice,), height=90 + 190 * len(panels), together=True)
@@ -86,56 +85,53 @@ def horizon_chart(facts: FreeRunFacts) -> Chart:
     half, seconds = facts.shown.get("half_width"), facts.shown["seconds"]
     panels: list[Panel] = []
     for part in PARTS:
-        by_channel = facts.twin["by_horizon"][part]["by_channel"]
-        if not by_channel:
+        if not facts.twin.by_horizon.part(part).by_channel:
             continue
         marks: list[Mark] = []
         for model, scores in facts.models.items():
-            by_horizon, when = scores["by_horizon"], {MODEL: model}
-            labels = label_by_name(name for one in PARTS for name in by_horizon[one]["by_channel"])
-            for index, (name, values) in enumerate(by_horizon[part]["by_channel"].items()):
+            by_horizon, when = scores.by_horizon, {MODEL: model}
+            by_channel = by_horizon.part(part).by_channel
+            labels = label_by_name(name for one in PARTS for name in by_horizon.part(one).by_channel)
+            for index, (name, values) in enumerate(by_channel.items()):
                 label, colour = labels[name], MUTED[index % len(MUTED)]
                 errors = _short(np.array(values, dtype=np.float64))
                 marks.append(DataSeries(
-                    x=by_horizon["seconds"], y=errors, name=label, colour=colour, width=2, hover="{y:.3g}", when=when
+                    x=by_horizon.seconds, y=errors, name=label, colour=colour, width=2, hover="{y:.3g}", when=when
                 ))  # fmt: skip
                 channels = facts.channels(part)
-                if model == TWIN and half is not None and len(channels) == len(by_horizon[part]["by_channel"]):
+                if model == TWIN and half is not None and len(channels) == len(by_channel):
                     # Half widths grow slowly: 60 points, evenly spread on the logarithmic axis, show them.
                     at = np.unique(np.geomspace(1, len(seconds), 60).astype(np.int64)) - 1
-                    widths = half[at, facts.columns(part)[index]] * channels[index]["factor"]
+                    widths = half[at, facts.columns(part)[index]] * channels[index].factor
                     marks.append(DataSeries(
                         x=_short(seconds[at]), y=_short(widths), group=label, colour=colour, width=1.2, dash="dot",
                         hover="{y:.3g}", remark=f"{label}, half width of its interval", when=when,
                     ))  # fmt: skip
         across = ChartAxis("Time since the last measured tick [s]", kind="log")
         up = ChartAxis("" if panels else "Mean absolute error", from_zero=True)
-        title = with_unit(part.capitalize(), facts.twin["by_horizon"][part]["unit"] or "")
+        title = with_unit(part.capitalize(), facts.twin.by_horizon.part(part).unit or "")
         panels.append(Panel(tuple(marks), across, up, title))
     options = tuple((model, "The twin" if model == TWIN else f"Floor: {model}") for model in facts.models)
     choice = Control(MODEL, "Model", options)
     return Chart("horizon", tuple(panels), columns=len(panels), choices=(choice,), height=460)
 
 
-def steps_chart(steps: Mapping[str, Any]) -> Chart | None:
+def steps_chart(steps: StepResponses) -> Chart | None:
     """Response of each answer to a step of the command that is chosen; None where there is none."""
-    if not steps.get("steps"):
+    if not steps.steps:
         return None
-    seconds, panels = steps["seconds"], []
-    labels = label_by_name(answer["name"] for answer in steps["steps"][0]["answers"])
-    for row, first in enumerate(steps["steps"][0]["answers"][:MOST_PANELS]):
+    seconds, panels = steps.seconds, []
+    labels = label_by_name(answer.name for answer in steps.steps[0].answers)
+    for row, first in enumerate(steps.steps[0].answers[:MOST_PANELS]):
         marks: list[Mark] = []
-        for step in steps["steps"]:
-            answer, when = step["answers"][row], {COMMAND: step["command"]}
-            low, high = (np.array(answer[end]) for end in ("low", "high"))
+        for step in steps.steps:
+            answer, when = step.answers[row], {COMMAND: step.command}
+            low, high = np.array(answer.low), np.array(answer.high)
             marks.append(Range(x=seconds, low=low, high=high, name="Middle 80 % of the moments", hover=None, when=when))
-            marks.append(DataSeries(x=seconds, y=answer["median"], name="Median", width=1.8, when=when))
-        title = with_unit(labels[first["name"]], first["unit"])
+            marks.append(DataSeries(x=seconds, y=answer.median, name="Median", width=1.8, when=when))
+        title = with_unit(labels[first.name], first.unit)
         panels.append(Panel(tuple(marks), ChartAxis("Time since the step [s]"), title=title))
-    options = tuple(
-        (step["command"], f"{step['command']}, step of {figure(step['size'])} {step['unit']}")
-        for step in steps["steps"]
-    )
+    options = tuple((step.command, f"{step.command}, step of {figure(step.size)} {step.unit}") for step in steps.steps)
     return Chart(
         "steps", tuple(panels), columns=2, choices=(Control(COMMAND, "Command", options),),
         height=80 + 210 * -(-len(panels) // 2),

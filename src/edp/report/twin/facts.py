@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,126 +13,35 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
 from edp.errors import StorageError, count_of
-from edp.evaluation.guard import twin_verdict
-from edp.evaluation.scores_file import (
-    COUNT,
-    NAME,
-    NUMBER,
-    REAL,
-    SIZE,
-    KeyedObject,
-    Leaf,
-    Listed,
-    NamedValues,
-    Shape,
-    read_shaped,
+from edp.evaluation.free_run_file import (
+    PARTS,
+    RUNS,
+    TWIN,
+    AheadErrors,
+    CandidateRow,
+    ChannelErrors,
+    FreeRunFile,
+    FreeRunScores,
+    IntervalCoverage,
+    PredictorComparison,
+    ReportedChannel,
+    RunSummary,
+    StepResponses,
+    StrokeErrors,
 )
+from edp.evaluation.guard import twin_verdict
 from edp.report.twin.candidates import candidate_sheet, choice_sentence, read_candidates
+from edp.settings.provenance import Provenance
 from edp.storage import read_object
 from edp.storage.headers import check_files
 from edp.storage.paths import full_path, is_file_at
 from edp.table import Column, Table, Value, figures
 from edp.wording import figure, listed, number, percent, short_labels
 
-CONTENT, RUNS, SCHEMA = "free_run.json", "free_runs.safetensors", 2
-STEPS_FILE = "step_response.json"
-TWIN = "twin"
-PARTS = ("velocities", "strokes", "pressures")
 SITUATIONS = {"end_stops": "at an end stop", "rest": "at rest (idling)", "motion": "in motion"}
 MOST_ROWS = 40
-PLAIN_UNIT = "1"
 """Recordings of a table, the worst first: nobody reads more."""
-UNIT = Leaf(lambda value: value is None or isinstance(value, str), "a text or null")
-BY_CHANNEL = KeyedObject(
-    {
-        "unit": UNIT,
-        "units": NamedValues(NAME),
-        "mean": NUMBER,
-        "median": NUMBER,
-        "by_channel": NamedValues(NUMBER),
-    },
-    ("unit", "mean", "by_channel"),
-)
-NRMSE = KeyedObject({"mean": NUMBER, "by_channel": NamedValues(NUMBER)}, ("mean", "by_channel"))
-AT = KeyedObject({"at_s": SIZE, **BY_CHANNEL.keys}, ("at_s", *BY_CHANNEL.needed))
-ERRORS: dict[str, Shape] = {
-    "runs": COUNT,
-    "velocity_mae": BY_CHANNEL,
-    "stroke_error": Listed(AT),
-    "pressure_nrmse": NRMSE,
-    "diverged": REAL,
-}
-SUMMARY = KeyedObject(ERRORS, tuple(ERRORS))
-LINE = KeyedObject(
-    {"unit": UNIT, "mean": Listed(NUMBER), "by_channel": NamedValues(Listed(NUMBER))}, ("unit", "by_channel")
-)
-SITUATION = KeyedObject(
-    {"share": REAL, "velocity_mae": BY_CHANNEL, "stroke_error": BY_CHANNEL, "pressure_nrmse": NRMSE},
-    ("share", "velocity_mae", "pressure_nrmse"),
-)
-COVERED = KeyedObject(
-    {"share": REAL, "by_channel": NamedValues(REAL), "half_width": BY_CHANNEL}, ("share", "half_width")
-)
-AHEAD = KeyedObject(
-    {
-        "seconds": SIZE,
-        "moments": COUNT,
-        "velocity_mae": BY_CHANNEL,
-        "stroke_error": BY_CHANNEL,
-        "pressure_nrmse": NRMSE,
-    },
-    ("seconds", "moments", "velocity_mae", "stroke_error", "pressure_nrmse"),
-)
-BESIDE = KeyedObject(
-    {
-        "label": NAME,
-        "seconds": SIZE,
-        "moments": COUNT,
-        "trained_on": Listed(NAME),
-        "errors": NamedValues(KeyedObject({"twin": BY_CHANNEL, "predictor": BY_CHANNEL}, ("twin", "predictor"))),
-    },
-    ("label", "seconds", "moments", "trained_on", "errors"),
-)
-MODEL = KeyedObject(
-    {
-        **ERRORS,
-        "recordings": COUNT,
-        "seconds": SIZE,
-        "by_horizon": KeyedObject({"seconds": Listed(SIZE), **dict.fromkeys(PARTS, LINE)}, ("seconds", *PARTS)),
-        "by_recording": NamedValues(SUMMARY),
-        "by_driving": NamedValues(SUMMARY),
-        "situations": NamedValues(SITUATION),
-        "intervals": KeyedObject(
-            {"coverage": REAL, "at": Listed(KeyedObject({"at_s": SIZE, **dict.fromkeys(PARTS, COVERED)}, ("at_s",)))},
-            ("coverage", "at"),
-        ),
-        "ahead": AHEAD,
-        "beside": BESIDE,
-    },
-    (*ERRORS, "recordings", "seconds", "by_horizon", "by_recording", "by_driving", "situations"),
-)
-CHANNEL = KeyedObject(
-    {"name": NAME, "description": NAME, "unit": NAME, "factor": SIZE}, ("name", "description", "unit", "factor")
-)
-SHAPE = KeyedObject(
-    {
-        "schema": COUNT,
-        "channels": KeyedObject(dict.fromkeys(PARTS, Listed(CHANNEL)), PARTS),
-        "models": NamedValues(MODEL, (TWIN,)),
-    },
-    ("schema", "channels", "models"),
-)
-ANSWER = KeyedObject(
-    {"name": NAME, "unit": NAME, **dict.fromkeys(("median", "low", "high"), Listed(REAL))},
-    ("name", "unit", "median", "low", "high"),
-)
-STEP = KeyedObject(
-    {"command": NAME, "size": SIZE, "unit": NAME, "answers": Listed(ANSWER)}, ("command", "size", "unit", "answers")
-)
-STEPS_SHAPE = KeyedObject(
-    {"schema": COUNT, "seconds": Listed(SIZE), "moments": COUNT, "steps": Listed(STEP)},
-    ("schema", "seconds", "moments", "steps"),
-)
+PLAIN_UNIT = "1"
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,34 +50,33 @@ class FreeRunFacts:
 
     Attributes:
         title: of the page.
-        content: plain values.
+        content: of the file.
         shown: ``seconds``, ``half_width`` where known, and ``NAME/answers``, ``NAME/truth`` ``(tick, answer)``, SI.
         provenance: of the twin; empty where it is not at hand.
         candidates: formulations that it was chosen among, see `read_candidates`; empty where it was not chosen.
-        steps: responses to steps of its commands, see `read_steps`; empty where they are not at hand.
+        steps: responses to steps of its commands, see `read_steps`; None where they are not at hand.
     """
 
     title: str
-    content: Mapping[str, Any]
+    content: FreeRunFile
     shown: Mapping[str, NDArray[np.float32]]
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-    candidates: Sequence[Mapping[str, Any]] = ()
-    steps: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=Provenance)
+    candidates: Sequence[CandidateRow] = ()
+    steps: StepResponses | None = None
 
     @property
-    def models(self) -> Mapping[str, Mapping[str, Any]]:
+    def models(self) -> Mapping[str, FreeRunScores]:
         """The twin, then its floors."""
-        models: Mapping[str, Mapping[str, Any]] = self.content["models"]
-        return models
+        return self.content.models
 
     @property
-    def twin(self) -> Mapping[str, Any]:
+    def twin(self) -> FreeRunScores:
         """Scores of the twin."""
         return self.models[TWIN]
 
-    def channels(self, part: str) -> Sequence[Mapping[str, Any]]:
-        """Name, description, unit and factor of the channels of a part."""
-        channels: Sequence[Mapping[str, Any]] = self.content["channels"][part]
+    def channels(self, part: str) -> Sequence[ReportedChannel]:
+        """Return the channels of one of `PARTS`."""
+        channels: Sequence[ReportedChannel] = getattr(self.content.channels, part)
         return channels
 
     def columns(self, part: str) -> range:
@@ -185,7 +92,7 @@ class FreeRunFacts:
 
 def holds_free_runs(folder: str | Path) -> bool:
     """Whether a folder is the run folder of a twin, or one in it with the judgement of other recordings."""
-    return any(is_file_at(Path(folder) / name) for name in (CONTENT, "twin/twin.json"))
+    return any(is_file_at(Path(folder) / name) for name in (FreeRunFile.NAME, "twin/twin.json"))
 
 
 def read_free_runs(folder: str | Path) -> FreeRunFacts:
@@ -195,20 +102,17 @@ def read_free_runs(folder: str | Path) -> FreeRunFacts:
         StorageError: nothing, something of another version, or damaged content.
     """
     path = Path(folder)
-    if not is_file_at(path / CONTENT):
-        raise StorageError(f"'{folder}' holds no {CONTENT}; run edp evaluate {folder}")
-    schema = read_object(path / CONTENT).get("schema")
-    if isinstance(schema, bool) or schema != SCHEMA:
-        raise StorageError(f"'{path / CONTENT}' is of another version of EDP; run edp evaluate {folder}")
-    content = read_shaped(path / CONTENT, SHAPE)
-    check_files(content, path, f"run edp evaluate {folder}")
+    if not is_file_at(path / FreeRunFile.NAME):
+        raise StorageError(f"'{folder}' holds no {FreeRunFile.NAME}; run edp evaluate {folder}")
+    content = FreeRunFile.read(path)
+    check_files(content.files, path, f"run edp evaluate {folder}")
     try:
         shown = load_file(path / RUNS)
     except (OSError, SafetensorError) as error:
         raise StorageError(f"cannot read '{path / RUNS}' ({error}); run edp evaluate {folder}") from error
     header = path / "twin" / "twin.json"
-    provenance = read_object(header).get("provenance") if is_file_at(header) else {}
-    origin = provenance if isinstance(provenance, dict) else {}
+    stated = read_object(header).get("provenance") if is_file_at(header) else {}
+    origin = Provenance.from_table(stated if isinstance(stated, dict) else {}, f"'{header}', provenance")
     facts = FreeRunFacts(full_path(path).name, content, shown, origin, read_candidates(path), read_steps(path))
     _check_arrays(facts, path / RUNS)
     return facts
@@ -225,23 +129,13 @@ def _check_arrays(facts: FreeRunFacts, path: Path) -> None:
         raise StorageError(f"'{path}' does not fit its scores: '{wrong[0][:80]}'; run edp evaluate again")
 
 
-def read_steps(folder: Path) -> Mapping[str, Any]:
-    """What `edp twin` or `edp evaluate` wrote of step responses; empty where there is none, as of an older version.
+def read_steps(folder: Path) -> StepResponses | None:
+    """Return what `edp twin` or `edp evaluate` wrote of step responses; None for a run of an older version.
 
     Raises:
         StorageError: damaged content.
     """
-    path = folder / STEPS_FILE
-    if not is_file_at(path):
-        return {}
-    content: Mapping[str, Any] = read_shaped(path, STEPS_SHAPE)
-    count = len(content["seconds"])
-    lines = [
-        answer[key] for step in content["steps"] for answer in step["answers"] for key in ("median", "low", "high")
-    ]
-    if any(len(line) != count for line in lines):
-        raise StorageError(f"'{path}' has lines of other lengths than its times; run edp evaluate again")
-    return content
+    return StepResponses.read(folder) if is_file_at(folder / StepResponses.NAME) else None
 
 
 def headline(facts: FreeRunFacts) -> str:
@@ -255,29 +149,29 @@ def _figures(facts: FreeRunFacts) -> str:
     twin = facts.twin
     plain = _plain_answers(facts)
     if plain:
-        off = number(twin["velocity_mae"]["mean"])
-        return f"{plain} off by {off} on average in {figure(twin['seconds'])} s on commands alone"
-    last = twin["stroke_error"][-1] if twin["stroke_error"] else None
-    if last is None or last["mean"] is None:
-        return f"{count_of(twin['runs'], 'free run')} of {figure(twin['seconds'])} s on commands alone"
-    return f"Strokes off by {number(last['mean'])} {last['unit']} after {figure(last['at_s'])} s on commands alone"
+        off = number(twin.velocity_mae.mean)
+        return f"{plain} off by {off} on average in {figure(twin.seconds)} s on commands alone"
+    last = twin.stroke_error[-1] if twin.stroke_error else None
+    if last is None or last.mean is None:
+        return f"{count_of(twin.runs, 'free run')} of {figure(twin.seconds)} s on commands alone"
+    return f"Strokes off by {number(last.mean)} {last.unit} after {figure(last.at_s)} s on commands alone"
 
 
 def _plain_answers(facts: FreeRunFacts) -> str:
     """Names of the answers where they are numbers without a unit, whose integral is no stroke; else empty."""
-    if facts.twin["velocity_mae"].get("unit") != PLAIN_UNIT or facts.twin["velocity_mae"]["mean"] is None:
+    if facts.twin.velocity_mae.unit != PLAIN_UNIT or facts.twin.velocity_mae.mean is None:
         return ""
-    return listed(short_labels(str(channel["name"]) for channel in facts.channels("velocities")))
+    return listed(short_labels(channel.name for channel in facts.channels("velocities")))
 
 
 def verdict(facts: FreeRunFacts) -> list[str]:
     """What the runs are, and how far the floors are off."""
     twin = facts.twin
     lines = [
-        f"{count_of(twin['runs'], 'free run')} of {figure(twin['seconds'])} s in "
-        f"{count_of(twin['recordings'], 'recording')} that trained nothing."
-        if facts.provenance
-        else f"{count_of(twin['runs'], 'free run')} of {figure(twin['seconds'])} s."
+        f"{count_of(twin.runs, 'free run')} of {figure(twin.seconds)} s in "
+        f"{count_of(twin.recordings, 'recording')} that trained nothing."
+        if facts.provenance != Provenance()
+        else f"{count_of(twin.runs, 'free run')} of {figure(twin.seconds)} s."
     ]
     lines += [f"It is {sentence}" for sentence in (choice_sentence(facts.candidates),) if sentence]
     ground = ground_line(facts.provenance)
@@ -285,20 +179,20 @@ def verdict(facts: FreeRunFacts) -> list[str]:
     plain = _plain_answers(facts)
     for name, scores in facts.models.items():
         if name != TWIN and plain:
-            lines.append(f"The floor {name} is off by {number(scores['velocity_mae']['mean'])}.")
-        elif name != TWIN and scores["stroke_error"] and scores["stroke_error"][-1]["mean"] is not None:
-            last = scores["stroke_error"][-1]
-            lines.append(f"The floor {name} is off by {number(last['mean'])} {last['unit']} then.")
+            lines.append(f"The floor {name} is off by {number(scores.velocity_mae.mean)}.")
+        elif name != TWIN and scores.stroke_error and scores.stroke_error[-1].mean is not None:
+            last = scores.stroke_error[-1]
+            lines.append(f"The floor {name} is off by {number(last.mean)} {last.unit} then.")
     return lines
 
 
-def ground_line(provenance: Mapping[str, Any]) -> str:
+def ground_line(provenance: Provenance) -> str:
     """The law of the ground and what it explains, in a sentence; empty where the twin knows free air alone.
 
     Args:
         provenance: of the run; what is not as `edp twin` wrote it is passed over.
     """
-    facts = provenance.get("ground")
+    facts = provenance.more.get("ground")
     if not isinstance(facts, Mapping):
         return ""
     explained, kind = facts.get("explained"), facts.get("kind")
@@ -312,22 +206,22 @@ def ground_line(provenance: Mapping[str, Any]) -> str:
 def tiles(facts: FreeRunFacts) -> list[tuple[str, str, str]]:
     """Key figures: value, unit, what it is."""
     twin = facts.twin
-    velocity = twin["velocity_mae"]
+    velocity = twin.velocity_mae
     if mixed_units(twin):
         rows = actuator_tiles(twin)
     else:
-        rows = [(number(velocity["mean"]), velocity["unit"] or "", "mean absolute error of the velocities")]
+        rows = [(number(velocity.mean), velocity.unit or "", "mean absolute error of the velocities")]
         rows += [
-            (number(row["mean"]), row["unit"] or "", f"stroke error after {figure(row['at_s'])} s")
-            for row in (*twin["stroke_error"][:1], *twin["stroke_error"][-1:])
+            (number(row.mean), row.unit or "", f"stroke error after {figure(row.at_s)} s")
+            for row in (*twin.stroke_error[:1], *twin.stroke_error[-1:])
         ]
-    if twin["pressure_nrmse"]["by_channel"]:
-        rows.append((number(twin["pressure_nrmse"]["mean"]), "", "error of the pressures in their deviations (NRMSE)"))
-    rows.append((percent(twin["diverged"]), "", "of the runs diverged"))
-    intervals = twin.get("intervals")
-    if intervals is not None and intervals["at"]:
-        shares = [row[part]["share"] for row in intervals["at"] for part in PARTS if part in row]
-        meant = f"of the truth in intervals meant for {percent(intervals['coverage'])}"
+    if twin.pressure_nrmse.by_channel:
+        rows.append((number(twin.pressure_nrmse.mean), "", "error of the pressures in their deviations (NRMSE)"))
+    rows.append((percent(twin.diverged), "", "of the runs diverged"))
+    intervals = twin.intervals
+    if intervals is not None and intervals.at:
+        shares = [part.share for row in intervals.at for part in row.parts().values()]
+        meant = f"of the truth in intervals meant for {percent(intervals.coverage)}"
         rows.append((" to ".join(dict.fromkeys(map(percent, (min(shares), max(shares))))), "", meant))
     return rows
 
@@ -338,41 +232,47 @@ def free_run_tables(facts: FreeRunFacts) -> dict[str, Table]:
     sheets = [
         *([actuator_sheet(facts.models)] if mixed_units(twin) else []),
         _summary_sheet("models", "The twin and its floors", "Model", facts.models, frozenset({0})),
-        _summary_sheet("recordings", "By recording, the worst first", "Recording", _worst(twin["by_recording"])),
-        _summary_sheet("driving", "By way of driving", "Way of driving", twin["by_driving"]),
+        _summary_sheet("recordings", "By recording, the worst first", "Recording", _worst(twin.by_recording)),
+        _summary_sheet("driving", "By way of driving", "Way of driving", twin.by_driving),
         _situation_sheet(twin),
         *([candidate_sheet(facts.candidates)] if facts.candidates else []),
-        *([_coverage_sheet(twin["intervals"])] if "intervals" in twin else []),
-        *([_ahead_sheet(facts)] if "ahead" in twin else []),
-        *([_beside_sheet(twin["beside"])] if "beside" in twin else []),
+        *([] if twin.intervals is None else [_coverage_sheet(twin.intervals)]),
+        *([] if twin.ahead is None else [_ahead_sheet(facts, twin.ahead)]),
+        *([] if twin.beside is None else [_beside_sheet(twin.beside)]),
     ]
     return {sheet.name: sheet for sheet in sheets if sheet.rows}
 
 
-def _worst(summaries: Mapping[str, Any]) -> dict[str, Any]:
+def _worst(summaries: Mapping[str, RunSummary]) -> dict[str, RunSummary]:
     """The recordings with the largest errors first, by the strokes at the end, or else by the velocities."""
 
-    def size(summary: Mapping[str, Any]) -> float:
-        last = summary["stroke_error"][-1] if summary["stroke_error"] else summary["velocity_mae"]
-        return float(last["mean"] if last["mean"] is not None else max(last["by_channel"].values(), default=0.0))
+    def size(summary: RunSummary) -> float:
+        last: ChannelErrors = summary.stroke_error[-1] if summary.stroke_error else summary.velocity_mae
+        if last.mean is not None:
+            return last.mean
+        return max((value or 0.0 for value in last.by_channel.values()), default=0.0)
 
     ranked = sorted(summaries.items(), key=lambda entry: -size(entry[1]))
     return dict(ranked[:MOST_ROWS])
 
 
 def _summary_sheet(
-    name: str, caption: str, first: str, summaries: Mapping[str, Any], marked: frozenset[int] = frozenset()
+    name: str,
+    caption: str,
+    first: str,
+    summaries: Mapping[str, RunSummary | FreeRunScores],
+    marked: frozenset[int] = frozenset(),
 ) -> Table:
     """A row of errors for each of several sets of runs."""
     rows: list[tuple[Value, ...]] = []
     heads: list[tuple[str, str]] = []
     for label, entry in summaries.items():
-        strokes = entry["stroke_error"]
-        heads = [(f"Stroke after {figure(row['at_s'])} s", row["unit"] or "") for row in strokes]
-        velocity = entry["velocity_mae"]
-        cells = (velocity["mean"], *(row["mean"] for row in strokes), entry["pressure_nrmse"]["mean"])
-        rows.append((label, entry["runs"], *cells, percent(entry["diverged"])))
-    unit = next((entry["velocity_mae"]["unit"] for entry in summaries.values()), None) or ""
+        strokes = entry.stroke_error
+        heads = [(f"Stroke after {figure(row.at_s)} s", row.unit or "") for row in strokes]
+        velocity = entry.velocity_mae
+        cells = (velocity.mean, *(row.mean for row in strokes), entry.pressure_nrmse.mean)
+        rows.append((label, entry.runs, *cells, percent(entry.diverged)))
+    unit = next((entry.velocity_mae.unit for entry in summaries.values()), None) or ""
     titles = [("Velocity MAE", unit), *heads, ("Pressure NRMSE", "")]
     # Nothing is known of a column where units differ, or without pressures.
     full = [i for i in range(len(titles)) if any(row[2 + i] is not None for row in rows)]
@@ -383,117 +283,113 @@ def _summary_sheet(
     return Table(caption, (Column(first), count, *shown, Column("Diverged")), tuple(rows), marked, name=name)
 
 
-def _situation_sheet(twin: Mapping[str, Any]) -> Table:
+def _situation_sheet(twin: FreeRunScores) -> Table:
     rows: list[tuple[Value, ...]] = []
-    for name, row in twin["situations"].items():
-        strokes = row.get("stroke_error", {"mean": None, "unit": None})
-        cells = (row["velocity_mae"]["mean"], strokes["mean"], row["pressure_nrmse"]["mean"])
-        rows.append((SITUATIONS.get(name, name), percent(row["share"]), *cells))
-    velocity = next((r["velocity_mae"]["unit"] for r in twin["situations"].values() if r["velocity_mae"]["unit"]), "")
-    stroke = next((r["stroke_error"]["unit"] for r in twin["situations"].values() if r.get("stroke_error")), "") or ""
+    for name, row in twin.situations.items():
+        strokes = None if row.stroke_error is None else row.stroke_error.mean
+        cells = (row.velocity_mae.mean, strokes, row.pressure_nrmse.mean)
+        rows.append((SITUATIONS.get(name, name), percent(row.share), *cells))
+    velocity = next((r.velocity_mae.unit for r in twin.situations.values() if r.velocity_mae.unit), "")
+    stroke = next((r.stroke_error.unit for r in twin.situations.values() if r.stroke_error), "") or ""
     titles = [("Velocity MAE", velocity), ("Stroke error", stroke), ("Pressure NRMSE", "")]
     shown = [Column(title, unit, figures(row[2 + i] for row in rows)) for i, (title, unit) in enumerate(titles)]
     heads = (Column("What the actuator did"), Column("Share of the time"), *shown)
     return Table("At end stops, at rest and in motion", heads, tuple(rows), name="situations")
 
 
-def _coverage_sheet(intervals: Mapping[str, Any]) -> Table:
-    parts = [part for part in PARTS if intervals["at"] and part in intervals["at"][0]]
+def _coverage_sheet(intervals: IntervalCoverage) -> Table:
+    covered = [(row.at_s, row.parts()) for row in intervals.at]
+    parts = list(covered[0][1]) if covered else []
     rows: list[tuple[Value, ...]] = []
     heads: list[Column] = [Column("After")]
     for part in parts:
-        unit = intervals["at"][0][part]["half_width"]["unit"] or ""
-        widths = figures(row[part]["half_width"]["mean"] for row in intervals["at"])
+        unit = covered[0][1][part].half_width.unit or ""
+        widths = figures(row[part].half_width.mean for _, row in covered)
         heads += [Column(f"{part.capitalize()} inside"), Column("half width", unit, widths)]
-    for row in intervals["at"]:
-        cells = [cell for part in parts for cell in (percent(row[part]["share"]), row[part]["half_width"]["mean"])]
-        rows.append((f"{figure(row['at_s'])} s", *cells))
-    caption = f"Share of the free runs whose truth lies in intervals meant to hold {percent(intervals['coverage'])}"
+    for at_s, row in covered:
+        cells = [cell for part in parts for cell in (percent(row[part].share), row[part].half_width.mean)]
+        rows.append((f"{figure(at_s)} s", *cells))
+    caption = f"Share of the free runs whose truth lies in intervals meant to hold {percent(intervals.coverage)}"
     return Table(caption, tuple(heads), tuple(rows), name="intervals")
 
 
-def _ahead_sheet(facts: FreeRunFacts) -> Table:
-    first = facts.twin["ahead"]
-    caption = f"{figure(first['seconds'])} s ahead of measured ports, told the commands in between"
+def _ahead_sheet(facts: FreeRunFacts, first: AheadErrors) -> Table:
+    caption = f"{figure(first.seconds)} s ahead of measured ports, told the commands in between"
     if mixed_units(facts.twin):
         return ahead_by_actuator(facts.models, caption)
     rows: list[tuple[Value, ...]] = []
     for name, scores in facts.models.items():
-        if "ahead" in scores:
-            ahead = scores["ahead"]
-            rows.append((name, *(ahead[key]["mean"] for key in ("velocity_mae", "stroke_error", "pressure_nrmse"))))
-    units = (first["velocity_mae"]["unit"] or "", first["stroke_error"]["unit"] or "", "")
+        ahead = scores.ahead
+        if ahead is not None:
+            rows.append((name, ahead.velocity_mae.mean, ahead.stroke_error.mean, ahead.pressure_nrmse.mean))
+    units = (first.velocity_mae.unit or "", first.stroke_error.unit or "", "")
     titles = ("Velocity MAE", "Stroke error", "Pressure NRMSE")
     shown = [Column(t, u, figures(r[1 + i] for r in rows)) for i, (t, u) in enumerate(zip(titles, units, strict=True))]
     return Table(caption, (Column("Model"), *shown), tuple(rows), frozenset({0}), name="ahead")
 
 
-def _beside_sheet(beside: Mapping[str, Any]) -> Table:
+def _beside_sheet(beside: PredictorComparison) -> Table:
     rows: list[tuple[Value, ...]] = [
-        (part, row["twin"]["unit"], row["twin"]["mean"], row["predictor"]["mean"])
-        for part, row in beside["errors"].items()
+        (part, row.twin.unit, row.twin.mean, row.predictor.mean) for part, row in beside.errors.items()
     ]
     both = figures(value for row in rows for value in row[2:])
     heads = (
         Column("MAE of"),
         Column("Unit"),
         Column("Twin, told the commands", "", both),
-        Column(beside["label"], "", both),
+        Column(beside.label, "", both),
     )
-    caption = (
-        f"Beside a look-ahead predictor, {figure(beside['seconds'])} s ahead at the same {beside['moments']:,} moments"
-    )
+    caption = f"Beside a look-ahead predictor, {figure(beside.seconds)} s ahead at the same {beside.moments:,} moments"
     return Table(caption, heads, tuple(rows), name="beside")
 
 
-def mixed_units(scores: Mapping[str, Any]) -> bool:
+def mixed_units(scores: FreeRunScores) -> bool:
     """Whether velocities of a twin have more than one unit."""
-    return bool(scores["velocity_mae"].get("units"))
+    return bool(scores.velocity_mae.units)
 
 
-def actuator_sheet(models: Mapping[str, Mapping[str, Any]]) -> Table:
+def actuator_sheet(models: Mapping[str, FreeRunScores]) -> Table:
     """A row for each actuator and model: errors of its velocity, and of its stroke by time, with their units."""
     columns = {
-        name: [("Velocity MAE", one["velocity_mae"])]
-        + [(f"Stroke after {figure(row['at_s'])} s", row) for row in one["stroke_error"]]
+        name: [
+            ("Velocity MAE", one.velocity_mae),
+            *((f"Stroke after {figure(row.at_s)} s", row) for row in one.stroke_error),
+        ]
         for name, one in models.items()
     }
     return _by_actuator("actuators", "The twin and its floors, each actuator in its units", columns)
 
 
-def ahead_by_actuator(models: Mapping[str, Mapping[str, Any]], caption: str) -> Table:
+def ahead_by_actuator(models: Mapping[str, FreeRunScores], caption: str) -> Table:
     """The same a few ticks ahead of measured ports."""
     columns = {
-        name: [("Velocity MAE", one["ahead"]["velocity_mae"]), ("Stroke error", one["ahead"]["stroke_error"])]
+        name: [("Velocity MAE", one.ahead.velocity_mae), ("Stroke error", one.ahead.stroke_error)]
         for name, one in models.items()
-        if "ahead" in one
+        if one.ahead is not None
     }
     return _by_actuator("ahead", caption, columns)
 
 
-def _by_actuator(name: str, caption: str, columns: Mapping[str, Sequence[tuple[str, Mapping[str, Any]]]]) -> Table:
+def _by_actuator(name: str, caption: str, columns: Mapping[str, Sequence[tuple[str, ChannelErrors]]]) -> Table:
     """Rows by actuator, then model; of each model titles and rows of errors, each by channel."""
     first = next(iter(columns.values()))
     rows: list[tuple[Value, ...]] = []
-    for which, velocity in enumerate(first[0][1]["by_channel"]):
+    for which, velocity in enumerate(first[0][1].by_channel):
         for model, entries in columns.items():
             cells = []
             for _, row in entries:
-                if row["by_channel"]:
-                    channel, value = list(row["by_channel"].items())[which]
-                    cells.append(f"{number(value)} {_unit(row, channel)}".strip())
+                if row.by_channel:
+                    channel, value = list(row.by_channel.items())[which]
+                    cells.append(f"{number(value)} {row.unit_of(channel)}".strip())
             rows.append((velocity, model, *cells))
-    titles = [title for title, row in first if row["by_channel"]]
+    titles = [title for title, row in first if row.by_channel]
     heads = tuple(Column(title) for title in ("Actuator", "Model", *titles))
     return Table(caption, heads, tuple(rows), frozenset(range(0, len(rows), len(columns))), name=name)
 
 
-def actuator_tiles(twin: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+def actuator_tiles(twin: FreeRunScores) -> list[tuple[str, str, str]]:
     """Key figures of each actuator: value, unit, what it is."""
-    row = twin["stroke_error"][-1] if twin["stroke_error"] else twin["velocity_mae"]
-    what = f"error of {{}} after {figure(row['at_s'])} s" if "at_s" in row else "mean absolute error of {}"
-    return [(number(value), _unit(row, name), what.format(name)) for name, value in row["by_channel"].items()]
-
-
-def _unit(row: Mapping[str, Any], channel: str) -> str:
-    return str(row.get("units", {}).get(channel) or row["unit"] or "")
+    row: ChannelErrors = twin.stroke_error[-1] if twin.stroke_error else twin.velocity_mae
+    at_s = row.at_s if isinstance(row, StrokeErrors) else None
+    what = "mean absolute error of {}" if at_s is None else f"error of {{}} after {figure(at_s)} s"
+    return [(number(value), row.unit_of(name), what.format(name)) for name, value in row.by_channel.items()]

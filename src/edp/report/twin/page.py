@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from edp.evaluation.free_run_file import PARTS
 from edp.report.common.page import Page, Section, Subsection
 from edp.report.common.provenance import provenance_rows
 from edp.report.twin import facts as words
@@ -31,6 +32,7 @@ def build_twin_report(run_folder: str | Path, output: str | Path | None = None, 
 
 def build_twin_page(facts: FreeRunFacts, title: str | None = None) -> Page:
     """Return the page of free runs; its title is that of the free runs if none is given."""
+    moments = facts.steps.moments if facts.steps else 0
     charts = {chart.name: chart for chart in twin_charts(facts)}
     tables = words.free_run_tables(facts)
     chart, table = charts.get, tables.get
@@ -48,7 +50,7 @@ def build_twin_page(facts: FreeRunFacts, title: str | None = None) -> Page:
                 [
                     "Measured up to the left edge, on the commands alone from there on. The band is the interval of "
                     "each answer, calibrated on free runs that the fit had not seen; it grows with the horizon.",
-                    *(Subsection([chart(f"runs_{part}")], part.capitalize()) for part in words.PARTS),
+                    *(Subsection([chart(f"runs_{part}")], part.capitalize()) for part in PARTS),
                 ],
             ),
             Section(
@@ -69,7 +71,7 @@ def build_twin_page(facts: FreeRunFacts, title: str | None = None) -> Page:
                 [
                     "What the twin would do if one command jumped upwards by half of its range while all others "
                     "stayed: the difference between two free runs, from "
-                    f"{facts.steps.get('moments', 0)} moments of recordings that trained nothing. It is the twin's "
+                    f"{moments} moments of recordings that trained nothing. It is the twin's "
                     "answer, not a measured one.",
                     chart("steps"),
                 ],

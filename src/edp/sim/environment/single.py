@@ -87,7 +87,7 @@ class ExcavatorEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._enter(start)
         return out[0][0], {**facts, "truth": self._truth(out[1][0])}
 
-    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, object]]:
         """Hold lever positions, shape (3,), for one tick.
 
         Raises:

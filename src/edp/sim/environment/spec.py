@@ -63,7 +63,7 @@ class EnvironmentSpec:
     lost_frames: float = 0.0
     start_strokes: tuple[float, float] = START_STROKES
     observed: tuple[str, ...] = OBSERVED
-    sensors: Mapping[str, Any] = field(default_factory=dict)
+    sensors: Mapping[str, object] = field(default_factory=dict)
     randomise: bool | float = False
     masses_t: tuple[float, float] = MASSES_T
     faults: tuple[FaultSpec, ...] = ()

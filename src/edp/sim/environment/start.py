@@ -37,7 +37,7 @@ MOST_SEED = 2**31 - 1
 
 def episode_start(
     spec: EnvironmentSpec, seed: int, options: Mapping[str, Any] | None
-) -> tuple[EpisodeStart, dict[str, Any]]:
+) -> tuple[EpisodeStart, dict[str, object]]:
     """Return the start of an episode, and its description for `info`.
 
     Raises:
@@ -59,7 +59,7 @@ def episode_start(
     start = EpisodeStart(
         scenario, machine, spec.hand, spec.loop_latency, spec.lost_frames, _strokes(options.get("strokes"))
     )
-    facts: dict[str, Any] = {"seed": seed, "machine": machine.name, "material": spec.material}
+    facts: dict[str, object] = {"seed": seed, "machine": machine.name, "material": spec.material}
     if spec.faults:
         facts["faults"] = "; ".join(map(fault_text, spec.faults))
     mass_t = known_mass(machine.name)

@@ -29,7 +29,7 @@ def sources(in_soil: bool) -> Mapping[str, tuple[int, float]]:
     return columns
 
 
-class Truth(Mapping[str, Any]):
+class Truth(Mapping[str, object]):
     """Noise-free channels in SI units: Table A.1 without accelerations, and the additional ones logged by `simulate`.
 
     Args:

@@ -87,8 +87,8 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
             array[:] = np.nan
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, object] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, object]]:
         """Begin episodes.
 
         Args:
@@ -111,7 +111,7 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
         infos = self._begin(mask, seeds, options)
         return self._present[0].copy(), {**infos, "truth": self._truth()}
 
-    def step(self, actions: Any) -> tuple[NDArray[np.float32], Array, Bools, Bools, dict[str, Any]]:
+    def step(self, actions: Any) -> tuple[NDArray[np.float32], Array, Bools, Bools, dict[str, object]]:
         """Hold lever positions, shape (num_envs, 3), for one tick.
 
         Raises:
@@ -127,7 +127,7 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
         stuck = ~self._begun if resets else ~self._begun | ended
         if stuck.any():
             raise ConfigError(f"episodes {shown(np.flatnonzero(stuck).tolist())} are not under way; call reset() first")
-        infos: dict[str, Any] = {}
+        infos: dict[str, object] = {}
         if resets and ended.any():
             # An episode that is reset in this step ignores its levers.
             self._episodes.step(self._levers, self._present, ~ended)
@@ -164,9 +164,9 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
         observation: NDArray[np.float32] = self._present[0][index].copy()
         return observation
 
-    def _begin(self, mask: Bools, seeds: Sequence[int | None], options: dict[str, Any]) -> dict[str, Any]:
+    def _begin(self, mask: Bools, seeds: Sequence[int | None], options: dict[str, object]) -> dict[str, object]:
         """Begin the masked episodes; returns what began."""
-        infos: dict[str, Any] = {}
+        infos: dict[str, object] = {}
         for index in np.flatnonzero(mask).tolist():
             seed = checked_seed(seeds[index])
             if seed is not None:
@@ -179,7 +179,7 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
             infos = self._add_info(infos, facts, index)
         return infos
 
-    def _next_at_once(self, truncated: Bools) -> dict[str, Any]:
+    def _next_at_once(self, truncated: Bools) -> dict[str, object]:
         """Begin the next episodes in the step in which the last ones ended, and keep what these showed last."""
         last_observations = np.full(self.num_envs, None, dtype=object)
         for index in np.flatnonzero(truncated).tolist():
@@ -207,7 +207,7 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
 
 
 def _side_by_side(
-    count: int, settings: EnvironmentSpec | Sequence[EnvironmentSpec] | None, changes: dict[str, Any]
+    count: int, settings: EnvironmentSpec | Sequence[EnvironmentSpec] | None, changes: dict[str, object]
 ) -> list[EnvironmentSpec]:
     """Return the settings of each machine.
 

@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -221,7 +221,7 @@ class FaultSpec:
         kind = FAULTS[self.kind]
         return kind.neutral * kind.units.get(kind.unit, 1.0)
 
-    def plain(self) -> dict[str, Any]:
+    def plain(self) -> dict[str, object]:
         """Convert to plain data; `FaultSpec(**fault.plain()) == fault`. Default values are omitted."""
         values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         return {key: value for key, value in values.items() if key == "kind" or value not in (None, "", 0.0)} | (

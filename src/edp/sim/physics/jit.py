@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from edp.signals import GROUND_POINTS
 from edp.storage.machine_code import Compiler, files_with
@@ -14,7 +13,7 @@ from edp.storage.portable import lock as lock_file
 # No "nnan"/"ninf": a diverging state must stay visible as NaN.
 # No reference counts ("_nrt"): compiled functions read and write arrays of their callers and allocate none. Counting
 # references to them, with atomic operations at every use, took 40 % of a step.
-OPTIONS: dict[str, Any] = {
+OPTIONS: dict[str, object] = {
     "fastmath": {"nsz", "arcp", "contract", "afn", "reassoc"},
     "error_model": "numpy",
     "_nrt": False,

@@ -6,7 +6,6 @@ import itertools
 import math
 import time
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -107,7 +106,7 @@ class PerceptronLearner:
         updates: int,
         began: float,
         edges: Sequence[int],
-        row: dict[str, Any] | None = None,
+        row: dict[str, object] | None = None,
     ) -> None:
         done, seconds = edges[check - 1] + update, time.perf_counter() - began
         rate = done * self.bagging.batch / max(seconds, 1e-9)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +55,7 @@ class IdentifiedNumber:
             return unknown
         return f"{'' if self.is_told else 'roughly '}{typed(self.low, 3)} to {typed(self.high, 3)}"
 
-    def plain(self) -> dict[str, Any]:
+    def plain(self) -> dict[str, object]:
         """For JSON."""
         return dict(vars(self))
 

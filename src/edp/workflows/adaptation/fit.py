@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +31,7 @@ Rows = NDArray[np.float64]
 HISTORY = "history.jsonl"
 
 
-def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) -> tuple[Adaptation, dict[str, Any]]:
+def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) -> tuple[Adaptation, dict[str, object]]:
     """Write a run whose network has an adaptation: it is exported with it and replayed with it.
 
     Args:
@@ -57,7 +56,7 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
     with Run.create(out, "adaptation", key, experiment_toml(experiment)) as target:
         if is_file_at(folder / HISTORY):
             write_bytes(target.file(HISTORY), (folder / HISTORY).read_bytes())
-        write_json(target.file("provenance.json"), provenance | {"adaptation": adaptation.digest})
+        write_json(target.file("provenance.json"), provenance.with_entries(adaptation=adaptation.digest).to_table())
         save_bundle(replace(bundle, adaptation=adaptation), target.file("bundle"))
         # The footprint counts the adaptation too; the one of the source run would state too little.
         write_json(target.file("footprint.json"), footprint_of(target.path)[0].to_json())

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,7 +88,7 @@ class Replay:
         pairs = [(base, adapted) for base, adapted in rows if base is not None and adapted is not None]
         return np.concatenate(pairs, axis=1) if pairs else np.empty((2, 0))
 
-    def to_json(self, task: Task, kinds: Sequence[Kind]) -> dict[str, Any]:
+    def to_json(self, task: Task, kinds: Sequence[Kind]) -> dict[str, object]:
         """MAE by horizon and time in motion, in the units of reports, and how often the adaptation was taken back."""
         facts = [KINDS[kind] for kind in kinds]
         factors = np.array([fact.report_factor for fact in facts])
@@ -188,7 +187,7 @@ def replay_run(
     learn: bool = True,
     progress: Progress = SILENT,
     twin: str | Path | None = None,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Replay logs through a run that `edp adapt` wrote; see `replay`.
 
     Args:

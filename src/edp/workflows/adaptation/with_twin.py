@@ -29,7 +29,7 @@ def tuned_spec(bundle: TwinBundle) -> TunedSpec:
     Raises:
         BundleError: its provenance holds another thing than a temperature there.
     """
-    celsius = bundle.provenance.get(OIL_C, math.nan)
+    celsius = bundle.provenance.more.get(OIL_C, math.nan)
     if isinstance(celsius, bool) or not isinstance(celsius, int | float) or abs(celsius) > HOTTEST_C:
         raise BundleError(
             f"the twin's provenance holds {OIL_C} = {str(celsius)[:40]!r}, which is no temperature of oil"

@@ -266,7 +266,7 @@ class Recordings(Sequence[Recording]):
 
 def read(
     path: str | Path | Sequence[str | Path],
-    map: str | Path | Mapping[str, Any] | None = None,
+    map: str | Path | Mapping[str, object] | None = None,
     repair: Mapping[str, str] | None = None,
 ) -> Recordings:
     """Read recordings from logs and folders of logs, from a data-set file, or from a store.

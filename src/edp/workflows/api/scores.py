@@ -9,7 +9,7 @@ from typing import Any
 from edp.evaluation.study import StudyFile, read_study
 from edp.report import Facts, headline
 from edp.report.notebook import html_of, score_figure, score_tables, study_figure, study_html, text_of
-from edp.report.run.facts import comparison_rows, score
+from edp.report.run.facts import METRICS, comparison_rows, score
 from edp.report.search import words
 from edp.table import Table
 from edp.workflows.api.frames import OneFrame
@@ -51,9 +51,9 @@ class JudgedScores(OneFrame):
         """Folder that holds ``scores.json``, or the evaluated bundle."""
         return self._facts.folder
 
-    def to_dict(self) -> Mapping[str, Any]:
+    def to_dict(self) -> Mapping[str, object]:
         """Everything that was measured: the content of ``scores.json``."""
-        return dict(self._facts.scores or {})
+        return {} if self._facts.scores is None else self._facts.scores.to_table()
 
     def table(self) -> ShownTable:
         """Return one table per horizon with every evaluated model, the best first."""
@@ -64,13 +64,13 @@ class JudgedScores(OneFrame):
         return score_figure(self._facts)
 
     def _columns(self) -> dict[str, list[Any]]:
-        rows = [{"horizon": k, **row} for k in sorted(self._facts.horizons) for row in comparison_rows(self._facts, k)]
-        keys = [key for key in rows[0] if key not in ("outputs", "is_network", "label")]
-        columns = {key: [row[key] for row in rows] for key in keys}
+        rows = [(k, row) for k in sorted(self._facts.horizons) for row in comparison_rows(self._facts, k)]
+        columns: dict[str, list[Any]] = {"horizon": [k for k, _ in rows]}
+        columns |= {key: [getattr(row, key) for _, row in rows] for key in ("model", *METRICS, "change", "seconds")}
         for target in self._facts.targets:
             for metric in ("mae", "rmse"):
                 columns[f"{metric} {target.name}"] = [
-                    score(self._facts.models[row["model"]], row["horizon"], metric, target.name) for row in rows
+                    score(self._facts.models[row.model], k, metric, target.name) for k, row in rows
                 ]
         return columns
 

@@ -39,7 +39,7 @@ def train(
     features: Sequence[str] | str | None = None,
     out: str | Path | None = None,
     preset: str | None = None,
-    settings: Mapping[str, Any] | str | Path | None = None,
+    settings: Mapping[str, object] | str | Path | None = None,
     progress: Progress = SILENT,
 ) -> TrainedPredictor:
     """Train a predictor of `targets` some samples ahead; what `edp train` does, with the same settings.
@@ -119,7 +119,7 @@ def _experiment(
     horizons: Sequence[int],
     features: Sequence[str] | str | None,
     preset: str | None,
-    settings: Mapping[str, Any] | str | Path | None,
+    settings: Mapping[str, object] | str | Path | None,
 ) -> Experiment | AutoSettings:
     if isinstance(targets, str):
         raise ConfigError(f"targets = '{targets}'; give a list of names, such as [\"{targets}\"]")
@@ -155,7 +155,7 @@ def _experiment(
     return experiment
 
 
-def _table(settings: Mapping[str, Any] | str | Path | None) -> Table:
+def _table(settings: Mapping[str, object] | str | Path | None) -> Table:
     if settings is None:
         return {}
     if isinstance(settings, Mapping):
@@ -163,7 +163,7 @@ def _table(settings: Mapping[str, Any] | str | Path | None) -> Table:
     return with_set_file(read_toml(settings), Path(settings).parent)
 
 
-def _nested(settings: Mapping[str, Any]) -> Table:
+def _nested(settings: Mapping[str, object]) -> Table:
     """Dotted keys as tables, in the order given."""
     table: Table = {}
     for key, value in settings.items():

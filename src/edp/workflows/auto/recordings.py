@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -140,7 +139,7 @@ class ReadOnce:
         self._recordings = self._recordings or self._source.read()
         return self._recordings
 
-    def to_plain(self) -> dict[str, Any]:
+    def to_plain(self) -> dict[str, object]:
         """Return the plain values of the source."""
         return self._source.to_plain()
 

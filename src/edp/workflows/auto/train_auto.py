@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import tomli_w
@@ -17,8 +16,8 @@ from edp.jobs import IN_PROCESS, Workers
 from edp.logs.source import DataSource
 from edp.networks.predictor import build_model
 from edp.progress import SILENT, Progress
-from edp.report.run.choice import FILE, FLOOR, PERSISTENCE, read_choice
-from edp.storage import write_json
+from edp.report.run.choice import FLOOR, PERSISTENCE, AutoCandidate, AutoChoice, ErrorBounds, Skill, read_choice
+from edp.settings.provenance import Provenance
 from edp.storage.runs import FINISHED, Run, check_claimable, run_key, state_of
 from edp.training import Bundle, load_bundle, make_bundle, save_bundle
 from edp.training.blas import one_blas_thread
@@ -59,16 +58,16 @@ class AutoResult:
 
     Attributes:
         bundle: the winner's.
-        facts: the content of ``auto.json``.
+        choice: the content of ``auto.json``.
     """
 
     bundle: Bundle
-    facts: dict[str, Any]
+    choice: AutoChoice
 
     @property
     def sentence(self) -> str:
         """What was chosen and why."""
-        return str(self.facts["sentence"])
+        return self.choice.sentence
 
 
 @one_blas_thread()
@@ -136,36 +135,36 @@ def _write_choice(
     if not trained:
         raise ConfigError(f"automatic choice: every candidate diverged: {'; '.join(failed.values())}")
     choice = choose({name: one.promise for name, one in trained.items()})
-    facts = _choice_facts(choice, trained, failed, data, settings, amount) | {
-        "key": run.key,
-        "notes": [*notes, *portfolio.notes],
-    }
+    stated = replace(
+        _stated(choice, trained, failed, data, settings, amount), key=run.key, notes=(*notes, *portfolio.notes)
+    )
     winner, floor = trained[choice.name], trained.get(FLOOR)
-    write_json(run.file(FILE), facts)
+    stated.write(run.path)
     if floor is not None and winner is not floor:
         # What the skill is measured against: `edp evaluate` needs its error on the test recordings, too.
-        save_bundle(make_bundle(floor.fitted.predictor, data, {"auto": facts["sentence"]}), run.file(FLOOR))
-    bundle = keep_fitted(run, source, winner.experiment, data, winner.fitted, {"auto": facts["sentence"]})
-    return AutoResult(bundle, facts)
+        provenance = Provenance().with_entries(auto=stated.sentence)
+        save_bundle(make_bundle(floor.fitted.predictor, data, provenance), run.file(FLOOR))
+    bundle = keep_fitted(run, source, winner.experiment, data, winner.fitted, {"auto": stated.sentence})
+    return AutoResult(bundle, stated)
 
 
 def _finished(folder: Path, key: str) -> AutoResult | None:
     """Return the result of a finished run with this key; None if there is none."""
     # The key stands in the choice, too: earlier versions wrote the winner's key into the identity of the run.
-    facts = read_choice(folder)
-    if facts is None or facts["key"] != key or state_of(folder) != FINISHED:
+    choice = read_choice(folder)
+    if choice is None or choice.key != key or state_of(folder) != FINISHED:
         return None
-    return AutoResult(load_bundle(folder), dict(facts))
+    return AutoResult(load_bundle(folder), choice)
 
 
-def _choice_facts(
+def _stated(
     choice: PortfolioChoice,
     trained: dict[str, TrainedCandidate],
     failed: dict[str, str],
     data: Prepared,
     settings: AutoSettings,
     amount: Amount,
-) -> dict[str, Any]:
+) -> AutoChoice:
     """Return the content of ``auto.json`` without its key.
 
     Args:
@@ -177,12 +176,12 @@ def _choice_facts(
         amount: what there was to learn from.
     """
     candidates = {
-        name: {
-            "label": CANDIDATES[name].label,
-            "seconds": round(one.fitted.seconds, 2),
-            "parameters": sum(parameter.numel() for parameter in one.fitted.predictor.parameters()),
-            "promise": in_report_units(one.promise.error(), data),
-        }
+        name: AutoCandidate(
+            label=CANDIDATES[name].label,
+            seconds=round(one.fitted.seconds, 2),
+            parameters=sum(parameter.numel() for parameter in one.fitted.predictor.parameters()),
+            promise=in_report_units(one.promise.error(), data),
+        )
         for name, one in trained.items()
     }
     promise, floor = trained[choice.name].promise, trained.get(FLOOR)
@@ -191,25 +190,27 @@ def _choice_facts(
     tested = sum(max(0, part.samples - data.task.max_horizon) for part in data.test)
     against = still if floor is None or choice.name == FLOOR else floor.promise
     skill = promise.relative_to(against)
-    return {
-        "schema": 1,
-        "minutes": settings.auto.minutes,
-        "rows": amount.rows,
-        "chosen": choice.name,
-        "best": choice.best,
-        "excess": dict(choice.excess),
-        "doubt": dict(choice.doubt),
-        "sentence": _sentence(choice, trained, amount, data),
-        "candidates": candidates,
-        "persistence": unchanged,
-        "interval": {side: in_report_units(bound, data) for side, bound in promise.interval(tested).items()},
-        "skill": {
-            "against": PERSISTENCE if against is still else FLOOR,
-            "promise": by_output(skill.error(), data),
-            "interval": {side: by_output(bound, data) for side, bound in skill.interval(tested).items()},
-        },
-        "failed": failed,
-    }
+    return AutoChoice(
+        minutes=settings.auto.minutes,
+        rows=amount.rows,
+        chosen=choice.name,
+        best=choice.best,
+        excess=dict(choice.excess),
+        doubt=dict(choice.doubt),
+        sentence=_sentence(choice, trained, amount, data),
+        candidates=candidates,
+        persistence=unchanged,
+        interval=ErrorBounds(
+            **{side: in_report_units(bound, data) for side, bound in promise.interval(tested).items()}
+        ),
+        skill=Skill(
+            against=PERSISTENCE if against is still else FLOOR,
+            promise=by_output(skill.error(), data),
+            interval=ErrorBounds(**{side: by_output(bound, data) for side, bound in skill.interval(tested).items()}),
+        ),
+        failed=failed,
+        key="",
+    )
 
 
 def _persistence(settings: AutoSettings, data: Prepared, amount: Amount) -> Promise:

@@ -211,7 +211,7 @@ def train_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithStat
         return {}
     note.unlink(missing_ok=True)
     fitted = trained.fitted
-    save_bundle(make_bundle(fitted.predictor, job.data, {}), job.folder / FITTED)
+    save_bundle(make_bundle(fitted.predictor, job.data), job.folder / FITTED)
     return WithState({}, pack(_FoldResult(trained.promise, fitted.history, fitted.seconds, fitted.targets_per_s)))
 
 

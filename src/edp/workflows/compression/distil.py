@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from edp.config.experiment import Change, Experiment, Table, load_experiment, plain_tree
-from edp.data.frozen import frozen_before, frozen_of, keep_frozen, refuse_frozen
+from edp.data.frozen import frozen_of, keep_frozen, refuse_frozen
 from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.data.unlabelled import unlabelled
@@ -18,9 +18,9 @@ from edp.networks.losses import LOSSES
 from edp.networks.predictor import Predictor
 from edp.progress import SILENT, Progress
 from edp.settings.bounds import MOST_LEVELS, MOST_UNITS, check_bounds, integer
+from edp.settings.provenance import read_provenance
 from edp.settings.tree import SettingsTree
 from edp.storage.paths import is_file_at
-from edp.storage.provenance import read_provenance
 from edp.storage.runs import check_claimable
 from edp.training import Bundle, load_bundle
 from edp.training.bundle import weights_digest
@@ -162,12 +162,12 @@ def read_run(run: str | Path, changes: Sequence[Change] = ()) -> tuple[Predictor
         )
     # Frozen sessions were judged once; a student that trains on them would make the test part worthless.
     keep_frozen(before.split, experiment.split)
-    return bundle.predictor, experiment, DataSource.from_plain(read_provenance(folder)["data"]["reader"])
+    return bundle.predictor, experiment, DataSource.from_plain(read_provenance(folder).origin.reader)
 
 
 def frozen_sessions(run: str | Path, experiment: Experiment) -> dict[str, str]:
     """Names by digest of the sessions that stay frozen for what comes of a run: of its split and of runs before it."""
-    return frozen_before(read_provenance(_run_folder(run))) | frozen_of(experiment.split)
+    return {**read_provenance(_run_folder(run)).origin.frozen} | frozen_of(experiment.split)
 
 
 def _run_folder(run: str | Path) -> Path:

@@ -16,6 +16,7 @@ from edp.errors import ExportError
 from edp.evaluation.compression import CompressedRow, Scores
 from edp.evaluation.controller import Budget, ResourceUsage
 from edp.evaluation.judge import score_predictions
+from edp.evaluation.scores_file import MEAN, ByHorizon, ModelScores, metric
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
 from edp.stats.pareto import pareto
@@ -48,7 +49,7 @@ class NetworkResult:
     plain: Scores
     formats: Mapping[str, FormatResult]
     left_out: Mapping[str, str]
-    recordings: Mapping[str, Mapping[str, Mapping[str, Table]]] = field(default_factory=dict)
+    recordings: Mapping[str, Mapping[str, ByHorizon]] = field(default_factory=dict)
 
     def to_json(self) -> Table:
         """Return plain values with lists, equal to those that are read from a record."""
@@ -78,7 +79,7 @@ class Evaluator:
 
     def __init__(self, data: Prepared, budget: Budget) -> None:
         self.data, self.budget = data, budget
-        self._plain: dict[int, Table] = {}
+        self._plain: dict[int, ModelScores] = {}
 
     def evaluate(self, network: Predictor, formats: Sequence[str], parameter_bytes: int | None = None) -> NetworkResult:
         """Evaluate a network in number formats.
@@ -103,17 +104,17 @@ class Evaluator:
                 scored[name] = self._score(deployed.predict(self.data.test), network)
             usage = deployed.resource_usage
             results[name] = FormatResult(_overall(scored[name]), usage, usage.over(self.budget))
-        recordings = {name: table["recordings"] for name, table in scored.items()}
+        recordings = {name: scores.recordings for name, scores in scored.items()}
         return NetworkResult(_overall(scored["float32"]), results, left_out, recordings)
 
-    def _score(self, predictions: list[np.ndarray], network: Predictor) -> Table:
+    def _score(self, predictions: list[np.ndarray], network: Predictor) -> ModelScores:
         return score_predictions(predictions, self.data, network.spec.window)
 
 
-def _overall(scored: Table) -> Scores:
+def _overall(scored: ModelScores) -> Scores:
     return {
-        horizon: {score: float(by_target["mean"][score]) for score in ("mae", "composite")}
-        for horizon, by_target in scored["overall"].items()
+        horizon: {score: metric(by_target[MEAN], score) for score in ("mae", "composite")}
+        for horizon, by_target in scored.overall.items()
     }
 
 

@@ -52,7 +52,8 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
         for name in ("history.jsonl", "footprint.json"):
             if is_file_at(folder / name):
                 write_bytes(target.file(name), (folder / name).read_bytes())
-        write_json(target.file("provenance.json"), provenance | {"number_format": integer_network.number_format})
+        provenance = provenance.with_entries(number_format=integer_network.number_format)
+        write_json(target.file("provenance.json"), provenance.to_table())
         # Scores are those of the float network; they would be wrong for the integer one.
         save_bundle(replace(bundle, predictor=integer_network, scores={}), target.file("bundle"))
     return errors | {"bytes": float(constant_bytes(integer_network.integers, bundle.adaptation))}

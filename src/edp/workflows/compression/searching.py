@@ -132,7 +132,7 @@ class DiskBench(Bench):
         status = read_object(run / "status.json", ("status",))["status"] if is_file_at(run / "status.json") else ""
         if status == "finished":
             bundle = load_bundle(run)
-            if bundle.provenance.get("strategy") == facts:
+            if bundle.provenance.more.get("strategy") == facts:
                 self.networks.step(self.done)
                 return bundle.predictor
 

@@ -81,7 +81,7 @@ class ControlBench:
         experiment: ControlExperiment,
         sources: ControlSources,
         models: ControlModels | None = None,
-        options: Mapping[str, Any] | None = None,
+        options: Mapping[str, object] | None = None,
     ) -> None:
         _check_used(experiment, sources)
         self.experiment, self.sources, self._options = experiment, sources, options

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -239,7 +238,7 @@ def _replayed(stored: KeptController, ticks: int) -> tuple[Array, Array]:
     return np.array(before), np.array(levers)
 
 
-def _most(options: Mapping[str, Any]) -> dict[str, int]:
+def _most(options: Mapping[str, object]) -> dict[str, int]:
     most = dict(MOST)
     for option, value in options.items():
         if option not in MOST:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,9 @@ from edp.progress import SILENT, Progress
 from edp.report import ControlFacts, build_control_page
 from edp.report.animation.page import scene_of
 from edp.report.common.provenance import provenance_rows
+from edp.settings.provenance import Provenance, new_provenance
 from edp.storage import make_folder, write_json
-from edp.storage.provenance import PROVENANCE, new_provenance
+from edp.storage.provenance import PROVENANCE
 from edp.storage.runs import Run, check_claimable, check_free, run_key
 from edp.workflows.control.bench import ControlBench, ControlSources, DividedLoops
 from edp.workflows.control.kept import keep_controller
@@ -88,14 +89,13 @@ def control_loops(
         keep_controller(run.path, bench.plant, bench.models, chosen.twin, (bench.tasks[0], results[0]))
         content = _content(experiment, bench.tasks, results)
         write_json(run.file(RESULTS), content)
-        provenance = new_provenance() | {
-            "seed": experiment.seed,
-            "machine": content["machine"],
-            "plant": content["plant"] if chosen.plant is None else str(chosen.plant),
-            "twin": str(chosen.twin or ""),
-            "predictor": str(chosen.predictor or ""),
-        }
-        write_json(run.file(PROVENANCE), provenance)
+        provenance = replace(new_provenance(), seed=experiment.seed).with_entries(
+            machine=content["machine"],
+            plant=content["plant"] if chosen.plant is None else str(chosen.plant),
+            twin=str(chosen.twin or ""),
+            predictor=str(chosen.predictor or ""),
+        )
+        write_json(run.file(PROVENANCE), provenance.to_table())
         page = build_control_page(_facts(run.path.name, content, results, provenance)).write(run.file(PAGE))
     forget_units(units)
     return ControlRun(content, results, page)
@@ -103,7 +103,7 @@ def control_loops(
 
 def _content(
     experiment: ControlExperiment, tasks: Sequence[ControlTask], results: Sequence[LoopResult]
-) -> dict[str, Any]:
+) -> dict[str, object]:
     scores = [result.score for result in results]
     energies = [score.energy_kj for score in scores]
     times = np.concatenate([result.solve_s for result in results]) * 1e6
@@ -146,7 +146,7 @@ def sentence(content: Mapping[str, Any], controller: str) -> str:
     )
 
 
-def _loop(task: ControlTask, result: LoopResult) -> dict[str, Any]:
+def _loop(task: ControlTask, result: LoopResult) -> dict[str, object]:
     times = result.solve_s * 1e6
     return {
         "name": result.recording.name,
@@ -163,7 +163,7 @@ def _loop(task: ControlTask, result: LoopResult) -> dict[str, Any]:
     }
 
 
-def _plain(events: Sequence[ControlEvent]) -> list[dict[str, Any]]:
+def _plain(events: Sequence[ControlEvent]) -> list[dict[str, object]]:
     return [{"tick": event.tick, "ticks": event.ticks, "text": event.text} for event in events]
 
 
@@ -172,7 +172,7 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _facts(
-    title: str, content: Mapping[str, Any], results: Sequence[LoopResult], provenance: Mapping[str, Any]
+    title: str, content: Mapping[str, object], results: Sequence[LoopResult], provenance: Provenance
 ) -> ControlFacts:
     recordings = [result.recording for result in results]
     scene = scene_of(recordings[0], str(content["machine"]))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import tomli_w
 
@@ -291,7 +290,7 @@ def _needed_map(source: DataSource, screening: ScreeningResult, first: Recording
         resolved_names.append(() if problems else tuple(entry.channel.name for entry in log_entries))
     if all(set(names) <= set(own) and own == resolved_names[0] for own in resolved_names):
         return None
-    entries: dict[str, Any] = {}
+    entries: dict[str, object] = {}
     for name in names:
         kind = first.channels[first.index(name)].kind
         # The kind is stated where the name alone does not tell it.

@@ -20,6 +20,7 @@ from edp.config.experiment import Experiment, FeatureSettings, plain_tree
 from edp.data.features import FEATURE_SETS, Derived
 from edp.data.task import TargetMode
 from edp.errors import ConfigError, closest
+from edp.evaluation.scores_file import MEAN, ScoresFile, metric
 from edp.jobs import IN_PROCESS, Workers
 from edp.jobs.workers import WorkUnit
 from edp.logs.source import DataSource
@@ -27,7 +28,7 @@ from edp.networks.streaming import parameters_of
 from edp.recording import Recording
 from edp.settings.bounds import SEED, check_bounds, check_count, integer
 from edp.signals import Kind
-from edp.storage import make_folder, read_object, write_json
+from edp.storage import make_folder, write_json
 from edp.storage.ledger import TrainingIdentity
 from edp.storage.paths import full_path
 from edp.training import Bundle, Diverged, TrainingProgress
@@ -120,7 +121,7 @@ class Trials:
     held_out: tuple[str, ...]
     notes: tuple[str, ...]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Plain values: the content of ``trials.json``."""
         return {"schema": 1, **asdict(self)}
 
@@ -307,7 +308,7 @@ class _Finished:
     features: int
     parameters: int
     seconds: float
-    scores: dict[str, Any]
+    scores: ScoresFile
 
     @staticmethod
     def of(bundle: Bundle, run: Path) -> _Finished:
@@ -315,8 +316,8 @@ class _Finished:
             bundle.task.inputs,
             len(bundle.task.features.features),
             parameters_of(bundle.predictor),
-            float(bundle.provenance["seconds"]),
-            read_object(run / "scores.json", ("models", "targets")),
+            bundle.provenance.seconds or 0.0,
+            ScoresFile.read(run),
         )
 
 
@@ -327,8 +328,8 @@ def _compared(finished: Mapping[str, Sequence[_Finished]], notes: Sequence[str],
     by_recording = {name: _recordings(finished[name], ahead) for name in names}
     trials = []
     for name in names:
-        models = [run.scores["models"]["network"] for run in finished[name]]
-        by_seed = {h: tuple(float(m["overall"][h]["mean"]["mae"]) for m in models) for h in ahead}
+        models = [run.scores.models["network"] for run in finished[name]]
+        by_seed = {h: tuple(metric(m.overall[h][MEAN], "mae") for m in models) for h in ahead}
         difference = None
         # An interval needs two recordings at least.
         if name != names[0] and len(by_recording[name][ahead[0]]) > 1:
@@ -347,16 +348,19 @@ def _compared(finished: Mapping[str, Sequence[_Finished]], notes: Sequence[str],
             )
         )
     scores = finished[names[0]][0].scores
-    persistence = {h: float(scores["models"]["persistence"]["overall"][h]["mean"]["mae"]) for h in ahead}
-    units = {target["unit"] for target in scores["targets"]}
+    persistence = {h: metric(scores.models["persistence"].overall[h][MEAN], "mae") for h in ahead}
+    units = {target.unit for target in scores.targets}
     unit = units.pop() if len(units) == 1 else "mixed units"
     return Trials(tuple(trials), persistence, unit, tuple(by_recording[names[0]][ahead[0]]), tuple(notes))
 
 
 def _recordings(runs: Sequence[_Finished], ahead: Sequence[str]) -> dict[str, dict[str, float]]:
     """Error by horizon and recording, mean over seeds."""
-    each = [run.scores["models"]["network"]["recordings"] for run in runs]
-    return {h: {name: float(np.mean([one[name][h]["mean"]["mae"] for one in each])) for name in each[0]} for h in ahead}
+    each = [run.scores.models["network"].recordings for run in runs]
+    return {
+        h: {name: float(np.mean([metric(one[name][h][MEAN], "mae") for one in each])) for name in each[0]}
+        for h in ahead
+    }
 
 
 def _difference(ours: Mapping[str, float], reference: Mapping[str, float]) -> PairedDifference:

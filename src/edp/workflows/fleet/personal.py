@@ -15,6 +15,7 @@ from edp.config.experiment import Change
 from edp.data.prepared import Prepared
 from edp.errors import ConfigError, EdpError, StorageError, closest
 from edp.evaluation.judge import score_predictions
+from edp.evaluation.scores_file import MEAN, metric
 from edp.jobs import Workers
 from edp.jobs.workers import UNITS, WorkUnit
 from edp.networks.predictor import Predictor
@@ -154,10 +155,8 @@ def network_of(folder: str | Path, machine: str, out: str | Path, base: str | Pa
     bundle = load_bundle(base or content["source"])
     delta = read_delta(Path(folder, DELTAS, file_of(machine)))
     own = with_delta(bundle.predictor, delta)
-    provenance = {
-        **bundle.provenance,
-        "strategy": {"method": "delta", "source": {"weights": delta.base}, **delta.facts},
-    }
+    strategy = {"method": "delta", "source": {"weights": delta.base}, **delta.facts}
+    provenance = bundle.provenance.with_entries(strategy=strategy)
     return save_bundle(replace(bundle, predictor=own, provenance=provenance, scores={}), out)
 
 
@@ -239,7 +238,7 @@ def _errors(network: Predictor, data: Prepared) -> float:
     """Mean absolute error over the outputs at the first horizon, on the ends of the recordings, in report units."""
     skip = max(network.spec.window, data.task.features.starting_ticks)
     scores = score_predictions(stream_predictions(network, data.test), data, skip)
-    return float(scores["overall"][str(data.task.horizons[0])]["mean"]["mae"])
+    return metric(scores.overall[str(data.task.horizons[0])][MEAN], "mae")
 
 
 @lru_cache(maxsize=1)

@@ -16,7 +16,10 @@ from typing import Any
 
 from edp import __version__
 from edp.errors import ConfigError, EdpError, StorageError, closest
+from edp.evaluation.scores_file import MEAN, ScoresFile, metric
 from edp.networks.predictor import describe
+from edp.settings.provenance import DataPart, Provenance, read_provenance
+from edp.settings.tree import Table
 from edp.storage import (
     check_writable,
     hold,
@@ -30,7 +33,6 @@ from edp.storage import (
 )
 from edp.storage.folders import check_kind
 from edp.storage.paths import entries_of, is_file_at, is_folder_at
-from edp.storage.provenance import read_provenance
 from edp.training import Bundle, load_bundle, save_bundle
 from edp.training.bundle import weights_digest
 from edp.training.delta import MOST_BYTES, read_delta
@@ -179,9 +181,9 @@ def _entered(top: Path, entry: RegistryEntry) -> RegistryEntry:
     return entry
 
 
-def _base_of(provenance: Mapping[str, Any]) -> str:
+def _base_of(provenance: Provenance) -> str:
     """Content address of the weights that a training began with."""
-    strategy = provenance.get("strategy")
+    strategy = provenance.more.get("strategy")
     if not isinstance(strategy, Mapping):
         return ""
     source = strategy.get("source")
@@ -189,24 +191,23 @@ def _base_of(provenance: Mapping[str, Any]) -> str:
     return str(weights or "")
 
 
-def _data_of(provenance: Mapping[str, Any]) -> dict[str, Any]:
-    data = provenance.get("data")
-    if not isinstance(data, Mapping):
+def _data_of(provenance: Provenance) -> Table:
+    data = provenance.data
+    if data is None:
         return {}
-    parts = [data[part] for part in ("train", "validation", "test") if isinstance(data.get(part), Mapping)]
+    parts = [part for part in (data.train, data.validation, data.test) if part is not None]
     return {
-        "source": str(data.get("source", "")),
-        "digest": str(data.get("digest", "")),
+        "source": data.source or "",
+        "digest": data.digest or "",
         "recordings": _recordings(parts),
-        "hours": round(sum(float(part.get("hours", 0.0)) for part in parts), 4),
+        "hours": round(sum(part.hours for part in parts), 4),
     }
 
 
-def _recordings(parts: Sequence[Mapping[str, Any]]) -> int:
+def _recordings(parts: Sequence[DataPart]) -> int:
     """How many recordings are divided into these parts; one that is cut by time is in all of them."""
-    listed = [part["names"] for part in parts if isinstance(part.get("names"), list)]
-    names = [PART.sub("", str(name)) for own in listed for name in own]
-    return len(set(names)) or sum(int(part.get("recordings", 0)) for part in parts)
+    names = {PART.sub("", name) for part in parts for name in part.names}
+    return len(names) or sum(part.recordings for part in parts)
 
 
 def _judge_of(folder: Path, bundle: Bundle) -> dict[str, Any]:
@@ -214,30 +215,26 @@ def _judge_of(folder: Path, bundle: Bundle) -> dict[str, Any]:
     file = folder / SCORES
     if not is_file_at(file):
         return {}
-    scores = object_with(read_object(file), ("models", "task", "targets"), f"'{file}'")
-    try:
-        errors = {
-            name: {horizon: entry["mean"]["mae"] for horizon, entry in model["overall"].items()}
-            for name, model in scores["models"].items()
-        }
-    except (KeyError, TypeError, AttributeError) as error:
-        raise StorageError(f"'{file}' is damaged: {error}; give `edp evaluate {folder}` again") from error
+    scores = ScoresFile.from_file(file)
+    errors = {
+        name: {horizon: metric(entry[MEAN], "mae") for horizon, entry in model.overall.items()}
+        for name, model in scores.models.items()
+    }
     best = {}
     for horizon in errors.get("network", {}):
         others = {name: by[horizon] for name, by in errors.items() if name != "network" and horizon in by}
         best[horizon] = min(others.items(), key=lambda pair: pair[1]) if others else None
-    provenance = read_provenance(folder) if is_file_at(folder / "provenance.json") else {}
-    data = provenance.get("data", {})
-    test = data.get("test", {}) if isinstance(data, Mapping) else {}
+    provenance = read_provenance(folder) if is_file_at(folder / "provenance.json") else Provenance()
+    test = provenance.origin.test
     return {
         "judged": "test recordings of the run",
-        "recordings": test.get("recordings"),
-        "hours": test.get("hours"),
-        "skip": scores["task"].get("skip"),
-        "unit": sorted({str(target["unit"]) for target in scores["targets"]}),
+        "recordings": test and test.recordings,
+        "hours": test and test.hours,
+        "skip": scores.task.skip,
+        "unit": sorted({target.unit for target in scores.targets}),
         "mae": errors.get("network", {}),
         "best_baseline": {horizon: None if pair is None else list(pair) for horizon, pair in best.items()},
-        "key": str(scores.get("key", "")),
+        "key": scores.key or "",
     }
 
 

@@ -16,6 +16,7 @@ from edp.data.prepared import Prepared
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, DataError, StorageError
 from edp.evaluation.free_run import check_runs, free_run_scores
+from edp.evaluation.free_run_file import FreeRunScores
 from edp.evaluation.guard import GREY, MACHINE
 from edp.logs.source import DataSource
 from edp.networks.twin import TWINS, TwinSpec, fit_scales
@@ -26,6 +27,7 @@ from edp.networks.twin.kinds import KINDS, AutoTwin
 from edp.networks.twin.residual import Residual
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
+from edp.settings.results import plain_value
 from edp.signals import Kind
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_files import load_machine, parse_machine
@@ -82,7 +84,7 @@ class Identified:
 
     machine: Machine
     rows: list[IdentifiedNumber]
-    scores: dict[str, Any]
+    scores: Mapping[str, FreeRunScores]
     notes: list[str]
 
 
@@ -192,9 +194,13 @@ def identify(
         scores = _scores(fitted, (base, written), parts, (data, settings))
         write_bytes(target, text.encode())
         facts = {"schema": 1, "machine": str(target), "base": base.name, "basis": BASIS, "notes": notes}
-        write_json(target.with_suffix(".json"), facts | {"numbers": [row.plain() for row in rows], "models": scores})
+        write_json(
+            target.with_suffix(".json"),
+            facts | {"numbers": [row.plain() for row in rows], "models": plain_value(scores)},
+        )
         seconds = time.process_time() - began
-        write_json(opened.file(PROVENANCE), training_provenance(source, data, settings.training.seed, 1, seconds))
+        provenance = training_provenance(source, data, settings.training.seed, 1, seconds)
+        write_json(opened.file(PROVENANCE), provenance.to_table())
         write_json(opened.file(RESULT), {"schema": 1, "machine": str(target)})
     return Identified(written, rows, scores, notes)
 
@@ -425,7 +431,7 @@ def _notes(parts: GreyParts) -> list[str]:
 
 def _scores(
     fitted: _Fitted, machines: tuple[Machine, Machine], parts: GreyParts, logs: tuple[Prepared, TwinExperiment]
-) -> dict[str, Any]:
+) -> dict[str, FreeRunScores]:
     """Free runs along held-out recordings: the identified machine, the guess, the grey box and the static map."""
     data, settings = logs
     twin, judge = fitted.twin, settings.judge

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,7 +89,7 @@ class LiveFront(LivePart):
 
         names = [channel.name for channel in channels]
         angles, strokes = ([f"{kind}_{i}" for i in (1, 2, 3)] for kind in ("JointAngle", "CylStroke"))
-        self.geometry: Mapping[str, Any] = geometry_of(machine)
+        self.geometry: Mapping[str, object] = geometry_of(machine)
         self._tables = None if set(angles) <= set(names) else stroke_tables(machine)
         self._columns = columns_of(angles if self._tables is None else strokes, channels, "the side view")
 

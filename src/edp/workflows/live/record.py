@@ -82,7 +82,7 @@ class McapRecorder:
         """Finish the file; without its end no reader takes it."""
         self._writer.close()
 
-    def _about(self) -> dict[str, Any]:
+    def _about(self) -> dict[str, object]:
         """As `edp.logs.formats.edp_metadata.facts_text` says it, without a digest: nobody knows it before the end."""
         channels = [
             {"name": c.name, "unit": c.unit, "kind": str(c.kind), "description": c.description} for c in self._channels

@@ -7,7 +7,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -28,11 +27,12 @@ from edp.monitor.residuals.virtual_sensors import VirtualSensorsSpec
 from edp.monitor.session_blocks import SessionBlocks, session_means
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
+from edp.settings.provenance import new_provenance
 from edp.signals import Channel
 from edp.storage import write_json
 from edp.storage.headers import model_digest
 from edp.storage.paths import is_there
-from edp.storage.provenance import PROVENANCE, new_provenance
+from edp.storage.provenance import PROVENANCE
 from edp.storage.reading import object_with
 from edp.storage.runs import Run, check_claimable, run_key
 from edp.training.blas import one_blas_thread
@@ -109,7 +109,7 @@ def fit_monitor(
     settings = monitor_toml(experiment)
     models = [model_digest(run) for run in runs]
     origin = source.origin(recordings)
-    key = run_key({"monitor": settings, "models": models}, origin["digest"])
+    key = run_key({"monitor": settings, "models": models}, origin.digest or "")
     with Run.create(out, "monitor", key, settings) as opened:
         if opened.is_finished:
             return _read_fitted(opened.path, experiment)
@@ -117,8 +117,8 @@ def fit_monitor(
             side_by_side = UnitMap(staying, opened.path, key)
             fitted = fit_to_recordings(recordings, experiment, bundles, progress, side_by_side=side_by_side)
         fitted = replace(fitted, seconds=fitted.seconds + side_by_side.seconds)
-        provenance = new_provenance(origin) | {"seed": experiment.seed, "seconds": round(fitted.seconds, 2)}
-        write_json(opened.file(PROVENANCE), provenance)
+        provenance = replace(new_provenance(origin), seed=experiment.seed, seconds=round(fitted.seconds, 2))
+        write_json(opened.file(PROVENANCE), provenance.to_table())
         fitted = replace(fitted, folder=save_monitor(fitted.monitor, opened.path))
     forget_units(opened.path / UNITS)
     return fitted
@@ -225,7 +225,7 @@ def _assembled(
 ) -> Monitor:
     """The monitor without a dictionary; `rest` are the sessions that trained no residual."""
     doubtful = fitted.doubtful
-    provenance: dict[str, Any] = {
+    provenance: dict[str, object] = {
         "sessions": len(sessions),
         "hours": sum(session.duration_s for session in sessions) / 3600.0,
         "doubtful": list(doubtful),

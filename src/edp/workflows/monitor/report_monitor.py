@@ -16,8 +16,9 @@ from edp.monitor.traces import read_traces
 from edp.report.common.provenance import provenance_rows
 from edp.report.monitor.facts import AlarmFacts, MonitorFacts
 from edp.report.monitor.page import build_monitor_page
+from edp.settings.provenance import Provenance
 from edp.storage import JSON_BYTES, object_with, parse_json, read_object, read_text
-from edp.storage.headers import check_files
+from edp.storage.headers import FILES, check_files
 from edp.storage.paths import full_path, is_there
 from edp.storage.provenance import PROVENANCE
 from edp.storage.runs import IDENTITY, missing_text
@@ -60,7 +61,7 @@ def read_run(folder: Path, title: str | None = None) -> MonitorFacts:
     if not is_there(folder / ALARM_LOG):
         raise StorageError(missing_text(folder, "monitor run"))
     content = read_object(file, ("promise", "monitor", "classes", "confusions"))
-    check_files(content, folder, "run the monitor again")
+    check_files(content.get(FILES, {}), folder, "run the monitor again")
     where = f"'{file}'"
     pairs, classes = content["confusions"], content["classes"]
     if not isinstance(pairs, list) or len(pairs) > MOST_PAIRS or type(classes) is not int or classes < 0:
@@ -82,12 +83,12 @@ def read_run(folder: Path, title: str | None = None) -> MonitorFacts:
     )
 
 
-def _provenance(folder: Path, content: Mapping[str, Any]) -> Mapping[str, Any]:
+def _provenance(folder: Path, content: Mapping[str, object]) -> Provenance:
     file = folder / PROVENANCE
-    return {**content, **(read_object(file) if is_there(file) else {})}
+    return Provenance.from_table({**content, **(read_object(file) if is_there(file) else {})}, f"'{file}'")
 
 
-def _remarks(content: Mapping[str, Any], where: str) -> dict[str, list[str]]:
+def _remarks(content: Mapping[str, object], where: str) -> dict[str, list[str]]:
     """What is to be said of recordings, with their names; runs of earlier versions have less of it.
 
     Raises:
@@ -137,7 +138,7 @@ def _alarm(value: Any, where: str) -> AlarmFacts:
 
 def _cause(value: Any, where: str) -> Cause:
     names = [entry.name for entry in fields(Cause)]
-    entry: Mapping[str, Any] = object_with(value, names, where)
+    entry: Mapping[str, object] = object_with(value, names, where)
     if entry["at_fault"] not in ("sensor", "machine", "none") or not isinstance(entry["grave"], bool):
         raise StorageError(f"{where}: a cause is damaged; run the monitor again")
     kind, site, component, unit, words = (

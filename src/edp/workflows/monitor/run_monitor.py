@@ -26,11 +26,12 @@ from edp.monitor.traces import RecordingTrace, RunTraces, write_traces
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.report.monitor.facts import start_time
+from edp.settings.provenance import new_provenance
 from edp.storage import write_bytes, write_json
 from edp.storage.headers import FILES, digests_of, model_digest
 from edp.storage.ledger import TrainingIdentity, WithState
 from edp.storage.paths import full_path
-from edp.storage.provenance import PROVENANCE, new_provenance
+from edp.storage.provenance import PROVENANCE
 from edp.storage.runs import Run, check_claimable, run_key
 
 ALARM_LOG, RESULT = "alarms.jsonl", "monitor_run.json"
@@ -82,7 +83,7 @@ class MonitorRun:
         """Alarms that say the same, together; see `episodes`."""
         return episodes(self.alarms)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Plain JSON values."""
         return {
             "hours": self.hours,
@@ -147,10 +148,11 @@ def run_monitor(
     if out is None:
         return _watch_all(monitor, folder, recordings, None, progress, workers)
     origin = source.origin(recordings)
-    key = run_key({"monitor": model_digest(folder)}, origin["digest"])
+    key = run_key({"monitor": model_digest(folder)}, origin.digest or "")
     with Run.create(out, "monitor run", key) as opened:
         run = _watch_all(monitor, folder, recordings, opened.file(UNITS), progress, workers)
-        write_json(opened.file(PROVENANCE), new_provenance(origin) | {"monitor": str(folder)})
+        provenance = new_provenance(origin).with_entries(monitor=str(folder))
+        write_json(opened.file(PROVENANCE), provenance.to_table())
         _write(run, opened.path, str(folder))
     forget_units(opened.file(UNITS))
     return run

@@ -10,7 +10,6 @@ from typing import Any
 from edp import __version__
 from edp.config.experiment import Experiment, plain_tree
 from edp.data.episodes import by_machine
-from edp.data.frozen import frozen_before
 from edp.data.prepared import Prepared
 from edp.data.splits import ByMachine
 from edp.errors import BundleError, ConfigError
@@ -157,7 +156,7 @@ def _start(path: str | Path) -> tuple[Predictor, dict[str, str]]:
     predictor = bundle.predictor
     if predictor.number_format != "float32":
         raise BundleError(f"'{path}' is a network in {predictor.number_format}, which cannot be trained on")
-    return predictor, frozen_before(bundle.provenance)
+    return predictor, dict(bundle.provenance.origin.frozen)
 
 
 def _carrying(experiment: Experiment, episodic: bool, rate_hz: float) -> Experiment:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -102,7 +101,7 @@ def _without_shared_end(one: str, other: str) -> tuple[str, str]:
     return one[: len(one) - shared], other[: len(other) - shared]
 
 
-def choose_split(group: LogGroup, proposal: MapProposal, targets: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
+def choose_split(group: LogGroup, proposal: MapProposal, targets: Sequence[str]) -> tuple[dict[str, object], list[str]]:
     """Whole logs where there are many, else time; blocks where ends are unlike the rest; and why, for notes."""
     idle = _rests_in_most(group, proposal, targets) if len(group.paths) >= _LEAST_RECORDINGS else ""
     if len(group.paths) >= _LEAST_RECORDINGS and not idle:

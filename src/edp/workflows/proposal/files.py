@@ -30,9 +30,9 @@ def horizons_for(rate_hz: float | None) -> tuple[int, int]:
     return 1, ahead if ahead > 1 else _SLOW_TICKS
 
 
-def map_table(signal_map: SignalMap) -> dict[str, Any]:
+def map_table(signal_map: SignalMap) -> dict[str, object]:
     """A signal map as a file has it, without what is as usual."""
-    table: dict[str, Any] = {}
+    table: dict[str, object] = {}
     for key in ("time", "sample_time_s", "rate_hz"):
         value = getattr(signal_map, key)
         if value is not None:
@@ -73,7 +73,9 @@ def toml_text(table: dict[str, Any], remarks: Iterable[str] = ()) -> str:
     return "".join(f"# {line}\n" for line in visible) + tomli_w.dumps(table)
 
 
-def settings_text(proposal: MapProposal, channels: Sequence[str], targets: Sequence[str], split: dict[str, Any]) -> str:
+def settings_text(
+    proposal: MapProposal, channels: Sequence[str], targets: Sequence[str], split: dict[str, object]
+) -> str:
     """Settings as a file has them: task, features and split."""
     clock = proposal.clock
     rate = clock.wanted_hz or clock.rate_hz
@@ -108,7 +110,7 @@ def data_set_text(
     """
     if not recordings:
         raise DataError("no path of these logs can be listed in a file ($ or unprintable characters); rename them")
-    table: dict[str, Any] = ({"map": map_file} if map_file else {}) | ({"repair": repair} if repair else {})
+    table: dict[str, object] = ({"map": map_file} if map_file else {}) | ({"repair": repair} if repair else {})
     table["recordings"] = recordings
     return toml_text(table, ["Proposed by edp init: the logs with one set of columns."])
 

@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from edp.errors import ConfigError, StorageError, count_of
 from edp.logs.proposal.experiments import Experiments, part_experiments
@@ -197,7 +196,7 @@ def propose(path: str | Path | Sequence[str | Path], progress: Progress = SILENT
 
 def _recordings(
     group: LogGroup, proposal: MapProposal, experiments: Experiments | None
-) -> list[tuple[Path, dict[str, Any]]]:
+) -> list[tuple[Path, dict[str, object]]]:
     """The logs of a group as entries of a data set; an experiment has a map that names its variable."""
     if experiments is None:
         return [(path, {"path": str(full_path(path)), "name": name}) for path, name in named_paths(group.paths)]

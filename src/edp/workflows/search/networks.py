@@ -6,14 +6,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from edp.config.experiment import Experiment, Table, experiment_toml
+from edp.config.experiment import Experiment, experiment_toml
 from edp.data.frozen import ByFrozen, Session
 from edp.data.prepared import Prepared, prepare
 from edp.evaluation.footprint import footprint
 from edp.logs.source import DataSource
 from edp.networks.predictor import Predictor
+from edp.settings.provenance import Provenance
 from edp.storage import write_json
 from edp.storage.paths import full_path
+from edp.storage.provenance import PROVENANCE
 from edp.storage.runs import Run, run_key
 from edp.training import make_bundle, save_bundle
 from edp.training.provenance import training_provenance
@@ -81,21 +83,20 @@ def write_networks(
     return written
 
 
-def _write_run(folder: Path, network: Predictor, experiment: Experiment, data: Prepared, facts: Table) -> None:
+def _write_run(
+    folder: Path, network: Predictor, experiment: Experiment, data: Prepared, provenance: Provenance
+) -> None:
     # The recipe is part of the key: another recipe of the same settings is another run.
-    key = run_key({"experiment": experiment_toml(experiment), "made by": facts["search"]}, data.digest)
+    key = run_key({"experiment": experiment_toml(experiment), "made by": provenance.more["search"]}, data.digest)
     with Run.create(folder, "network", key, experiment_toml(experiment)) as run:
-        write_json(run.file("provenance.json"), facts)
+        write_json(run.file(PROVENANCE), provenance.to_table())
         write_json(run.file("footprint.json"), footprint(network).to_json())
-        save_bundle(make_bundle(network, data, facts), run.file("bundle"))
+        save_bundle(make_bundle(network, data, provenance), run.file("bundle"))
 
 
-def _provenance(source: DataSource, experiment: Experiment, data: Prepared, recipe: Recipe) -> Table:
+def _provenance(source: DataSource, experiment: Experiment, data: Prepared, recipe: Recipe) -> Provenance:
     training, split = experiment.training, experiment.split
     frozen = split.frozen if isinstance(split, ByFrozen) else {}
-    facts = {
-        "regime": training.chunks.regime,
-        "device": training.device,
-        "search": {"phase": NAME, "recipe": recipe.to_json()},
-    }
-    return training_provenance(source, data, training.seed, training.threads, 0.0, frozen) | facts
+    provenance = training_provenance(source, data, training.seed, training.threads, 0.0, frozen)
+    search = {"phase": NAME, "recipe": recipe.to_json()}
+    return provenance.with_entries(regime=training.chunks.regime, device=training.device, search=search)

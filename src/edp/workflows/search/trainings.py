@@ -19,6 +19,7 @@ from edp.errors import ConfigError, DataError
 from edp.evaluation.footprint import parameters_and_macs
 from edp.evaluation.judge import JudgeSpec, judge, score_predictions
 from edp.evaluation.mac_check import check_counted
+from edp.evaluation.scores_file import MEAN, ByHorizon, metric
 from edp.logs.source import DataSource
 from edp.networks.predictor import build_model
 from edp.networks.running import window_predictions
@@ -187,9 +188,9 @@ def train_part(plain: Table, start: bytes | None = None) -> tuple[Table, bytes |
     if windowed:
         # Windows have no start-up of their own; the first whole one ends at the window's last tick.
         skip = max(spec.skip or 0, experiment.model.window, data.task.features.starting_ticks)
-        by_recording = score_predictions(window_predictions(fitted.predictor, data.test), data, skip)["recordings"]
+        by_recording = score_predictions(window_predictions(fitted.predictor, data.test), data, skip).recordings
     else:
-        by_recording = judge(fitted.predictor, data, spec, "").scores["models"]["network"]["recordings"]
+        by_recording = judge(fitted.predictor, data, spec, "").scores.models["network"].recordings
     sessions = session_scores(by_recording)
     parameters, macs_tick = parameters_and_macs(fitted.predictor.costs())
     result = {
@@ -224,10 +225,12 @@ def experiment_of(order: TrainingRequest) -> Experiment:
     return replace(experiment, training=training)
 
 
-def session_scores(recordings: Mapping[str, Mapping[str, Table]]) -> SessionScores:
+def session_scores(recordings: Mapping[str, ByHorizon]) -> SessionScores:
     """Return the means over outputs of the scores by recording and horizon that `score_predictions` gives."""
     return {
-        name: {horizon: {score: scores["mean"][score] for score in SCORES} for horizon, scores in horizons.items()}
+        name: {
+            horizon: {score: metric(scores[MEAN], score) for score in SCORES} for horizon, scores in horizons.items()
+        }
         for name, horizons in recordings.items()
     }
 

@@ -56,7 +56,7 @@ class TransferCase:
         name: str,
         training: TrainingSpec,
         strategy: Callable[[], TrainingStrategy] | None,
-        facts: Mapping[str, Any] | None = None,
+        facts: Mapping[str, object] | None = None,
         phase: str = "",
         judged: Sequence[Series] = (),
         centred: bool = True,

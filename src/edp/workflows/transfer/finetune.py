@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +16,18 @@ from edp import __version__
 from edp.config.experiment import Change, Experiment
 from edp.data.frozen import refuse_frozen
 from edp.data.prepared import Prepared, prepare
+from edp.data.series import Series
 from edp.errors import ConfigError
+from edp.evaluation.scores_file import ScoredTarget
+from edp.evaluation.transfer_file import MethodScores, PartMinutes, TransferData, TransferFile, TransferTask
 from edp.jobs import IN_PROCESS, Workers
 from edp.jobs.workers import WorkUnit
 from edp.logs.source import DataSource
 from edp.networks.predictor import describe
 from edp.progress import SILENT, Progress
 from edp.signals import KINDS
-from edp.storage import write_bytes, write_json
-from edp.storage.headers import FILES, digests_of
+from edp.storage import write_bytes
+from edp.storage.headers import digests_of
 from edp.storage.ledger import TrainingIdentity
 from edp.storage.paths import full_path
 from edp.storage.runs import Run, check_claimable, check_visible
@@ -37,7 +40,7 @@ from edp.workflows.transfer.methods import METHODS, Made, Method, code_names
 from edp.workflows.transfer.scores import MeasuredMethod, distributions, errors_of, excerpts, measure
 from edp.workflows.transfer.source import SourceModel, read_source, target_experiment
 
-KIND, RESULT, SHOWN = "transfer", "transfer.json", "transfer_predictions.safetensors"
+KIND, SHOWN = "transfer", "transfer_predictions.safetensors"
 BEFORE = "direct"
 RENAMED = {"replay": "rehearsal", "replay_distilled": "rehearsal_distilled"}
 """Methods by their former names; ``edp replay`` judges a log with an adapted network and mixes no data."""
@@ -89,7 +92,7 @@ def finetune(
     out: str | Path,
     progress: Progress = SILENT,
     workers: Workers = IN_PROCESS,
-) -> dict[str, Any]:
+) -> TransferFile:
     """Train a network of one machine on for another, judge it beside baselines, and write a run folder.
 
     The source's scaling is carried and never fitted again. Each log is divided by time into training, validation and
@@ -137,9 +140,9 @@ def finetune(
                 progress.note(notes[-1])
             methods.step(number + 1)
         result, shown = _result(begun, data, experiment, order, results)
-        result |= {"logs": logs.label, "notes": notes}
         write_bytes(run.file(SHOWN), save(shown))
-        write_json(run.file(RESULT), result | {FILES: digests_of(run.path, SHOWN)})
+        result = replace(result, logs=logs.label, notes=tuple(notes), files=digests_of(run.path, SHOWN))
+        result.write(run.path)
         run.finish()
     return result
 
@@ -224,7 +227,7 @@ def target_data(
 
 def _result(
     source: SourceModel, data: Prepared, experiment: Experiment, order: FinetuneRequest, results: dict[str, Made]
-) -> tuple[dict[str, Any], dict[str, NDArray[np.float32]]]:
+) -> tuple[TransferFile, dict[str, NDArray[np.float32]]]:
     """Scores of all methods in both domains, and the predictions before and after that pictures show."""
     # The longest start-up of all methods, so that all are scored on the same ticks.
     skip = max(source.predictor.spec.window, experiment.judge.history, data.task.features.starting_ticks)
@@ -237,40 +240,43 @@ def _result(
         }
     pair = {name: values for name, values in predictions.items() if name in (BEFORE, order.method)}
     rate = data.task.rate_hz
-    parts = {part: getattr(data, part) for part in ("train", "validation", "test")}
     facts = [KINDS[kind] for kind in data.target_kinds]
-    result = {
-        "schema": 2,
-        "edp": __version__,
-        "method": order.method,
-        "before": BEFORE,
-        "network": describe(source.predictor.spec),
-        "settings": asdict(order.spec),
-        "source": source.facts,
-        "task": {"horizons": list(data.task.horizons), "rate_hz": rate, "skip": skip},
-        "targets": [
-            {"name": name, "description": text, "unit": fact.report_unit, "factor": fact.report_factor}
+
+    def minutes(series: Sequence[Series]) -> float:
+        return round(sum(one.samples for one in series) / rate / 60, 3)
+
+    result = TransferFile(
+        edp=__version__,
+        method=order.method,
+        before=BEFORE,
+        network=describe(source.predictor.spec),
+        settings=asdict(order.spec),
+        source=source.facts,
+        task=TransferTask(horizons=data.task.horizons, rate_hz=rate, skip=skip),
+        targets=tuple(
+            ScoredTarget(name=name, description=text, unit=fact.report_unit, factor=fact.report_factor)
             for name, text, fact in zip(data.task.targets, data.descriptions, facts, strict=True)
-        ],
-        "data": {
-            "recordings": len({part.name.partition("[")[0] for part in data.train}),
-            "minutes": {
-                part: round(sum(s.samples for s in part_series) / rate / 60, 3) for part, part_series in parts.items()
-            },
-        },
-        "methods": {name: _row(METHODS[name], one, domains, name) for name, one in results.items()},
-        "distributions": distributions({name: errors[name] for name in pair}, data.task.targets),
-    }
+        ),
+        data=TransferData(
+            recordings=len({part.name.partition("[")[0] for part in data.train}),
+            minutes=PartMinutes(
+                train=minutes(data.train), validation=minutes(data.validation), test=minutes(data.test)
+            ),
+        ),
+        methods={name: _scores(METHODS[name], one, domains, name) for name, one in results.items()},
+        distributions=distributions({name: errors[name] for name in pair}, data.task.targets),
+        notes=(),
+    )
     return result, excerpts(pair, data, skip)
 
 
-def _row(
+def _scores(
     method: type[Method], result: Made, domains: dict[str, dict[str, MeasuredMethod]], name: str
-) -> dict[str, Any]:
-    return {
-        "label": method.label,
-        "learned": result.learned,
-        "weights": None if result.network is None else weights_digest(result.network),
-        "domains": {domain: measured[name].overall for domain, measured in domains.items()},
-        "recordings": domains["target"][name].by_recording,
-    }
+) -> MethodScores:
+    return MethodScores(
+        label=method.label,
+        learned=result.learned,
+        weights=None if result.network is None else weights_digest(result.network),
+        domains={domain: measured[name].overall for domain, measured in domains.items()},
+        recordings=domains["target"][name].by_recording,
+    )

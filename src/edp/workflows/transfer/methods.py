@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from edp.networks.matrices import matrices_of
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
 from edp.registry import Registry
+from edp.settings.tree import Table
 from edp.training.averages import NoAverage
 from edp.training.bundle import weights_digest
 from edp.training.optimizers import AdamW, Discriminative, Sgd
@@ -123,7 +124,7 @@ class FewSteps(Method):
     def make(self, case: TransferCase) -> Made:
         """Take the steps; what did not adapt in the meta-learning does not here."""
         spec, source = case.spec, case.source
-        meta: Mapping[str, Any] = (source.bundle.provenance.get("strategy") or {}).get("meta") or {}
+        meta: Table = (source.bundle.provenance.more.get("strategy") or {}).get("meta") or {}
         rate = spec.inner_rate or float(meta.get("inner_rate", STEP_RATE))
         frozen = decompose(source.predictor).encoding if meta.get("head_only") else ()
         training = replace(

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.data.prepared import Prepared
 from edp.evaluation.judge import Predictions, score_predictions
+from edp.evaluation.scores_file import MEAN, ByHorizon, metric
+from edp.evaluation.transfer_file import ErrorDistribution
 from edp.signals import KINDS
 
 # An odd number, so that one bin is centred on zero error.
@@ -30,25 +31,27 @@ class MeasuredMethod:
         by_recording: mean absolute error over targets of each recording, by horizon.
     """
 
-    overall: Mapping[str, Any]
+    overall: ByHorizon
     by_recording: Mapping[str, Mapping[str, float]]
 
 
 def measure(predictions: Predictions, data: Prepared, skip: int) -> MeasuredMethod:
     """Return the scores of predictions on the test part."""
     scored = score_predictions(predictions, data, skip)
-    scores: dict[str, Any] = scored["overall"]
+    overall = {}
     for horizon, errors in errors_of(predictions, data, skip).items():
-        rows = scores[horizon]
-        for index, name in enumerate(data.task.targets):
-            rows[name] |= {"mse": rows[name]["rmse"] ** 2, "skew": skew(errors[:, index])}
-        own = [rows[name] for name in data.task.targets]
-        rows["mean"] |= {key: float(np.mean([row[key] for row in own])) for key in ("mse", "skew")}
+        rows = scored.overall[horizon]
+        own = {
+            name: {"mse": metric(rows[name], "rmse") ** 2, "skew": skew(errors[:, index])}
+            for index, name in enumerate(data.task.targets)
+        }
+        own[MEAN] = {key: float(np.mean([row[key] for row in own.values()])) for key in ("mse", "skew")}
+        overall[horizon] = {name: {**row, **own[name]} for name, row in rows.items()}
     by_recording = {
-        name: {horizon: row["mean"]["mae"] for horizon, row in by_horizon.items()}
-        for name, by_horizon in scored["recordings"].items()
+        name: {horizon: metric(row[MEAN], "mae") for horizon, row in by_horizon.items()}
+        for name, by_horizon in scored.recordings.items()
     }
-    return MeasuredMethod(scores, by_recording)
+    return MeasuredMethod(overall, by_recording)
 
 
 def errors_of(predictions: Predictions, data: Prepared, skip: int) -> Errors:
@@ -73,7 +76,7 @@ def skew(errors: NDArray[np.float64]) -> float:
     return float(np.mean((centred / deviation) ** 3)) if deviation > 0 else 0.0
 
 
-def distributions(errors: Mapping[str, Errors], targets: Sequence[str]) -> dict[str, Any]:
+def distributions(errors: Mapping[str, Errors], targets: Sequence[str]) -> dict[str, dict[str, ErrorDistribution]]:
     """Share of ticks by error, on edges that all methods have in common.
 
     Args:
@@ -81,9 +84,9 @@ def distributions(errors: Mapping[str, Errors], targets: Sequence[str]) -> dict[
         targets: names.
 
     Returns:
-        By horizon and target ``edges`` and the ``shares`` of each method; what lies beyond the edges is in none.
+        Histograms by horizon and target; errors beyond the edges are in no bin.
     """
-    histograms: dict[str, Any] = {}
+    histograms: dict[str, dict[str, ErrorDistribution]] = {}
     for horizon in next(iter(errors.values())):
         histograms[horizon] = {}
         for index, target in enumerate(targets):
@@ -97,10 +100,10 @@ def distributions(errors: Mapping[str, Errors], targets: Sequence[str]) -> dict[
             )
             edges = np.linspace(-reach, reach, BINS + 1)
             shares = {
-                name: (np.histogram(method_errors[horizon][:, index], edges)[0] / len(method_errors[horizon])).tolist()
-                for name, method_errors in errors.items()
+                name: tuple((np.histogram(rows[horizon][:, index], edges)[0] / len(rows[horizon])).tolist())
+                for name, rows in errors.items()
             }
-            histograms[horizon][target] = {"edges": edges.tolist(), "shares": shares}
+            histograms[horizon][target] = ErrorDistribution(edges=tuple(edges.tolist()), shares=shares)
     return histograms
 
 

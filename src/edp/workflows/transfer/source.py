@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
 
 from edp.config.experiment import (
     Change,
@@ -20,7 +19,6 @@ from edp.config.experiment import (
     plain_tree,
 )
 from edp.data.features import FEATURE_SETS
-from edp.data.frozen import frozen_before
 from edp.data.prepared import Prepared
 from edp.data.splits import ByTime
 from edp.data.task import Task
@@ -61,10 +59,10 @@ class SourceModel:
     @property
     def frozen(self) -> dict[str, str]:
         """Names by digest of sessions that a model search set apart for good."""
-        return frozen_before(self.bundle.provenance)
+        return dict(self.bundle.provenance.origin.frozen)
 
     @property
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> dict[str, object]:
         """What identifies it."""
         digest = None if self.data is None else self.data.digest
         return {"weights": weights_digest(self.predictor), "recordings": digest}

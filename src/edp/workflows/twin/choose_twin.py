@@ -13,12 +13,12 @@ from edp.data.series import Series
 from edp.data.stretch_folds import StretchFold, stretch_folds
 from edp.errors import ConfigError, DataError, NotFiniteError
 from edp.evaluation.free_run import FreeRuns, free_run_scores, free_runs
+from edp.evaluation.free_run_file import MAX_TEXT, CandidateRow
 from edp.evaluation.guard import free_run_error
 from edp.networks.twin import TWINS, TwinSpec, fit_scales
 from edp.networks.twin.elements import ElementsBox
 from edp.networks.twin.kinds import AutoTwin
 from edp.networks.twin.recurrent import Recurrent, member_seed
-from edp.report.twin.candidates import MOST_TEXT
 from edp.storage.runs import PARTS, KeyedRun, part_of
 from edp.training.free_run import FreeRunSpec
 from edp.training.free_run_members import MemberTraining, joined_members
@@ -90,10 +90,15 @@ class TwinCandidate:
         """Its options, where there is a trial."""
         return None if self.trial is None else self.trial.spec
 
-    def row(self) -> dict[str, Any]:
+    def row(self) -> CandidateRow:
         """For ``candidates.json``."""
-        plain = {"label": self.label, "error": self.error, "seconds": round(self.seconds, 2), "chosen": self.chosen}
-        return plain | {"why": self.why[:MOST_TEXT]}
+        return CandidateRow(
+            label=self.label,
+            error=self.error,
+            seconds=round(self.seconds, 2),
+            chosen=self.chosen,
+            why=self.why[:MAX_TEXT],
+        )
 
 
 @dataclass(frozen=True, eq=False)

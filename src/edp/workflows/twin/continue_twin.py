@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from edp.networks.twin.kinds import AutoTwin
 from edp.networks.twin.recurrent import RecurrentTwin, averaged, member_seed
 from edp.networks.twin.recurrent_members import scales_for, separated, with_scales
 from edp.networks.twin.static_map import StaticMap, StaticTwin
+from edp.settings.tree import Table
 from edp.storage.runs import PARTS, KeyedRun
 from edp.training.free_run import FittedTwin
 from edp.training.free_run_members import MemberTraining
@@ -138,10 +138,10 @@ class BaseTwin:
                     "scales in the signal map"
                 )
 
-    def provenance(self) -> dict[str, Any]:
-        """What the provenance of the new twin says of this one."""
-        data = dict(self.bundle.provenance.get("data") or {})
-        return {"from": {"run": str(self.folder), "hash": self.digest, "data": data.get("digest")}}
+    def provenance(self) -> Table:
+        """Return the entries about this twin in the provenance of the new one."""
+        data = self.bundle.provenance.origin.digest
+        return {"from": {"run": str(self.folder), "hash": self.digest, "data": data}}
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 from edp.config.twin import TwinExperiment
 from edp.data.prepared import Prepared
@@ -43,8 +42,8 @@ class FittedFormulation:
 
     spec: TwinSpec
     fitted: FittedTwin
-    datasheet: list[dict[str, Any]] = field(default_factory=list)
-    facts: dict[str, Any] = field(default_factory=dict)
+    datasheet: list[dict[str, object]] = field(default_factory=list)
+    facts: dict[str, object] = field(default_factory=dict)
     unseen: tuple[tuple[Twin, Sequence[Series]], ...] = ()
 
 

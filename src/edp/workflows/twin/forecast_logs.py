@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from edp.data.derived_velocities import matched
 from edp.errors import ConfigError, DataError, closest
+from edp.evaluation.free_run_file import ChannelErrors
 from edp.evaluation.free_run_parts import by_channel
 from edp.logs import write_recording
 from edp.logs.source import DataSource
@@ -22,12 +22,28 @@ from edp.report.common.picture import file_name
 from edp.signals import Channel
 from edp.storage import replacing_folder
 from edp.storage.paths import entries_of, is_folder_at, is_there
-from edp.storage.provenance import recording_names
 from edp.training.twin_bundle import TwinBundle, load_twin
 from edp.wording import typed
 
 AHEAD = "_in_"
 """Between the name of an answer and the ticks ahead, in the name of a forecast."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForecastErrors:
+    """Mean absolute errors of forecasts at one horizon, and of the present value as forecast.
+
+    Attributes:
+        ticks: horizon in samples.
+        seconds: the horizon in seconds.
+        moments: number of samples.
+    """
+
+    ticks: int
+    seconds: float
+    moments: int
+    twin: ChannelErrors
+    persistence: ChannelErrors
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,14 +54,13 @@ class ForecastLogs:
         files: a log each.
         channels: names of the forecasts.
         gain: of the observer.
-        scores: by horizon as text: ticks, seconds, and under ``twin`` and ``persistence`` the mean absolute error of
-            the forecast answers, by channel and, where all have one unit, its mean.
+        scores: by horizon as text.
     """
 
     files: tuple[Path, ...]
     channels: tuple[str, ...]
     gain: float
-    scores: dict[str, Any]
+    scores: Mapping[str, ForecastErrors]
 
 
 def forecast_logs(
@@ -104,7 +119,7 @@ def forecast_logs(
 
 def _chosen_gain(bundle: TwinBundle, recordings: Sequence[Recording], horizons: Sequence[int]) -> float:
     """A gain by logs from which the twin learned; where none of these is among the logs, by the first ones."""
-    learned_names = recording_names(bundle.provenance, "train", "validation")
+    learned_names = bundle.provenance.recording_names("train", "validation")
     chosen = [logged for logged in recordings if logged.name in learned_names] or list(recordings)
     task = bundle.twin.channels.task()
     series = [task.series(_checked(bundle.twin, logged)) for logged in chosen[:CHOICE_LOGS]]
@@ -201,13 +216,14 @@ def _scores(
     errors: list[list[tuple[np.ndarray, np.ndarray, np.ndarray]]],
     horizons: Sequence[int],
     columns: list[int],
-) -> dict[str, Any]:
+) -> dict[str, ForecastErrors]:
     forecast_channels = [twin.channels.answers[column] for column in columns]
-    rows: dict[str, Any] = {}
+    rows = {}
     for at, k in enumerate(horizons):
         ours, present, counted = (sum(each) for each in zip(*(log[at] for log in errors), strict=True))
-        row: dict[str, Any] = {"ticks": k, "seconds": k / twin.channels.rate_hz, "moments": int(np.min(counted))}
-        for name, total in (("twin", ours), ("persistence", present)):
-            row[name] = by_channel(forecast_channels, np.divide(total, np.maximum(counted, 1)))
-        rows[str(k)] = row
+        own, present_value = (
+            by_channel(forecast_channels, np.divide(total, np.maximum(counted, 1))) for total in (ours, present)
+        )
+        seconds, moments = k / twin.channels.rate_hz, int(np.min(counted))
+        rows[str(k)] = ForecastErrors(ticks=k, seconds=seconds, moments=moments, twin=own, persistence=present_value)
     return rows

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from edp.config.twin import TWIN_SETTINGS, TwinExperiment, twin_toml
 from edp.errors import ConfigError
+from edp.evaluation.free_run_file import RUNS, FreeRunFile, StepResponses
 from edp.logs.source import DataSource
 from edp.networks.twin import TWINS
 from edp.networks.twin.grey.datasheet import BASIS, datasheet_text
@@ -20,11 +20,10 @@ from edp.storage.runs import Run, run_key
 from edp.training.ground_fit import fit_ground
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin, twin_hash
 from edp.workflows.twin.continue_twin import BaseTwin
-from edp.workflows.twin.judge_twin import SCORES, SHOWN, STEPS
 from edp.workflows.twin.prepare_twin import prepared_twin
 
 FOLDER, DATASHEET = "twin", "datasheet"
-JUDGED = (SCORES, SHOWN, STEPS)
+JUDGED = (FreeRunFile.NAME, RUNS, StepResponses.NAME)
 """What the judgement of a twin leaves in its run."""
 GROUND_BASIS = (
     "those of the ground from least squares on forces along logs in soil, errors of 2 s taken as one; numbers of a "
@@ -72,8 +71,9 @@ def ground_twin(
         basis = f"{BASIS}; {GROUND_BASIS}"
         write_json(run.file(f"{DATASHEET}.json"), {"schema": 1, "basis": basis, "numbers": rows})
         write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(rows, basis).encode())
-        facts = fitted.facts() | base.provenance() | {"ground_data": {"source": source.label, "digest": data.digest}}
-        bundle = replace(base.bundle, ground=fitted.law, provenance={**base.bundle.provenance, **facts})
+        contact = {"source": source.label, "digest": data.digest}
+        facts = fitted.facts() | base.provenance() | {"ground_data": contact}
+        bundle = replace(base.bundle, ground=fitted.law, provenance=base.bundle.provenance.with_entries(**facts))
         for name in JUDGED:
             # In free air it is the twin that was judged there, so its page needs no evaluation of its own.
             if is_file_at(base.folder / name):
@@ -102,7 +102,7 @@ def _base(start: str | Path | None) -> tuple[BaseTwin, str]:
     return BaseTwin(Path(start), bundle, twin_hash(start)), bundle.spec.linkage
 
 
-def _known_rows(run: Path) -> list[dict[str, Any]]:
+def _known_rows(run: Path) -> list[dict[str, object]]:
     """Rows of the datasheet of a run; none where it has none."""
     file = run / f"{DATASHEET}.json"
     if not is_file_at(file):

@@ -20,6 +20,16 @@ from edp.errors import ConfigError, DataError, NotFiniteError
 from edp.evaluation.ahead import Ahead, ahead_scores, look_ahead, predictor_scores
 from edp.evaluation.beyond import RANGES, commands_beyond
 from edp.evaluation.free_run import FreeRunJudgeSpec, FreeRuns, free_run_scores, free_runs
+from edp.evaluation.free_run_file import (
+    RUNS,
+    TWIN,
+    AheadErrors,
+    AnswerChannels,
+    FreeRunFile,
+    FreeRunScores,
+    PredictorComparison,
+    ReportedChannel,
+)
 from edp.evaluation.step_response import step_responses
 from edp.logs.as_before import read_as_before
 from edp.logs.source import DataSource
@@ -29,16 +39,12 @@ from edp.networks.twin import TWINS, FreeRunIntervals, Twin, TwinSpec
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.signals import KINDS, Channel
-from edp.storage import check_writable, make_folder, write_bytes, write_json
-from edp.storage.headers import FILES, digests_of
-from edp.storage.provenance import recording_names
+from edp.storage import check_writable, make_folder, write_bytes
+from edp.storage.headers import digests_of
 from edp.training import load_bundle
 from edp.training.twin_bundle import TwinBundle, load_twin
 from edp.workflows.twin.prepare_twin import driving_labels, prepared_twin
 
-SCORES = "free_run.json"
-SHOWN = "free_runs.safetensors"
-STEPS = "step_response.json"
 SHOWN_RUNS = 6
 """Free runs on a page: a reader goes through a few."""
 SHOWN_TICKS = 1200
@@ -51,7 +57,7 @@ def judge_twin(
     data: Prepared,
     labels: Mapping[str, str],
     progress: Progress = SILENT,
-) -> tuple[dict[str, Any], FreeRuns]:
+) -> tuple[dict[str, FreeRunScores], FreeRuns]:
     """Scores of a twin and its floors on the test part, by label, and the free runs of the twin.
 
     Args:
@@ -65,10 +71,9 @@ def judge_twin(
     twin, spec = bundle.twin, experiment.judge
     progress.note("free runs of the twin")
     runs = free_runs(twin, data.test, spec.seconds, spec.starts)
-    scores = {"twin": free_run_scores(runs, spec, bundle.intervals, labels) | _ahead(twin, data, spec)}
-    inputs = [part.inputs for part in data.test]
-    if beyond := commands_beyond(bundle.provenance.get(RANGES), twin.channels, inputs):
-        scores["twin"]["beyond"] = beyond
+    beyond = commands_beyond(bundle.provenance.more.get(RANGES), twin.channels, [part.inputs for part in data.test])
+    own = free_run_scores(runs, spec, bundle.intervals, labels)
+    scores = {TWIN: replace(own, ahead=_ahead(twin, data, spec), beyond=beyond)}
     for name in spec.floors:
         progress.note(f"free runs of {name}")
         floor_spec: TwinSpec = replace(TWINS[name](), prefix_ticks=experiment.twin.prefix_ticks)
@@ -80,40 +85,34 @@ def judge_twin(
             # What such a log is too short for is no rival on it, and no reason to have no twin.
             progress.note(f"the floor {name} is left out: {problem}")
             continue
-        scores[name] = free_run_scores(floor_runs, spec, None, labels) | _ahead(floor, data, spec)
+        scores[name] = replace(free_run_scores(floor_runs, spec, None, labels), ahead=_ahead(floor, data, spec))
     return scores, runs
 
 
 def write_scores(
-    folder: Path,
-    scores: Mapping[str, Any],
-    runs: FreeRuns,
-    intervals: FreeRunIntervals | None,
-    more: Mapping[str, Any] | None = None,
+    folder: Path, scores: Mapping[str, FreeRunScores], runs: FreeRuns, intervals: FreeRunIntervals | None
 ) -> None:
     """Write ``free_run.json`` and the runs that pages draw, ``free_runs.safetensors``.
 
     Raises:
         StorageError: a file cannot be written.
     """
-    write_bytes(folder / SHOWN, save(shown_runs(runs, intervals)))
-    content = {"schema": 2, "channels": channel_facts(runs.channels), **(more or {}), "models": scores}
-    write_json(folder / SCORES, content | {FILES: digests_of(folder, SHOWN)})
+    write_bytes(folder / RUNS, save(shown_runs(runs, intervals)))
+    channels = reported_channels(runs.channels)
+    FreeRunFile(channels=channels, models=dict(scores), files=digests_of(folder, RUNS)).write(folder)
 
 
-def channel_facts(channels: TwinChannels) -> dict[str, list[dict[str, Any]]]:
-    """Name, description, unit of reports and its factor of each answer, by part."""
+def reported_channels(channels: TwinChannels) -> AnswerChannels:
+    """Return what a page needs of each answer."""
 
-    def facts(channel: Channel) -> dict[str, Any]:
+    def reported(channel: Channel) -> ReportedChannel:
         kind = KINDS[channel.kind]
-        return {
-            "name": channel.name,
-            "description": channel.description,
-            "unit": kind.report_unit,
-            "factor": kind.report_factor,
-        }
+        return ReportedChannel(
+            name=channel.name, description=channel.description, unit=kind.report_unit, factor=kind.report_factor
+        )
 
-    return {part: [facts(c) for c in channels.answers[columns]] for part, columns in channels.parts.items()}
+    parts = {part: tuple(map(reported, channels.answers[columns])) for part, columns in channels.parts.items()}
+    return AnswerChannels(**parts)
 
 
 def shown_runs(runs: FreeRuns, intervals: FreeRunIntervals | None) -> dict[str, NDArray[Any]]:
@@ -135,12 +134,12 @@ def shown_runs(runs: FreeRuns, intervals: FreeRunIntervals | None) -> dict[str, 
     return arrays
 
 
-def _ahead(twin: Twin, data: Prepared, spec: FreeRunJudgeSpec) -> dict[str, Any]:
-    """Scores a few ticks ahead; none where no recording is long enough."""
+def _ahead(twin: Twin, data: Prepared, spec: FreeRunJudgeSpec) -> AheadErrors | None:
+    """Scores a few ticks ahead; None where no recording is long enough."""
     longest = max(part.samples for part in data.test)
     if longest < twin.prefix_ticks + spec.ahead_ticks + 1:
-        return {}
-    return {"ahead": ahead_scores(look_ahead(twin, data.test, spec.ahead_ticks))}
+        return None
+    return ahead_scores(look_ahead(twin, data.test, spec.ahead_ticks))
 
 
 def evaluate_twin(
@@ -168,16 +167,16 @@ def evaluate_twin(
     check_writable(folder)
     experiment = load_twin_experiment(folder / "config.toml")
     progress.note("reading recordings")
-    recordings = DataSource.from_plain(bundle.provenance["data"]["reader"]).read()
+    recordings = DataSource.from_plain(bundle.provenance.origin.reader).read()
     channels, data = prepared_twin(recordings, experiment)
-    if data.digest != bundle.provenance["data"]["digest"]:
+    if data.digest != bundle.provenance.origin.digest:
         raise DataError(
-            f"the recordings in '{bundle.provenance['data']['source']}' changed since '{folder}' was trained; the "
+            f"the recordings in '{bundle.provenance.origin.source}' changed since '{folder}' was trained; the "
             "held-out part would not be the same: train again, or judge other recordings with --data"
         )
     target = folder
     if source is not None:
-        source = read_as_before(source, bundle.provenance["data"]["reader"])
+        source = read_as_before(source, bundle.provenance.origin.reader)
         recordings = [matched(channels, recording) for recording in source.read()]
         data = replace(data, test=[channels.task().series(recording) for recording in recordings])
         target = make_folder(folder / f"on_{source.short_name}")
@@ -185,15 +184,15 @@ def evaluate_twin(
     if predictor_run is not None:
         progress.note("the look-ahead predictor")
         beside = beside_predictor(bundle.twin, data.test, recordings, Path(predictor_run), experiment.judge)
-        scores["twin"]["beside"] = beside
+        scores[TWIN] = replace(scores[TWIN], beside=beside)
     write_scores(target, scores, runs, bundle.intervals)
-    write_json(target / STEPS, step_responses(bundle.twin, data.test))
+    step_responses(bundle.twin, data.test).write(target)
     return target
 
 
 def beside_predictor(
     twin: Twin, test: Sequence[Series], recordings: Sequence[Recording], run: Path, spec: FreeRunJudgeSpec
-) -> dict[str, Any]:
+) -> PredictorComparison:
     """Errors of a look-ahead predictor and of the twin at the same moments, for the channels that both answer.
 
     The twin is told the commands in between; the predictor is not.
@@ -216,11 +215,17 @@ def beside_predictor(
     predicted = _at_moments(predictor, pieces, ahead)
     columns = {name: predicted[:, task.targets.index(name)] for name in names}
     # A recording that trained the predictor flatters it: a reader must know.
-    trained = recording_names(bundle.provenance, "train")
+    trained = bundle.provenance.recording_names("train")
     seen = sorted({part.name for part in test if part.name in trained})
-    facts = {"run": str(run), "label": describe(predictor.spec), "ticks": ticks, "trained_on": seen}
-    facts |= {"seconds": ticks / twin.channels.rate_hz, "moments": len(ahead.truth)}
-    return facts | {"errors": predictor_scores(ahead, columns)}
+    return PredictorComparison(
+        run=str(run),
+        label=describe(predictor.spec),
+        ticks=ticks,
+        trained_on=tuple(seen),
+        seconds=ticks / twin.channels.rate_hz,
+        moments=len(ahead.truth),
+        errors=predictor_scores(ahead, columns),
+    )
 
 
 def _rows(name: str, recordings: Mapping[str, Recording]) -> tuple[Recording, int, int | None]:
@@ -239,4 +244,4 @@ def _at_moments(predictor: Predictor, series: Sequence[Series], ahead: Ahead) ->
     return np.concatenate([p[at, which] for p, at in zip(predictions, ahead.moments, strict=True)])
 
 
-__all__ = ["SCORES", "SHOWN", "beside_predictor", "evaluate_twin", "judge_twin", "write_scores"]
+__all__ = ["beside_predictor", "evaluate_twin", "judge_twin", "write_scores"]

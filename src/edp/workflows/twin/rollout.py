@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from edp.data.derived_velocities import matched
 from edp.errors import ConfigError, DataError, closest, count_of
 from edp.evaluation.beyond import RANGES, commands_beyond
 from edp.evaluation.free_run import MOST_SECONDS, FreeRunJudgeSpec, free_run_scores, runs_of
+from edp.evaluation.free_run_file import TWIN, CommandExcess, FreeRunFile, FreeRunScores
 from edp.logs import write_recording
 from edp.logs.as_before import read_as_before
 from edp.logs.source import DataSource
@@ -23,7 +23,7 @@ from edp.settings.bounds import above, span
 from edp.signals import Channel
 from edp.training.twin_bundle import load_twin
 from edp.wording import setting_text, typed
-from edp.workflows.twin.judge_twin import channel_facts, shown_runs
+from edp.workflows.twin.judge_twin import reported_channels, shown_runs
 
 FREE = "_twin"
 """Behind the name of a channel, for what the twin answered in its place."""
@@ -46,11 +46,11 @@ class Rollout:
     """
 
     recording: Recording
-    scores: dict[str, Any]
+    scores: FreeRunScores
     start_s: float
     coverage: float | None
     calibrated_s: float | None
-    beyond: dict[str, dict[str, float]]
+    beyond: Mapping[str, CommandExcess]
 
 
 def rollout_log(
@@ -80,7 +80,7 @@ def rollout_log(
     """
     bundle = load_twin(run)
     twin = bundle.twin
-    recording = matched(twin.channels, _only(read_as_before(source, bundle.provenance["data"]["reader"]).read()))
+    recording = matched(twin.channels, _only(read_as_before(source, bundle.provenance.origin.reader).read()))
     measured_columns = _columns(twin, measured)
     series = twin.channels.task().series(recording)
     start, ticks = _span(twin, recording, seconds, start_s)
@@ -104,14 +104,14 @@ def rollout_log(
         start / recording.rate_hz,
         None if intervals is None else intervals.coverage,
         None if intervals is None else intervals.ticks[-1] / recording.rate_hz,
-        commands_beyond(bundle.provenance.get(RANGES), twin.channels, [commands[0, prefix:]]),
+        commands_beyond(bundle.provenance.more.get(RANGES), twin.channels, [commands[0, prefix:]]),
     )
     if out is not None:
         write_recording(result.recording, out)
     if plots is not None:
         write_rollout_plots(result.recording, FREE, (start + 1) / recording.rate_hz, plots)
     if page is not None:
-        content = {"channels": channel_facts(twin.channels), "models": {"twin": result.scores}}
+        content = FreeRunFile(channels=reported_channels(twin.channels), models={TWIN: result.scores})
         title = f"{recording.name} from {typed(result.start_s)} s"
         build_twin_page(FreeRunFacts(title, content, shown_runs(runs, intervals))).write(page)
     return result

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from edp.data.prepared import Prepared
 from edp.data.twin_channels import TwinChannels
 from edp.evaluation.beyond import RANGES, command_ranges
 from edp.evaluation.free_run import calibrated, check_runs
+from edp.evaluation.free_run_file import CandidatesFile, FreeRunScores, read_models
 from edp.evaluation.step_response import step_responses
 from edp.jobs import IN_PROCESS, Workers
 from edp.logs.source import DataSource
@@ -26,7 +27,7 @@ from edp.networks.twin.kinds import AutoTwin
 from edp.networks.twin.recurrent_members import scales_for
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
-from edp.report.twin.candidates import CANDIDATES
+from edp.settings.results import plain_value
 from edp.signals import Kind
 from edp.sim.machine.machine_files import load_machine
 from edp.storage import write_bytes, write_json
@@ -38,7 +39,7 @@ from edp.workflows.twin.choose_twin import TwinChoice
 from edp.workflows.twin.continue_twin import BaseTwin, ContinuedTwin
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
 from edp.workflows.twin.ground_twin import ground_twin
-from edp.workflows.twin.judge_twin import SCORES, STEPS, judge_twin, write_scores
+from edp.workflows.twin.judge_twin import judge_twin, write_scores
 from edp.workflows.twin.prepare_twin import driving_labels, prepare_twin, prepared_twin
 
 FOLDER = "twin"
@@ -57,7 +58,7 @@ class TrainedTwin:
     """
 
     bundle: TwinBundle
-    scores: dict[str, Any]
+    scores: Mapping[str, FreeRunScores]
     resumed: bool
 
 
@@ -89,7 +90,7 @@ def train_twin(
     check_claimable(out, "twin")
     if experiment.ground:
         grounded, finished = ground_twin(source, experiment, out, start, progress)
-        return TrainedTwin(grounded, dict(grounded.scores), finished)
+        return TrainedTwin(grounded, read_models(grounded.scores, f"'{out}'"), finished)
     progress.note("reading recordings")
     base = None if start is None else BaseTwin.of(start)
     if base is not None:
@@ -108,7 +109,7 @@ def train_twin(
     with create as run, workers.stay() as staying:
         if run.is_finished:
             bundle = load_twin(run.path)
-            return TrainedTwin(bundle, dict(bundle.scores), True)
+            return TrainedTwin(bundle, read_models(bundle.scores, f"'{run.path}'"), True)
         fit = TwinFit(channels, fit_scales(channels, data.train), data, experiment, progress, staying)
         result = _chosen(fit, KeyedRun(run, key), base)
         fitted = result.fitted
@@ -118,19 +119,16 @@ def train_twin(
             write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(result.datasheet).encode())
         progress.note("calibrating intervals")
         intervals = calibrated(result.unseen or ((fitted.twin, data.validation),), experiment.judge)
-        provenance = (
-            training_provenance(source, data, experiment.training.seed, 1, fitted.seconds)
-            | _full_strokes(recordings)
-            | _oil(recordings)
-            | result.facts
+        before = None if base is None else base.bundle.provenance.more.get(RANGES)
+        ranges = command_ranges(channels, [*data.train, *data.validation], before)
+        provenance = training_provenance(source, data, experiment.training.seed, 1, fitted.seconds).with_entries(
+            **_full_strokes(recordings), **_oil(recordings), **result.facts, **{RANGES: ranges}
         )
-        before = None if base is None else base.bundle.provenance.get(RANGES)
-        provenance[RANGES] = command_ranges(channels, [*data.train, *data.validation], before)
         bundle = TwinBundle(result.spec, fitted.twin, provenance, {}, intervals)
         scores, runs = judge_twin(bundle, experiment, data, labels, progress)
         write_scores(run.path, scores, runs, intervals)
-        write_json(run.path / STEPS, step_responses(bundle.twin, data.test))
-        bundle = replace(bundle, scores=scores)
+        step_responses(bundle.twin, data.test).write(run.path)
+        bundle = replace(bundle, scores=plain_value(scores))
         save_twin(bundle, run.file(FOLDER))
     return TrainedTwin(bundle, scores, False)
 
@@ -157,7 +155,7 @@ def _check_judged(channels: TwinChannels, data: Prepared, experiment: TwinExperi
         check_runs(channels, scales, prefix, data.validation, judge.seconds, judge.calibration_starts)
 
 
-def _linkage(experiment: TwinExperiment) -> dict[str, Any]:
+def _linkage(experiment: TwinExperiment) -> dict[str, object]:
     """All numbers of the machine that settings name for its linkage: an edited file asks for another twin.
 
     Raises:
@@ -174,23 +172,23 @@ def _chosen(fit: TwinFit, run: KeyedRun, base: BaseTwin | None) -> FittedFormula
     spec = fit.experiment.twin
     if base is not None:
         result, tried = ContinuedTwin(fit, base, run).best()
-        write_json(run.folder.file(CANDIDATES), {"schema": 1, "candidates": [one.row() for one in tried]})
+        CandidatesFile(candidates=tuple(one.row() for one in tried)).write(run.folder.path)
         return result
     if not isinstance(spec, AutoTwin):
         result = fit.fitted(spec, run)
         return result if result.fitted.history else fit.refitted(result)
     result, tried = TwinChoice(fit, spec, run).best()
-    write_json(run.folder.file(CANDIDATES), {"schema": 1, "candidates": [one.row() for one in tried]})
+    CandidatesFile(candidates=tuple(one.row() for one in tried)).write(run.folder.path)
     return result
 
 
-def _oil(recordings: Sequence[Recording]) -> dict[str, Any]:
+def _oil(recordings: Sequence[Recording]) -> dict[str, object]:
     """Temperature of the oil that all recordings tell; nothing where one does not."""
     celsius = np.concatenate([oil_celsius(recording) for recording in recordings])
     return {OIL_C: float(celsius.mean())} if np.isfinite(celsius).all() else {}
 
 
-def _full_strokes(recordings: Sequence[Recording]) -> dict[str, Any]:
+def _full_strokes(recordings: Sequence[Recording]) -> dict[str, object]:
     """Full strokes (m) of the machine, where simulated recordings say them and all say the same."""
     stated = [recording.meta[STROKES] for recording in recordings if STROKES in recording.meta]
     # A log may say anything; what is no list of numbers says nothing.
@@ -203,4 +201,4 @@ def _numbers(value: Any) -> bool:
     return isinstance(value, list) and all(isinstance(each, int | float) for each in value)
 
 
-__all__ = ["FOLDER", "SCORES", "TrainedTwin", "prepare_twin", "train_twin"]
+__all__ = ["FOLDER", "TrainedTwin", "prepare_twin", "train_twin"]

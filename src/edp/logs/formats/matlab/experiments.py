@@ -20,12 +20,12 @@ _EACH = ("InputData", "OutputData", "Ts", "Tstart", "SamplingInstants")
 """Facts of an iddata that are cells with an entry an experiment."""
 
 
-def experiment_names(variables: Mapping[str, Any]) -> list[str]:
+def experiment_names(variables: Mapping[str, object]) -> list[str]:
     """Names of the experiments of all variables that hold several alike: ``train{1}``, ``train{2}``, ..."""
     return [f"{name}{{{i + 1}}}" for name, value in variables.items() for i in range(len(_experiments(value)))]
 
 
-def pick_experiment(variables: Mapping[str, Any], name: str) -> dict[str, Any] | None:
+def pick_experiment(variables: Mapping[str, object], name: str) -> dict[str, object] | None:
     """Return one experiment as a variable; None if no variable has one of this name."""
     match = _ONE.fullmatch(name)
     if match is None or match["variable"] not in variables:

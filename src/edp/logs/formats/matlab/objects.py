@@ -32,7 +32,7 @@ _SECONDS = {
 }
 
 
-def collect(variables: dict[str, Any]) -> MatVariables:
+def collect(variables: dict[str, object]) -> MatVariables:
     """Walk all variables; names that occur twice are distinguished by their path (``log.x``)."""
     mat_variables = MatVariables()
     for name, value in variables.items():
@@ -263,7 +263,7 @@ def _walk_contents(value: Any, name: str, path: str, mat_variables: MatVariables
         _walk(value, name, path, None, mat_variables)
 
 
-def _add_timeseries(props: dict[str, Any], name: str, path: str, mat_variables: MatVariables) -> None:
+def _add_timeseries(props: dict[str, object], name: str, path: str, mat_variables: MatVariables) -> None:
     data = np.asarray(props.get("Data_", np.empty(0)))
     if data.dtype.kind not in "fiub" or data.size == 0:
         return
@@ -273,7 +273,7 @@ def _add_timeseries(props: dict[str, Any], name: str, path: str, mat_variables: 
     _add_array(data, series_name if series_name and series_name != "unnamed" else name, path, time, mat_variables, unit)
 
 
-def _add_iddata(props: dict[str, Any], mat_variables: MatVariables) -> None:
+def _add_iddata(props: dict[str, object], mat_variables: MatVariables) -> None:
     """Add inputs and outputs of System Identification Toolbox data under their names there."""
     inner = props.get("Data_")
     facts = props | (inner.properties if isinstance(inner, MatlabOpaque) and isinstance(inner.properties, dict) else {})
@@ -302,7 +302,7 @@ def _texts(value: Any) -> list[str]:
     return [_text(item) for item in np.asarray(value if value is not None else np.empty(0)).ravel()]
 
 
-def _timeseries_time(props: dict[str, Any]) -> NDArray[np.float64] | None:
+def _timeseries_time(props: dict[str, object]) -> NDArray[np.float64] | None:
     """Time in seconds: its own vector, else start, increment and length."""
     info = props.get("TimeInfo")
     facts = info.properties if isinstance(info, MatlabOpaque) and isinstance(info.properties, dict) else {}

@@ -40,7 +40,7 @@ def variable_names(path: Path) -> list[str] | None:
         return [name for name in stored if not name.startswith("#")] if GROUP in stored else None
 
 
-def place_streams(path: Path, variables: dict[str, Any]) -> None:
+def place_streams(path: Path, variables: dict[str, object]) -> None:
     """Put values ``(time, column)`` and times ``(time,)`` of streamed signals where the variables refer to them.
 
     Raises:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import scipy.io
@@ -54,7 +53,7 @@ def unpack(path: Path, variable: str | None = None) -> MatVariables:
     return mat_variables
 
 
-def _load(path: Path) -> dict[str, Any]:
+def _load(path: Path) -> dict[str, object]:
     with path.open("rb") as stream:
         head = stream.read(128)
     # A file that is cut off inside its header begins like one.

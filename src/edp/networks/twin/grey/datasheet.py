@@ -25,7 +25,7 @@ BASIS = (
 )
 
 
-def datasheet(table: NumberTable, values: Doubles, information: Doubles) -> list[dict[str, Any]]:
+def datasheet(table: NumberTable, values: Doubles, information: Doubles) -> list[dict[str, object]]:
     """Return one row per fitted parameter, and one for the derived inertia of each actuator; SI units.
 
     Args:
@@ -59,7 +59,7 @@ def datasheet(table: NumberTable, values: Doubles, information: Doubles) -> list
     return rows + _inertias(table, values, information)
 
 
-def _inertias(table: NumberTable, values: Doubles, information: Doubles) -> list[dict[str, Any]]:
+def _inertias(table: NumberTable, values: Doubles, information: Doubles) -> list[dict[str, object]]:
     """Return one row for the inertia of each actuator with the others at rest, at the middle of all strokes.
 
     It is the sum of squares of its row of the root, whose first coefficients are the root there; its interval follows
@@ -80,7 +80,7 @@ def _inertias(table: NumberTable, values: Doubles, information: Doubles) -> list
     return rows
 
 
-def _body_inertias(table: NumberTable, values: Doubles, covariance: Doubles) -> list[dict[str, Any]]:
+def _body_inertias(table: NumberTable, values: Doubles, covariance: Doubles) -> list[dict[str, object]]:
     """Return the inertia rows of a known linkage, at the middle of the strokes of its machine."""
     span, n = slice(table.inertia_at, table.potential_at), len(table.actuator_at)
     joints = table.linkage[at.JOINTS :].reshape(at.BODIES, at.JOINT_VALUES)
@@ -103,7 +103,7 @@ def _body_inertias(table: NumberTable, values: Doubles, covariance: Doubles) -> 
 
 def _inertia_row(
     of: str, unit: str, factor: float, value: float, slope: Doubles, covariance: Doubles
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return the row of an actuator's inertia, from its derivative by scaled coordinates and their covariance."""
     deviation = float(np.sqrt(slope @ covariance @ slope))
     reach = NORMAL * deviation

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,12 +80,12 @@ class GroundLaw(ABC):
         """Return the undisturbed ground before a run."""
 
     @abstractmethod
-    def plain(self) -> dict[str, Any]:
+    def plain(self) -> dict[str, object]:
         """All of it as JSON takes it."""
 
     @classmethod
     @abstractmethod
-    def of(cls, plain: Mapping[str, Any]) -> GroundLaw:
+    def of(cls, plain: Mapping[str, object]) -> GroundLaw:
         """From what `plain` gave.
 
         Raises:
@@ -96,7 +96,7 @@ class GroundLaw(ABC):
     def names(self) -> list[tuple[str, str]]:
         """Name and unit of each number."""
 
-    def rows(self) -> list[dict[str, Any]]:
+    def rows(self) -> list[dict[str, object]]:
         """Return datasheet rows in the form of `edp.networks.twin.grey.datasheet.datasheet`."""
         rows = []
         for (name, unit), value, deviation in zip(self.names(), self.numbers, self.deviations, strict=True):

@@ -116,7 +116,7 @@ class DragLaw(GroundLaw):
     def contact(self, twin: GreyTwin) -> DragContact:
         return DragContact(self._front(twin), self.numbers, self._level(twin))
 
-    def plain(self) -> dict[str, Any]:
+    def plain(self) -> dict[str, object]:
         # JSON has no infinity.
         deviations = [float(value) if np.isfinite(value) else None for value in self.deviations]
         return {

@@ -51,7 +51,7 @@ class LoopSource(LiveSource):
         """
         file = Path(options.value)
         is_file = file.suffix == ".toml"
-        table: dict[str, Any] = {} if is_file else {"task": {"kind": options.value}}
+        table: dict[str, object] = {} if is_file else {"task": {"kind": options.value}}
         if options.machine:
             table["machine"] = options.machine
         if options.settings.get("controller"):
