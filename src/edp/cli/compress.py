@@ -65,7 +65,7 @@ def compress(
             _show_next(compression.best, folder)
         out.print(f"report: {page}")
 
-    emit(as_json, compression.to_json() | {"report": str(page)}, show)
+    emit(as_json, compression.to_table() | {"report": str(page)}, show)
 
 
 def _show_next(best: CompressedRow, folder: Path) -> None:
