@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-WIDE_FUNCTIONS = 46
+WIDE_FUNCTIONS = 43
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 
 
