@@ -41,7 +41,7 @@ def ordered(names: Sequence[str]) -> list[tuple[str, str]]:
 @of_phase(SoundScreening, ())
 def _modules_sound(study: StudyFile, facts: SoundScreening) -> tuple[Table | None, ...]:
     confirmation = study.facts(SoundConfirmation)
-    evidence = {} if confirmation is None else confirmation.by_module()
+    evidence = {} if confirmation is None else {entry.module: entry for entry in confirmation.evidence}
     rows, marked = [], set()
     for group, name in ordered(facts.registered):
         effect = facts.modules[name]
