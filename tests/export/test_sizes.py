@@ -191,7 +191,7 @@ def test_every_figure_of_a_network_is_the_same(predictor_of, integers_of):
     for name, graph in (("float32", predictor.graph()), ("w8a16", integers)):
         said = resource_usage(predictor, name, Budget())
         entry = counts.estimate(name)
-        rows = {row["what"]: row["value"] for row in counts.verdict(Budget())}
+        rows = {row.what: row.value for row in counts.verdict(Budget())}
         assert said.parameter_bytes == entry.parameter_bytes == rows[f"parameters, {name}"] == constant_bytes(graph)
         assert said.flash_bytes == entry.flash_bytes == rows[f"flash, {name}"]
         assert said.ram_bytes == rows[f"RAM, {name}"]
@@ -207,7 +207,7 @@ def test_a_network_without_a_form_in_whole_numbers_has_no_figures_for_it(predict
     assert "no form in integer arithmetic" in refused.refused["w8a16"]
     with pytest.raises(ExportError, match="no form in integer arithmetic"):
         refused.estimate("w8a16")
-    assert not any("w8a16" in row["what"] for row in refused.verdict(Budget()))
+    assert not any("w8a16" in row.what for row in refused.verdict(Budget()))
 
 
 def test_sizes_are_known_of_every_function_of_the_runtime():

@@ -92,10 +92,10 @@ def test_the_verdict_is_that_of_the_high_estimate():
     counts = footprint(network(64, 64))
     low, _, high = counts.estimates[1].cycles["cortex_m4f"]
     for cycles, fits in ((low, False), (high - 1, False), (high, True)):
-        rows = {row["what"]: row for row in counts.verdict(Budget(cycles=cycles))}
-        assert rows["cycles per tick, w8a16"]["fits"] is fits
+        rows = {row.what: row for row in counts.verdict(Budget(cycles=cycles))}
+        assert rows["cycles per tick, w8a16"].fits is fits
     assert {f"{what}, {name}" for what in ("parameters", "RAM", "flash") for name in FORMATS} < set(rows)
-    assert rows["parameters, w8a16"]["value"] == counts.estimate("w8a16").parameter_bytes
+    assert rows["parameters, w8a16"].value == counts.estimate("w8a16").parameter_bytes
 
 
 @pytest.mark.parametrize("path", BUDGETS, ids=lambda path: path.stem)

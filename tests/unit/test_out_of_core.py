@@ -22,8 +22,8 @@ from edp.data.splits import SPLITS
 from edp.data.spread_rows import spread_series
 from edp.data.task import TargetMode, Task
 from edp.errors import DataError, StorageError
-from edp.evaluation.tally import Tally
-from edp.jobs.packing import packed, unpacked
+from edp.evaluation.tally import Tally, TallyState
+from edp.jobs.packing import pack, unpack
 from edp.logs import read_data_set, write_recording
 from edp.logs.quality.cross_recording import compare
 from edp.logs.quality.quality import inspect
@@ -292,7 +292,7 @@ def test_scores_of_parts_that_are_added_are_those_of_all_at_once(monkeypatch, mo
     for start, stop in ((0, 300), (300, 300), (300, 2_400), (2_400, 6_000)):  # kept, empty and summed parts
         part = Tally(("x", "y"))
         part.update(predicted[start:stop], truth[start:stop])
-        added.add(unpacked(packed(part.state()), dict))
+        added.add(unpack(pack(part.state()), TallyState))
     for name, values in whole.scores().items():
         exact = most > 6_000
         assert added.scores()[name] == (values if exact else pytest.approx(values, rel=1e-9)), name

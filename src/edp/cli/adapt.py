@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -11,6 +11,7 @@ from edp.cli.console import JsonFlag, emit, out, table
 from edp.cli.options import LogsArgument, MapOption, RepairOption, SettingsOption, source_of
 from edp.cli.progress import shown_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
+from edp.storage.reading import Table
 from edp.wording import figure, percent
 
 
@@ -93,7 +94,7 @@ def replay(
     end_with(verdict)
 
 
-def replay_tables(facts: dict[str, Any]) -> None:
+def replay_tables(facts: Table) -> None:
     """Print one table per horizon: MAE with and without adaptation over time in motion, and by target."""
     units = {target["unit"] for target in facts["targets"]}
     unit = units.pop() if len(units) == 1 else "mixed units"
@@ -107,7 +108,7 @@ def replay_tables(facts: dict[str, Any]) -> None:
     out.print(f"taken back in {percent(facts['fallback'])} of the ticks; {facts['taught']:,} ticks taught")
 
 
-def _line(row: dict[str, Any]) -> list[str]:
+def _line(row: Table) -> list[str]:
     base, adapted = (sum(row[of]) / len(row[of]) for of in ("base", "adapted"))
     when = (
         f"over {figure(row['from_s'])}" if row["to_s"] is None else f"{figure(row['from_s'])} to {figure(row['to_s'])}"

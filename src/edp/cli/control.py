@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -14,6 +13,7 @@ from edp.cli.options import MOST_LOOPS, ClusterOption, OpenOption, WorkersOption
 from edp.cli.progress import shown_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.storage.paths import full_path
+from edp.storage.reading import Table
 from edp.wording import figure, number
 
 TaskOption = Annotated[str, typer.Option("--task", help="What to follow: grade, corners, level, point or dig.")]
@@ -157,7 +157,7 @@ def _options(task: str, machine: str, controller: str, seeds: int | None) -> dic
     return options | ({"controller": {"kind": controller}} if controller else {})
 
 
-def score_table(content: Mapping[str, Any]) -> None:
+def score_table(content: Table) -> None:
     """Print one row per loop."""
     rows = []
     for loop in content["loops"]:

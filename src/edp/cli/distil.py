@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,6 +12,7 @@ from edp.cli.console import JsonFlag, duration, emit, out, table
 from edp.cli.options import DataOption, MapOption, RepairOption, SettingsOption, source_if_given
 from edp.cli.progress import shown_progress
 from edp.errors import ConfigError
+from edp.storage.reading import Table
 from edp.wording import figure
 
 if TYPE_CHECKING:
@@ -79,7 +80,7 @@ def distil(
     emit(as_json, facts, lambda: _show(counts, facts))
 
 
-def _show(counts: Mapping[str, Footprint], facts: Mapping[str, Any]) -> None:
+def _show(counts: Mapping[str, Footprint], facts: Table) -> None:
     rows = [(name, count.parameters, count.macs_tick, count.macs_window) for name, count in counts.items()]
     table("", ["network", "parameters", "MACs per tick", "MACs per window"], rows)
     error = facts["validation_mae"]

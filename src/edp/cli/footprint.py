@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,7 +12,7 @@ from edp.cli.console import JsonFlag, emit, out, table
 from edp.wording import number
 
 if TYPE_CHECKING:
-    from edp.evaluation.controller import Budget
+    from edp.evaluation.controller import Budget, LimitCheck
 
 
 def footprint(
@@ -39,7 +39,7 @@ def footprint(
     facts = {"name": name, **counts.to_json(limits_of)}
 
     def show() -> None:
-        rows = [(r["part"], r["parameters"], r["macs_tick"], r["macs_window"]) for r in counts.rows]
+        rows = [(row.part, row.parameters, row.macs_tick, row.macs_window) for row in counts.rows]
         rows.append(("total", counts.parameters, counts.macs_tick, counts.macs_window))
         head = f"MACs per window of {counts.window}"
         table(name, ["part", "parameters", "MACs per tick", head], rows)
@@ -52,7 +52,7 @@ def footprint(
         ]
         table("Cycles per tick, estimates", ["core", "numbers", "low", "typical", "high"], estimates)
         out.print()
-        _budget_table(facts)
+        _budget_table(limits_of, counts.verdict(limits_of))
         for number_format, why in counts.refused.items():
             out.print(f"not in {number_format}: {why}")
 
@@ -82,15 +82,12 @@ def _of_monitor(file: Path, limits: Budget, as_json: bool) -> None:
         cycles = [(core.label, *counts.cycles[key]) for key, core in CORES.items()]
         table("Cycles per tick, estimates", ["core", "low", "typical", "high"], cycles)
         out.print()
-        _budget_table(facts)
+        _budget_table(limits, counts.verdict(limits))
 
     emit(as_json, facts, show)
 
 
-def _budget_table(facts: Mapping[str, Any]) -> None:
+def _budget_table(budget: Budget, checks: Sequence[LimitCheck]) -> None:
     """Print the comparison with a controller's limits."""
-    limits = [
-        (v["what"], v["value"], v["limit"], v["unit"], "fits" if v["fits"] else "too large", v["note"])
-        for v in facts["verdict"]
-    ]
-    table(f"Budget: {facts['budget']['name']}", ["", "value", "limit", "unit", "verdict", "meaning"], limits)
+    rows = [(v.what, v.value, v.limit, v.unit, "fits" if v.fits else "too large", v.note) for v in checks]
+    table(f"Budget: {budget.name}", ["", "value", "limit", "unit", "verdict", "meaning"], rows)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -23,6 +23,7 @@ from edp.cli.options import (
 from edp.cli.progress import shown_progress
 from edp.errors import ConfigError, count_of
 from edp.storage.paths import full_path
+from edp.storage.reading import Table
 from edp.wording import figure
 
 if TYPE_CHECKING:
@@ -103,7 +104,7 @@ def fit(
     with shown_progress("monitor", as_json) as progress:
         fitted = fit_monitor(runs, source, experiment, folder, progress, divided)
     monitor = fitted.monitor
-    facts: dict[str, Any] = {
+    facts: Table = {
         "monitor": str(folder),
         "seconds": fitted.seconds,
         "wall_s": time.monotonic() - began,

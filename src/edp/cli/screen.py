@@ -31,6 +31,7 @@ from edp.wording import figure, percent
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bars
+    from rich.progress import TaskID
 
     from edp.config.experiment import FeatureSettings
     from edp.jobs import Workers
@@ -141,7 +142,7 @@ class ScreeningDisplay:
 
     def __init__(self, shown: Bars, steps: Steps) -> None:
         self.shown, self.steps = shown, steps
-        self.bars: dict[str, Any] = {}
+        self.bars: dict[str, TaskID] = {}
         self.began: dict[str, tuple[float, float]] = {}
         self.shares: dict[str, float] = {}
         self.trained = False
@@ -210,7 +211,7 @@ def _print_first(table: Table, caption: str, most: int, page: Path) -> None:
     out.print()
 
 
-def facts_of(selection: Selection) -> dict[str, Any]:
+def facts_of(selection: Selection) -> dict[str, object]:
     """Return the result for scripts; the full result is in the files."""
     proposal = selection.screening.proposal
     return {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,6 +12,7 @@ from edp.cli.console import JsonFlag, Steps, count_text, emit, err, left_text, o
 from edp.cli.options import ClusterOption, OpenOption, WorkersOption, check_effects, workers_of
 from edp.cli.progress import shown_progress
 from edp.errors import count_of
+from edp.storage.reading import Table
 from edp.wording import figure, number
 
 if TYPE_CHECKING:
@@ -111,7 +112,7 @@ def simulate(
     paths = run(folder, order, divided, as_json)
     limit_facts = run_limit(folder, order, spec, divided, as_json) if limit else None
     what_simulated = f"{order.family} machines" if order.family else order.machine
-    facts: dict[str, Any] = {"folder": str(folder), "recordings": len(paths), "minutes": order.minutes}
+    facts: Table = {"folder": str(folder), "recordings": len(paths), "minutes": order.minutes}
     if order.faults:
         facts["faults"] = [fault_text(entry) for entry in order.faults]
     facts |= {"machine": what_simulated, "seed": order.seed} | ({} if limit_facts is None else {"limit": limit_facts})
@@ -149,7 +150,7 @@ def run(folder: Path, order: SimulationOrder, workers: Workers | None = None, qu
         return simulate_data_set(folder, order, workers or ONE_PER_CORE, on_done)
 
 
-def run_limit(folder: Path, order: SimulationOrder, spec: LimitSpec, workers: Workers, quiet: bool) -> dict[str, Any]:
+def run_limit(folder: Path, order: SimulationOrder, spec: LimitSpec, workers: Workers, quiet: bool) -> Table:
     """Find the limit of predictability with a progress display."""
     from edp.sim.data_set import find_data_set_limit
 
@@ -157,7 +158,7 @@ def run_limit(folder: Path, order: SimulationOrder, spec: LimitSpec, workers: Wo
         return find_data_set_limit(folder, order, spec, workers, progress)
 
 
-def limit_table(limit: dict[str, Any]) -> None:
+def limit_table(limit: Table) -> None:
     """Print the limit together with persistence."""
     names = [
         target.replace("CylVels_1", "boom").replace("CylVels_2", "arm").replace("CylVels_3", "bucket")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,6 +12,7 @@ from edp.cli.inspect import FAULTY
 from edp.cli.options import ClusterOption, MapOption, OpenOption, RepairOption, source_of, workers_of
 from edp.cli.progress import shown_progress
 from edp.errors import count_of
+from edp.storage.reading import Table
 from edp.wording import number
 
 if TYPE_CHECKING:
@@ -86,7 +87,7 @@ def check(
 
 def _show(index: StoreIndex, folder: Path, as_json: bool) -> None:
     size = sum(file.bytes for file in index.files)
-    facts: dict[str, Any] = {
+    facts: Table = {
         "store": str(folder),
         "recordings": len(index.recordings),
         "hours": index.hours(),

@@ -19,6 +19,7 @@ from edp.control.tasks.base import ControlTask
 from edp.errors import ConfigError
 from edp.recording import Recording
 from edp.signals import GROUND_CHANNELS, VOCABULARY, Channel, Kind
+from edp.storage.reading import Table
 from edp.wording import typed
 
 Array = NDArray[np.float64]
@@ -131,7 +132,7 @@ class _Watched:
 
 
 def _driven(
-    env: Any, watched: _Watched, ticks: int, names: tuple[str, ...], start: tuple[Any, Mapping[str, Any]]
+    env: Any, watched: _Watched, ticks: int, names: tuple[str, ...], start: tuple[Any, Table]
 ) -> tuple[_Rows, dict[str, Array]]:
     """Run tick by tick from an observation and its info; ends early where the plant does."""
     (observation, info), controller = start, watched.controller
@@ -153,7 +154,7 @@ def _driven(
     return rows, {name: values[:end] for name, values in infos.items()}
 
 
-def start_options(task: ControlTask, geometry: TipGeometry) -> dict[str, Any]:
+def start_options(task: ControlTask, geometry: TipGeometry) -> Table:
     """Options of the environment's reset that put the machine at the start of a task."""
     shares = np.clip(task.reference.strokes[0] / geometry.full_m, 0.0, 1.0)
     return {"strokes": tuple(map(float, shares)), "material": task.material}

@@ -22,6 +22,7 @@ from edp.data.twin_channels import INTEGRAL
 from edp.errors import DataError
 from edp.recording import STRETCH_S, Recording, spread_recordings
 from edp.signals import KINDS, Kind
+from edp.storage.reading import Table
 from edp.wording import typed
 
 Array = NDArray[np.float64]
@@ -137,7 +138,7 @@ class Coverage:
 
     def to_json(self) -> dict[str, object]:
         """Convert to JSON types; arrays become lists, the occupancy gets its fraction of visited cells."""
-        plain: dict[str, Any] = _plain(asdict(self))
+        plain: Table = _plain(asdict(self))
         plain["singular"] = {str(lags): value for lags, value in self.singular.items()}
         if self.occupancy is not None:
             plain["occupancy"]["share"] = self.occupancy.share

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +10,17 @@ from numpy.typing import NDArray
 BLOCK_ROWS = 4_096
 """Rows taken to double precision at a time: a megabyte of 30 columns, which stays in the processor's cache."""
 Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class MomentsState:
+    """Content of `Moments`."""
+
+    count: int
+    low: Vector
+    high: Vector
+    mean: Vector
+    squares: Vector
 
 
 class Moments:
@@ -41,16 +51,14 @@ class Moments:
         """Take in what other rows gave."""
         self.add(other.state())
 
-    def state(self) -> dict[str, object]:
-        """All that it holds, as plain values and arrays."""
-        return {
-            "count": self.count, "low": self.low, "high": self.high, "mean": self.mean, "squares": self.squares
-        }  # fmt: skip
+    def state(self) -> MomentsState:
+        """Return the moments, for another process."""
+        return MomentsState(self.count, self.low, self.high, self.mean, self.squares)
 
-    def add(self, state: Mapping[str, Any]) -> None:
-        """Take in what other rows gave, by the `state` of those."""
-        if state["count"]:
-            self._merge(state["count"], state["low"], state["high"], state["mean"], state["squares"])
+    def add(self, state: MomentsState) -> None:
+        """Add the moments of other rows."""
+        if state.count:
+            self._merge(state.count, state.low, state.high, state.mean, state.squares)
 
     def _merge(self, count: int, low: Vector, high: Vector, mean: Vector, squares: Vector) -> None:
         total = self.count + count

@@ -50,6 +50,25 @@ FORMATS = {
 
 
 @dataclass(frozen=True)
+class LimitCheck:
+    """Comparison of a network with one limit of a controller.
+
+    Attributes:
+        what: the resource.
+        value, limit: in `unit`.
+        fits: whether the value is within the limit.
+        note: how the value is estimated.
+    """
+
+    what: str
+    value: int
+    limit: int
+    unit: str
+    fits: bool
+    note: str
+
+
+@dataclass(frozen=True)
 class ProcessorCore:
     """A processor core, by its cycles against those of a Cortex-M4F.
 

@@ -4,24 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import torch
 
 from edp.errors import ConfigError, ExportError
-from edp.evaluation.controller import CORES, Budget, Estimate, estimate
+from edp.evaluation.controller import CORES, Budget, Estimate, LimitCheck, estimate
 from edp.export.c.sizes import Sizes, sizes_of
 from edp.ir import Graph
 from edp.ir.rls import Adaptation
 from edp.ir.w8a16.quantise import outline
 from edp.networks.predictor import Predictor
 from edp.networks.streaming import Cost, state_numbers
+from edp.settings.results import plain_value
+from edp.storage.reading import Table
 
 GRAPHS: dict[str, Callable[[Predictor], Graph]] = {
     "float32": lambda predictor: predictor.graph(),
     "w8a16": lambda predictor: outline(predictor.graph()),
 }
 """Layers of a network by number format of `FORMATS`."""
+
+
+@dataclass(frozen=True)
+class PartCost:
+    """Parameters of a part of a network, and its multiply-accumulates per sample of a stream and per window."""
+
+    part: str
+    parameters: int
+    macs_tick: int
+    macs_window: int
 
 
 @dataclass(frozen=True)
@@ -51,7 +62,7 @@ class Footprint:
     peak_activation_bytes_window: int
     state_bytes: int
     window: int
-    rows: tuple[dict[str, Any], ...]
+    rows: tuple[PartCost, ...]
     estimates: tuple[Estimate, ...]
     refused: dict[str, str]
 
@@ -66,14 +77,16 @@ class Footprint:
                 return entry
         raise ExportError(self.refused[number_format])
 
-    def to_json(self, budget: Budget | None = None) -> dict[str, Any]:
+    def to_json(self, budget: Budget | None = None) -> Table:
         """Return plain values, with the verdict against a budget where one is given."""
         plain = asdict(self)
-        plain["rows"], plain["estimates"] = list(self.rows), [entry.to_json() for entry in self.estimates]
-        return plain if budget is None else plain | {"budget": asdict(budget), "verdict": self.verdict(budget)}
+        plain |= {"rows": plain_value(self.rows), "estimates": [entry.to_json() for entry in self.estimates]}
+        if budget is None:
+            return plain
+        return plain | {"budget": asdict(budget), "verdict": plain_value(self.verdict(budget))}
 
-    def verdict(self, budget: Budget) -> list[dict[str, Any]]:
-        """A row for each limit: value, limit, unit, whether it fits, and what the figure means."""
+    def verdict(self, budget: Budget) -> list[LimitCheck]:
+        """Compare the network with each limit."""
         bound = "a lower bound: at least one cycle per MAC on a scalar core"
         rows = [("cycles per prediction, windowed", self.macs_window, budget.cycles, "cycles", bound)]
         for entry in self.estimates:
@@ -87,10 +100,7 @@ class Footprint:
                 (f"RAM, {label}", memory, budget.ram_bytes, "bytes", "constants too, as in the thesis"),
                 (f"flash, {label}", entry.flash_bytes, budget.flash_bytes, "bytes", "estimate, with the program"),
             ]
-        return [
-            {"what": what, "value": value, "limit": limit, "unit": unit, "fits": value <= limit, "note": note}
-            for what, value, limit, unit, note in rows
-        ]
+        return [LimitCheck(what, value, limit, unit, value <= limit, note) for what, value, limit, unit, note in rows]
 
 
 def footprint(predictor: Predictor, adaptation: Adaptation | None = None) -> Footprint:
@@ -183,10 +193,10 @@ def _window_width(cost: Cost, window: int) -> int:
     return (cost.width_in + cost.width_out) * (window if cost.per_time_step else 1)
 
 
-def _row(cost: Cost, window: int) -> dict[str, Any]:
-    return {
-        "part": cost.part,
-        "parameters": cost.parameters,
-        "macs_tick": cost.per_column + cost.per_prediction + cost.pooling,
-        "macs_window": cost.per_column * window + cost.per_prediction,
-    }
+def _row(cost: Cost, window: int) -> PartCost:
+    return PartCost(
+        part=cost.part,
+        parameters=cost.parameters,
+        macs_tick=cost.per_column + cost.per_prediction + cost.pooling,
+        macs_window=cost.per_column * window + cost.per_prediction,
+    )

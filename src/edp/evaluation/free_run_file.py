@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 from edp.errors import ConfigError
 from edp.settings.bounds import MOST_ROWS, above, check_bounds, integer
 from edp.settings.results import ResultFile, read_part
+from edp.storage.reading import Table
 
 TWIN = "twin"
 """Name of the twin among the models."""
@@ -317,7 +317,7 @@ class FreeRunFile(ResultFile):
             raise ConfigError(f"'models.{TWIN}' is missing; it must be given")
 
 
-def read_models(table: Mapping[str, Any], where: str) -> Mapping[str, FreeRunScores]:
+def read_models(table: Table, where: str) -> Mapping[str, FreeRunScores]:
     """Build scores by name of a model from the header of a twin, which messages call `where`; empty without scores.
 
     Raises:

@@ -17,7 +17,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any
 
 import numpy as np
 
@@ -25,6 +24,7 @@ from edp.errors import count_of
 from edp.evaluation.free_run_file import FreeRunErrors, FreeRunScores
 from edp.evaluation.scores_file import ByHorizon, ModelScores, ScoresFile, error_at
 from edp.stats.resampled import paired_t
+from edp.storage.reading import Table
 from edp.wording import figure, percent, percent_interval
 
 NETWORK = "network"
@@ -359,7 +359,7 @@ def _free_run_logs_by_recording(own: FreeRunScores, scores: FreeRunScores) -> di
     }
 
 
-def adaptation_verdict(facts: Mapping[str, Any]) -> ErrorVerdict:
+def adaptation_verdict(facts: Table) -> ErrorVerdict:
     """Return the verdict on an adaptation against the same network without it.
 
     Args:
@@ -368,7 +368,7 @@ def adaptation_verdict(facts: Mapping[str, Any]) -> ErrorVerdict:
     return change_verdict(facts["change"], facts["change_by_recording"], UNADAPTED)
 
 
-def tuning_verdict(judged: Mapping[str, Any]) -> ErrorVerdict:
+def tuning_verdict(judged: Table) -> ErrorVerdict:
     """Return the verdict on tuned gains against the gains before, on the plant.
 
     Args:
@@ -378,7 +378,7 @@ def tuning_verdict(judged: Mapping[str, Any]) -> ErrorVerdict:
     return change_verdict(_relative_change(judged), by_reference, BEFORE_TUNING)
 
 
-def _relative_change(judged: Mapping[str, Any]) -> float:
+def _relative_change(judged: Table) -> float:
     before, after = float(judged["before"]), float(judged["after"])
     return after / before - 1.0 if before > 0 < after else 0.0
 

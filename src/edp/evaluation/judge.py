@@ -17,6 +17,7 @@ from edp.data.series import Series
 from edp.data.spread_rows import spread_series
 from edp.errors import ConfigError
 from edp.evaluation.baselines import BASELINES, Baseline, BaselineTask
+from edp.evaluation.measured import IntervalsState, MeasuredState
 from edp.evaluation.ruler import Numbered, Ruler
 from edp.evaluation.scores_file import ByHorizon, IntervalScores, Means, ModelScores, ScoresFile, nearest_to_shown
 from edp.networks.predictor import Predictor
@@ -164,13 +165,13 @@ class JudgedPart:
     """What a network measures on a part of the test recordings, and what pictures show of it.
 
     Attributes:
-        measured: a state of `edp.evaluation.measured.Measured`.
-        intervals: one of `edp.evaluation.measured.MeasuredIntervals`, where the network gives intervals.
+        measured: of the part.
+        intervals: None for a network without intervals.
         tensors: by ``recording/name``.
     """
 
-    measured: Mapping[str, object]
-    intervals: Mapping[str, object] | None
+    measured: MeasuredState
+    intervals: IntervalsState | None
     tensors: Mapping[str, NDArray[np.float32]]
 
 

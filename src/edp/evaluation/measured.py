@@ -3,16 +3,47 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edp.evaluation.by_situation import SituationTally
 from edp.evaluation.scores_file import ByTarget, SpeedBin
-from edp.evaluation.tally import Tally, Values
+from edp.evaluation.tally import Tally, TallyState, Values
 
 # Six bins show where an error grows with speed and leave enough samples in each.
 SPEED_BINS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class SpeedState:
+    """Content of a `SpeedTally`."""
+
+    count: NDArray[np.int64]
+    total: Values
+
+
+@dataclass(frozen=True, eq=False)
+class IntervalsState:
+    """Content of `MeasuredIntervals`."""
+
+    covered: Values
+    wide: Values
+    scored: Values
+    ticks: int
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredState:
+    """Content of `Measured`."""
+
+    tallies: tuple[TallyState, ...]
+    by_situation: tuple[Mapping[str, NDArray[Any]], ...]
+    speeds: tuple[SpeedState, ...]
+    integrals: Mapping[str, Values]
+    recordings: Mapping[int, Mapping[str, ByTarget]]
 
 
 class Measured:
@@ -34,24 +65,27 @@ class Measured:
         self.integrals = {target: np.zeros(2) for target in integrate}
         self.recordings: dict[int, dict[str, ByTarget]] = {}
 
-    def state(self) -> dict[str, object]:
-        """All that it holds, as plain values and arrays."""
-        return {
-            "tallies": [tally.state() for tally in self.tallies],
-            "by_situation": [tally.state() for tally in self.by_situation],
-            "speeds": [tally.state() for tally in self.speeds],
-            "integrals": dict(self.integrals),
-            "recordings": dict(self.recordings),
-        }
+    def state(self) -> MeasuredState:
+        """Return the content, for another process."""
+        return MeasuredState(
+            tallies=tuple(tally.state() for tally in self.tallies),
+            by_situation=tuple(tally.state() for tally in self.by_situation),
+            speeds=tuple(tally.state() for tally in self.speeds),
+            integrals=dict(self.integrals),
+            recordings=dict(self.recordings),
+        )
 
-    def add(self, state: Mapping[str, Any]) -> None:
-        """Take in what another one held, by its `state`."""
-        for name in ("tallies", "by_situation", "speeds"):
-            for own, other in zip(getattr(self, name), state[name], strict=True):
-                own.add(other)
-        for target, sums in state["integrals"].items():
+    def add(self, state: MeasuredState) -> None:
+        """Add the content of another one."""
+        for tally, other in zip(self.tallies, state.tallies, strict=True):
+            tally.add(other)
+        for situations, ticks in zip(self.by_situation, state.by_situation, strict=True):
+            situations.add(ticks)
+        for speeds, bins in zip(self.speeds, state.speeds, strict=True):
+            speeds.add(bins)
+        for target, sums in state.integrals.items():
             self.integrals[target] += sums
-        self.recordings |= state["recordings"]
+        self.recordings |= {number: dict(scores) for number, scores in state.recordings.items()}
 
 
 class MeasuredIntervals:
@@ -60,16 +94,16 @@ class MeasuredIntervals:
     def __init__(self, shape: tuple[int, int, int]) -> None:
         self.covered, self.wide, self.scored, self.ticks = np.zeros(shape), np.zeros(shape), np.zeros(shape), 0
 
-    def state(self) -> dict[str, Any]:
-        """All that it holds, as plain values and arrays."""
-        return {"covered": self.covered, "wide": self.wide, "scored": self.scored, "ticks": self.ticks}
+    def state(self) -> IntervalsState:
+        """Return the content, for another process."""
+        return IntervalsState(self.covered, self.wide, self.scored, self.ticks)
 
-    def add(self, state: Mapping[str, Any]) -> None:
-        """Take in what another one held, by its `state`."""
-        self.covered += state["covered"]
-        self.wide += state["wide"]
-        self.scored += state["scored"]
-        self.ticks += state["ticks"]
+    def add(self, state: IntervalsState) -> None:
+        """Add the content of another one."""
+        self.covered += state.covered
+        self.wide += state.wide
+        self.scored += state.scored
+        self.ticks += state.ticks
 
 
 class SpeedTally:
@@ -86,14 +120,14 @@ class SpeedTally:
         self.count += np.bincount(places, minlength=SPEED_BINS)
         self.total += np.bincount(places, weights=np.abs(predicted - truth).ravel(), minlength=SPEED_BINS)
 
-    def state(self) -> dict[str, object]:
-        """All that it holds, as arrays."""
-        return {"count": self.count, "total": self.total}
+    def state(self) -> SpeedState:
+        """Return the content, for another process."""
+        return SpeedState(self.count, self.total)
 
-    def add(self, state: Mapping[str, Any]) -> None:
-        """Take in what another one held, by its `state`."""
-        self.count += state["count"]
-        self.total += state["total"]
+    def add(self, state: SpeedState) -> None:
+        """Add the content of another one."""
+        self.count += state.count
+        self.total += state.total
 
     def rows(self) -> tuple[SpeedBin, ...]:
         """Return the bins from slow to fast."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from edp.evaluation.controller import BOARD_SLOW, BOARD_TYPICAL, CORES, STACK_BYTES, Budget, Estimate
+from edp.evaluation.controller import BOARD_SLOW, BOARD_TYPICAL, CORES, STACK_BYTES, Budget, Estimate, LimitCheck
 from edp.evaluation.footprint import Footprint, footprint
 from edp.export.monitor import (
     BalancePart,
@@ -21,6 +21,7 @@ from edp.export.monitor import (
 from edp.export.monitor.parts import PIECE, ROW, pieces
 from edp.networks.integer import IntegerPredictor
 from edp.networks.twin import TwinPlant
+from edp.settings.results import plain_value
 
 CORE_COSTS = {
     "residual": 1_650.0,
@@ -194,11 +195,11 @@ class MonitorFootprint:
             "ram_bytes": self.ram_bytes,
             "program_bytes": self.program_bytes,
             "budget": asdict(budget),
-            "verdict": self.verdict(budget),
+            "verdict": plain_value(self.verdict(budget)),
         }
 
-    def verdict(self, budget: Budget) -> list[dict[str, object]]:
-        """A row for each limit, as `Footprint.verdict` has them."""
+    def verdict(self, budget: Budget) -> list[LimitCheck]:
+        """Compare the monitor with each limit."""
         low, typical, high = self.cycles[budget.core]
         text = f"high estimate of the longest tick; low {low:,}, typical {typical:,}"
         memory, flash = self.constants + self.ram_bytes, self.constants + self.program_bytes
@@ -208,10 +209,7 @@ class MonitorFootprint:
             ("RAM", memory, budget.ram_bytes, "bytes", "constants too, as in the thesis"),
             ("flash", flash, budget.flash_bytes, "bytes", "estimate, with the program"),
         ]
-        return [
-            {"what": what, "value": value, "limit": limit, "unit": unit, "fits": value <= limit, "note": note}
-            for what, value, limit, unit, note in rows
-        ]
+        return [LimitCheck(what, value, limit, unit, value <= limit, note) for what, value, limit, unit, note in rows]
 
 
 def monitor_footprint(parts: MonitorParts) -> MonitorFootprint:

@@ -3,17 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.data.moments import Moments
+from edp.data.moments import Moments, MomentsState
 from edp.evaluation.scores_file import MEAN, ByTarget
 from edp.stats.metrics import Scores, composite, mean_scores, score
 from edp.stats.sketch import MOST_EXACT, QuantileSketch
 
 Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SumsState:
+    """Sums of all targets: moments of the truth, sums of errors, and sketches of the sizes of errors."""
+
+    truth: MomentsState
+    errors: Values
+    sizes: tuple[Mapping[str, NDArray[Any]], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class TallyState:
+    """Content of a `Tally`: its samples, predicted and true, or sums if there are many."""
+
+    count: int
+    samples: tuple[Values, Values] | None = None
+    sums: SumsState | None = None
 
 
 class Tally:
@@ -39,21 +58,21 @@ class Tally:
         if self.count > MOST_EXACT or self._sums is not None:
             self._sum_all()
 
-    def state(self) -> dict[str, object]:
-        """All that it holds, as plain values and arrays."""
+    def state(self) -> TallyState:
+        """Return the content, for another process."""
         if self._sums is not None:
-            return {"count": self.count, "sums": self._sums.state()}
+            return TallyState(self.count, sums=self._sums.state())
         nothing = np.zeros((0, len(self.targets)))
         predicted, truth = (np.concatenate([nothing, *(pair[i] for pair in self._kept)]) for i in range(2))
-        return {"predicted": predicted, "truth": truth}
+        return TallyState(self.count, samples=(predicted, truth))
 
-    def add(self, state: Mapping[str, Any]) -> None:
-        """Take in what another one held, by its `state`."""
-        if "sums" not in state:
-            self.update(state["predicted"], state["truth"])
-            return
-        self._sum_all().add(state["sums"])
-        self.count += state["count"]
+    def add(self, state: TallyState) -> None:
+        """Add the content of another one."""
+        if state.samples is not None:
+            self.update(*state.samples)
+        elif state.sums is not None:
+            self._sum_all().add(state.sums)
+            self.count += state.count
 
     def _sum_all(self) -> _Sums:
         """The sums, with all ticks in them that were kept one by one."""
@@ -89,13 +108,13 @@ class _Sums:
         for sketch, column in zip(self.sizes, size.T, strict=True):
             sketch.update(column)
 
-    def state(self) -> dict[str, object]:
-        return {"truth": self.truth.state(), "errors": self.errors, "sizes": [sketch.state() for sketch in self.sizes]}
+    def state(self) -> SumsState:
+        return SumsState(self.truth.state(), self.errors, tuple(sketch.state() for sketch in self.sizes))
 
-    def add(self, state: Mapping[str, Any]) -> None:
-        self.truth.add(state["truth"])
-        self.errors += state["errors"]
-        for sketch, size in zip(self.sizes, state["sizes"], strict=True):
+    def add(self, state: SumsState) -> None:
+        self.truth.add(state.truth)
+        self.errors += state.errors
+        for sketch, size in zip(self.sizes, state.sizes, strict=True):
             sketch.add(size)
 
     def scores(self) -> list[Scores]:

@@ -20,6 +20,7 @@ from edp.ir.hydraulics import HydraulicTick
 from edp.networks.integer import IntegerPredictor
 from edp.networks.predictor import Predictor
 from edp.signals import KINDS, Kind
+from edp.storage.reading import Table
 from edp.training.bundle import Bundle
 
 SCHEMA = 1
@@ -45,7 +46,7 @@ class Description:
         targets = len(self.bundle.task.targets)
         return {meaning: shape_of_result(self.graph, value, targets) for meaning, value in self.graph.results.items()}
 
-    def content(self) -> dict[str, Any]:
+    def content(self) -> Table:
         """Plain values that JSON can hold."""
         bundle, task = self.bundle, self.bundle.task
         kinds, texts = bundle.target_kinds, bundle.descriptions

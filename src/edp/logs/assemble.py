@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from edp.logs.timebase import Clock, Grid, Rows, common_grid, hold_rows, uniform
 from edp.recording import FloatArray, Recording
 from edp.signals import SignalMap
 from edp.storage.memory import check_memory
+from edp.storage.reading import Table
 from edp.wording import typed
 
 _CACHED_ROWS = 4096
@@ -93,7 +93,7 @@ class Assembly:
             DataError: a column cannot be read, or holds missing values that may not be repaired.
         """
         values, repairs = self._mended(start, stop, before)
-        meta: dict[str, Any] = dict(self.raw.meta)
+        meta: Table = dict(self.raw.meta)
         if self.repairs or repairs:
             meta["repairs"] = [*meta.get("repairs", []), *self.repairs, *repairs]
         if self.resampled:
@@ -107,7 +107,7 @@ class Assembly:
             meta=meta,
         )
 
-    def _mended(self, start: int, stop: int, before: FloatArray | None) -> tuple[FloatArray, list[dict[str, Any]]]:
+    def _mended(self, start: int, stop: int, before: FloatArray | None) -> tuple[FloatArray, list[Table]]:
         values = self.values(start, stop)
         missing = self.missing[start:stop]
         if self.repair.gaps != "hold":

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from edp.storage.reading import Table
 
 Array = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ class SlowDrift:
         return {"step": self.step, "most": self.most}
 
     @staticmethod
-    def of(plain: Mapping[str, Any]) -> SlowDrift:
+    def of(plain: Table) -> SlowDrift:
         """From plain values.
 
         Raises:

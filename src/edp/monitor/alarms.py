@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 from edp.monitor.diagnosis.causes import NONE_OF_THESE, Cause
+from edp.storage.reading import Table
 
 SEVERITIES = ("note", "warning", "stop")
 
@@ -40,7 +41,7 @@ class MonitorAlarm:
     sentence: str = ""
     severity: str = "warning"
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Table:
         """Plain JSON values, keys as the fields."""
         plain = asdict(self)
         plain["evidence"] = [[name, value] for name, value in self.evidence]

@@ -19,6 +19,7 @@ from edp.monitor.detectors.base import DETECTORS, Detector
 from edp.monitor.summaries import BlockSummaries, SummaryState
 from edp.monitor.watches import BankSpec, Watch
 from edp.settings.tree import SettingsTree
+from edp.storage.reading import Table
 
 Array = NDArray[np.float64]
 MOST_SUMMARIES = 5_000
@@ -187,7 +188,7 @@ class MonitorChain:
         return named
 
     @staticmethod
-    def of(plain: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> MonitorChain:
+    def of(plain: Table, arrays: Mapping[str, NDArray[Any]]) -> MonitorChain:
         """From plain values and arrays.
 
         Raises:

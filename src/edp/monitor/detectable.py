@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
@@ -17,6 +17,7 @@ from edp.monitor.monitor import Monitor
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.signals import KINDS, Channel
+from edp.storage.reading import Table
 from edp.wording import figure, percent
 
 FOUND_SHARE = 0.8
@@ -269,7 +270,7 @@ def _spread(channels: Sequence[Channel], most: int) -> list[Channel]:
     return [channels[i] for i in places.tolist()]
 
 
-def found_sizes(provenance: Mapping[str, Any]) -> list[FoundSize]:
+def found_sizes(provenance: Table) -> list[FoundSize]:
     """Return what `measure_found_sizes` found, from the provenance of a monitor; empty for earlier versions.
 
     Raises:
@@ -293,7 +294,7 @@ def promise_lines(sizes: Sequence[FoundSize]) -> list[str]:
     return lines
 
 
-def effort_line(provenance: Mapping[str, Any]) -> str:
+def effort_line(provenance: Table) -> str:
     """Return a sentence about trials left out for lack of time; an empty text if all were run.
 
     Raises:

@@ -22,6 +22,7 @@ from edp.monitor.residuals.base import ResidualSource, Rows, SourceState, rows_o
 from edp.recording import Recording
 from edp.settings.bounds import shown
 from edp.signals import Channel
+from edp.storage.reading import Table
 from edp.wording import figure, number
 
 Array = NDArray[np.float64]
@@ -111,7 +112,7 @@ class Monitor:
     limit: AlarmLimit
     session_means: Array
     diagnosis: Dictionary | None = None
-    provenance: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Table = field(default_factory=dict)
     scatter: Array | None = None
 
     @property

@@ -26,6 +26,7 @@ from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, write_json
 from edp.storage.headers import read_header
 from edp.storage.paths import entries_of, is_entry_at, is_folder_at, is_link_at, is_there
+from edp.storage.reading import Table
 from edp.storage.seals import HASH
 from edp.training.bundle import HEADER as BUNDLE_HEADER
 from edp.training.bundle import (
@@ -57,7 +58,7 @@ def save_monitor(monitor: Monitor, folder: str | Path) -> Path:
         StorageError: the folder cannot be written.
     """
     path = make_folder(folder)
-    arrays: dict[str, Any] = {f"chain.{name}": values for name, values in monitor.chain.arrays().items()}
+    arrays: Table = {f"chain.{name}": values for name, values in monitor.chain.arrays().items()}
     arrays["session_means"] = monitor.session_means
     if monitor.scatter is not None:
         arrays["scatter"] = monitor.scatter
@@ -153,7 +154,7 @@ def load_monitor(folder: str | Path) -> Monitor:
     return replace(monitor, diagnosis=load_dictionary(path, monitor.summary_names))
 
 
-def _assembled(header: Mapping[str, Any], path: Path) -> Monitor:
+def _assembled(header: Table, path: Path) -> Monitor:
     entries = header["channels"]
     if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_CHANNELS:
         raise ValueError(f"it has no list of 1 to {MOST_CHANNELS:,} channels")
@@ -200,7 +201,7 @@ def _check_fit(sources: tuple[ResidualSource, ...], chain: MonitorChain, names: 
             raise ValueError(f"a source reads '{unknown[0][:80]}', which is none of its channels")
 
 
-def _sources(entries: Any, arrays: Mapping[str, Any], path: Path) -> tuple[ResidualSource, ...]:
+def _sources(entries: Any, arrays: Table, path: Path) -> tuple[ResidualSource, ...]:
     if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_SOURCES:
         raise ValueError(f"it has no list of 1 to {MOST_SOURCES} sources of residuals")
     sources = []
@@ -239,7 +240,7 @@ def read_network(path: Path, entry: Mapping[str, Any]) -> Bundle | TwinBundle:
     return network
 
 
-def _limit(entry: Mapping[str, Any]) -> AlarmLimit:
+def _limit(entry: Table) -> AlarmLimit:
     count = entry["alarms"]
     if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count < 2**53:
         raise ValueError(f"alarms of its limit is {str(count)[:40]}; a count must hold")
@@ -250,7 +251,7 @@ def _limit(entry: Mapping[str, Any]) -> AlarmLimit:
     return AlarmLimit(alarms=count, **values)
 
 
-def _channel(entry: Mapping[str, Any]) -> Channel:
+def _channel(entry: Table) -> Channel:
     channel = Channel(_text(entry["name"]), Kind(entry["kind"]), _text(entry["description"]))
     if entry["unit"] != channel.unit:
         raise ValueError(f"channel '{channel.name[:80]}' is in {str(entry['unit'])[:20]}, {channel.unit} must hold")

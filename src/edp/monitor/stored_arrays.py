@@ -14,6 +14,7 @@ from safetensors.numpy import load, save
 from edp.errors import StorageError, brief
 from edp.storage import read_bytes, write_bytes, write_json
 from edp.storage.headers import read_header
+from edp.storage.reading import Table
 from edp.storage.seals import HASH, content_digest, digest_of_bytes
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -34,7 +35,7 @@ def write_stored(folder: Path, name: str, header: Mapping[str, object], arrays: 
     write_json(folder / f"{name}.json", whole)
 
 
-def read_stored(folder: Path, name: str, schema: int) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def read_stored(folder: Path, name: str, schema: int) -> tuple[Table, dict[str, NDArray[Any]]]:
     """Read header and arrays after a check of their hashes; nothing in them is executed.
 
     Raises:

@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.storage.reading import Table
+
 HEADER_BYTES = 1 << 28
 """Of the JSON of one message: names and descriptions of all columns of a log."""
 _LENGTH = struct.Struct("<Q")
@@ -23,7 +25,7 @@ _NUMBERS = re.compile(r"[<>|]?(?:f[248]|[iu][1248]|b1)")
 """Plain numbers of at most eight bytes: no objects, which would be pickled, and no structures."""
 _WRITTEN_BYTES = 1 << 24
 """Written at once: some systems refuse single writes of gigabytes."""
-Header = dict[str, Any]
+Header = Table
 ReadInto = Callable[[memoryview], None]
 Write = Callable[[Any], None]
 

@@ -10,11 +10,10 @@ given the commands.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +31,7 @@ from edp.sim.scenario import Scenario, plain
 from edp.sim.sensors import sensors
 from edp.sim.simulate import Simulation
 from edp.storage.ledger import TrainingIdentity, WithState
+from edp.storage.reading import Table
 
 Array = NDArray[np.float64]
 TARGETS = tuple(TABLE_A1)[:3]
@@ -204,7 +204,7 @@ def find_limit(
     workers: Workers = IN_PROCESS,
     progress: Progress = SILENT,
     folder: Path | None = None,
-) -> dict[str, Any]:
+) -> Table:
     """Return the predictability limit of a data set as plain data in mm/s, equal for any number of workers.
 
     Args:
@@ -258,7 +258,7 @@ def _unit(job: LimitJob) -> WorkUnit:
     return WorkUnit(f"{__name__}:branch_unit", f"'{job.label}'", arguments, machine_hash(job.scenario))
 
 
-def branch_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState:
+def branch_unit(identity: TrainingIdentity, where: Table) -> WithState:
     """Branch the moments of the recording of a unit."""
     config = identity.config
     scenario = scenario_of_unit(config["scenario"], identity.data)

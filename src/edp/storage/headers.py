@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 from edp.errors import StorageError
 from edp.storage.paths import is_file_at
-from edp.storage.reading import JSON_BYTES, object_with, parse_json, read_bytes, read_text
+from edp.storage.reading import JSON_BYTES, Table, object_with, parse_json, read_bytes, read_text
 from edp.storage.run_kinds import RUN_KINDS
 from edp.storage.seals import HASH, content_digest, digest_of_bytes
 
@@ -19,7 +18,7 @@ FILES = "files"
 _ENTRY = {"file", HASH}
 
 
-def read_header(file: str | Path, keys: Iterable[str] = ()) -> dict[str, Any]:
+def read_header(file: str | Path, keys: Iterable[str] = ()) -> Table:
     """Return a header with its hash, which is not checked: headers of several schemas state it differently.
 
     Raises:

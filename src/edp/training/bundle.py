@@ -235,7 +235,7 @@ def upgrade_bundle(folder: str | Path) -> Path:
     return path
 
 
-def _reworded(header: Mapping[str, Any]) -> dict[str, object]:
+def _reworded(header: Table) -> dict[str, object]:
     """Convert the keys of an earlier header to this version."""
     reworded = {**header, "provenance": _renamed(header["provenance"], "lesson", "strategy")}
     if "adaptation" in header:
@@ -284,7 +284,7 @@ def _read_header(path: Path) -> dict[str, object]:
     return header
 
 
-def _assembled(header: dict[str, Any], path: Path) -> Bundle:
+def _assembled(header: Table, path: Path) -> Bundle:
     """Build the bundle from a header and its files."""
     spec, task = model_from_plain(header["model"]), task_from_plain(header["task"])
     inputs = tuple(Channel(_text(c["name"]), Kind(c["kind"]), _text(c["description"])) for c in header["inputs"])
@@ -303,7 +303,7 @@ def _assembled(header: dict[str, Any], path: Path) -> Bundle:
     return Bundle(predictor.eval(), inputs, kinds, texts, provenance, scores, adaptation)
 
 
-def _check_channels(header: Mapping[str, Any], task: Task, inputs: Sequence[Channel]) -> None:
+def _check_channels(header: Table, task: Task, inputs: Sequence[Channel]) -> None:
     """Check that the listed channels are those of the task, in its order."""
     # Order is meaning: swapped columns would give plausible and wrong predictions.
     if [channel.name for channel in inputs] != list(task.inputs):
@@ -353,7 +353,7 @@ def _fill(predictor: Predictor, tensors: Mapping[str, torch.Tensor]) -> None:
             raise ValueError(f"its weights are damaged: the scale of the {what} holds a width that is not positive")
 
 
-def _adaptation(entry: Mapping[str, Any], task: Task, path: Path) -> Adaptation:
+def _adaptation(entry: Table, task: Task, path: Path) -> Adaptation:
     adaptation = Adaptation.from_plain(entry, load_arrays(read_arrays(path, entry["arrays"])))
     if (len(adaptation.offset), len(adaptation.columns), adaptation.horizons) != (
         len(task.inputs),
@@ -366,7 +366,7 @@ def _adaptation(entry: Mapping[str, Any], task: Task, path: Path) -> Adaptation:
     return adaptation
 
 
-def _check_schema(header: Mapping[str, Any], path: Path) -> None:
+def _check_schema(header: Table, path: Path) -> None:
     schema = header["schema"]
     # 1.0 and true equal 1 in Python; neither is a schema.
     if schema in (SCHEMA, INTEGER_SCHEMA, ADAPTED_SCHEMA) and not isinstance(schema, bool | float):

@@ -18,6 +18,7 @@ from edp.errors import StorageError
 from edp.networks.streaming import State
 from edp.storage import parse_json, read_bytes, write_bytes
 from edp.storage.paths import is_entry_at
+from edp.storage.reading import Table
 from edp.training.schedules import ScheduleState
 
 CHECKPOINT_BYTES = 16 * 2**30
@@ -39,7 +40,7 @@ class TrainingPosition:
     best_epoch: int = 0
     seconds: float = 0.0
     schedule: ScheduleState = field(default_factory=ScheduleState)
-    history: list[dict[str, Any]] = field(default_factory=list)
+    history: list[Table] = field(default_factory=list)
 
 
 @dataclass
@@ -111,9 +112,7 @@ def damaged(path: Path, error: Exception) -> StorageError:
     return StorageError(f"checkpoint '{path}' is damaged ({error}); remove it to train from the start")
 
 
-def _taken_apart(
-    header: dict[str, Any], tensors: dict[str, Tensor]
-) -> tuple[TrainingPosition, Weights, dict[str, object]]:
+def _taken_apart(header: Table, tensors: dict[str, Tensor]) -> tuple[TrainingPosition, Weights, dict[str, object]]:
     plain = header["progress"]
     progress = TrainingPosition(**{**plain, "schedule": ScheduleState(**plain["schedule"])})
     groups: dict[str, dict[str, Tensor]] = {"current": {}, "average": {}, "best": {}}
@@ -125,7 +124,7 @@ def _taken_apart(
     return progress, Weights(**groups, running=tensors["running"]), optimizer
 
 
-def optimizer_state(plain: dict[str, Any]) -> dict[str, Any]:
+def optimizer_state(plain: Table) -> Table:
     """Return an optimiser state for loading, from its form with text keys."""
     return {**plain, "state": {int(index): value for index, value in plain["state"].items()}}
 

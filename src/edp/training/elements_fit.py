@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from edp.data.series import Series
 from edp.errors import DataError
 from edp.networks.twin.elements import PRIOR, ElementsTwin
+from edp.storage.reading import Table
 from edp.training.free_run import FreeRunProgress, FreeRunValidation
 from edp.wording import typed
 
@@ -190,7 +191,7 @@ def fit_elements(
     longest = max(series.samples for series in validation) - 1 - twin.prefix_ticks
     judge = FreeRunValidation(twin, validation, longest, 8)
     size, every = problem.size()
-    history: list[dict[str, Any]] = []
+    history: list[Table] = []
     best, least, length_s = twin, np.inf, problem.commands.shape[1]
     information: Doubles = np.zeros((size, size))
     for start in range(twin.spec.starts):

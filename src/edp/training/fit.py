@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -18,6 +17,7 @@ from edp.data.series import Series
 from edp.errors import ConfigError, DataError
 from edp.networks.predictor import ModelSpec, build_model, trainable
 from edp.networks.streaming import State, detach_state, reset_where
+from edp.storage.reading import Table
 from edp.storage.runs import KeyedRun
 from edp.training.bagging.fit import fit_in_folds
 from edp.training.checkpoint import (
@@ -108,7 +108,7 @@ class Loop:
         spec: TrainingSpec,
         run: KeyedRun | None,
         strategy: TrainingStrategy | None = None,
-        refitted: list[dict[str, Any]] | None = None,
+        refitted: list[Table] | None = None,
         windowed: bool = False,
     ) -> None:
         self.data, self.spec, self.run, self.strategy, self.refitted = data, spec, run, strategy, refitted

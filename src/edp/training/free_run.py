@@ -11,7 +11,6 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import torch
@@ -38,6 +37,7 @@ from edp.settings.bounds import (
     check_count,
     integer,
 )
+from edp.storage.reading import Table
 from edp.storage.runs import KeyedRun
 from edp.training.blas import one_blas_thread
 from edp.training.checkpoint import FILE, TrainingPosition, Weights, damaged, load_checkpoint, save_checkpoint
@@ -155,7 +155,7 @@ class FittedTwin:
     """
 
     twin: Twin
-    history: list[dict[str, Any]]
+    history: list[Table]
     seconds: float
 
 

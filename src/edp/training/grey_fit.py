@@ -20,6 +20,7 @@ from edp.errors import DataError
 from edp.networks.twin.grey.numbers import coarse_by_fine
 from edp.networks.twin.grey.plausible import STRETCHES
 from edp.networks.twin.greybox import GreyTwin, RunTarget
+from edp.storage.reading import Table
 from edp.training.blas import one_blas_thread
 from edp.training.free_run import FreeRunProgress, FreeRunValidation
 
@@ -280,7 +281,7 @@ def _fitted(
     twin, spec, (_, validation) = problem.twin, problem.twin.spec.fit, parts
     judge = FreeRunValidation(twin, validation, round(spec.validation_s * twin.channels.rate_hz), spec.validation_runs)
     rounds = [length for length, count in zip(spec.lengths_s, spec.rounds, strict=True) for _ in range(count)]
-    history: list[dict[str, Any]] = []
+    history: list[Table] = []
 
     def advance(path: _Path, lengths: Sequence[float], last: bool = False) -> None:
         for number, length_s in enumerate(lengths, 1):

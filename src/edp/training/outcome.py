@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from edp.errors import EdpError, NotFiniteError
 from edp.networks.predictor import Predictor
+from edp.storage.reading import Table
 
 
 class TrainingError(EdpError):
@@ -23,7 +23,7 @@ class TrainingProgress:
     updates: int
     targets_per_s: float
     seconds_left: float
-    row: dict[str, Any] | None = None
+    row: Table | None = None
     refit: bool = False
 
     @property
@@ -45,7 +45,7 @@ class Fitted:
     """
 
     predictor: Predictor
-    history: list[dict[str, Any]]
+    history: list[Table]
     seconds: float
     targets_per_s: float
     resumed_at: int
@@ -61,6 +61,6 @@ class Diverged(TrainingError, NotFiniteError):
 
     exit_code = 4
 
-    def __init__(self, message: str, fitted: Fitted | None, facts: dict[str, Any]) -> None:
+    def __init__(self, message: str, fitted: Fitted | None, facts: Table) -> None:
         super().__init__(message)
         self.fitted, self.facts = fitted, facts

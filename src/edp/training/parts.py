@@ -14,6 +14,7 @@ from torch import Tensor
 from edp.data.prepared import Prepared
 from edp.errors import ConfigError
 from edp.networks.predictor import ModelSpec
+from edp.storage.reading import Table
 from edp.training.checkpoint import TrainingPosition, optimizer_state, pack, unpack
 from edp.training.fit import Loop
 from edp.training.outcome import Fitted
@@ -105,7 +106,7 @@ def _state_of_epochs(loop: Loop) -> dict[str, object]:
     }
 
 
-def _restore_epochs(loop: Loop, state: dict[str, Any]) -> None:
+def _restore_epochs(loop: Loop, state: Table) -> None:
     progress = state["progress"]
     loop.progress = TrainingPosition(**{**progress, "schedule": ScheduleState(**progress["schedule"])})
     with torch.no_grad():
@@ -138,7 +139,7 @@ def _state(loop: Loop) -> dict[str, object]:
     }
 
 
-def _restore(loop: Loop, state: dict[str, Any]) -> None:
+def _restore(loop: Loop, state: Table) -> None:
     loop.progress.updates = state["updates"]
     loop.within.updates, loop.within.total = state["epoch_updates"], state["total"]
     loop.within.stream = _moved(state["stream"], loop.device)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from safetensors.numpy import load as load_arrays
@@ -185,7 +183,7 @@ def load_twin(folder: str | Path) -> TwinBundle:
         return _assembled(header, path)
 
 
-def _assembled(header: Mapping[str, Any], path: Path) -> TwinBundle:
+def _assembled(header: Table, path: Path) -> TwinBundle:
     parts = {part: tuple(_channel(entry) for entry in header["channels"][part]) for part in PARTS}
     if not RATE.holds(header["rate_hz"]):
         raise ValueError(f"its rate_hz is {str(header['rate_hz'])[:40]}; {RATE.rule('rate_hz')} must hold")
@@ -211,7 +209,7 @@ def _assembled(header: Mapping[str, Any], path: Path) -> TwinBundle:
     return TwinBundle(spec, twin, provenance, scores, intervals, _ground(header, twin))
 
 
-def _ground(header: Mapping[str, Any], twin: Twin) -> GroundLaw | None:
+def _ground(header: Table, twin: Twin) -> GroundLaw | None:
     """Read the ground law of a header, if it has one."""
     if header["schema"] < GROUNDED:
         return None
@@ -227,7 +225,7 @@ def _plain(channel: Channel) -> dict[str, str]:
     return {"name": channel.name, "kind": str(channel.kind), "unit": channel.unit, "description": channel.description}
 
 
-def _channel(entry: Mapping[str, Any]) -> Channel:
+def _channel(entry: Table) -> Channel:
     texts = [entry["name"], entry["description"]]
     if not all(isinstance(text, str) for text in texts):
         raise TypeError("the name or description of a channel is no text")

@@ -19,6 +19,7 @@ from edp.errors import ConfigError
 from edp.networks.twin import Twin, TwinState
 from edp.sim.environment import ExcavatorEnv, VectorExcavatorEnv
 from edp.sim.machine.machine_files import load_machine
+from edp.storage.reading import Table
 
 Array = NDArray[np.float64]
 
@@ -78,7 +79,7 @@ class SimulatorLanes(PlantLanes):
         observed, _, _, _, infos = self._env.step(levers)
         self._show(observed, infos)
 
-    def _show(self, observed: NDArray[np.float32], infos: dict[str, Any]) -> None:
+    def _show(self, observed: NDArray[np.float32], infos: Table) -> None:
         self.observed = observed
         self.strokes, self.tip = (
             np.stack([infos["truth"][name] for name in names], axis=1) for names in (STROKES, TIP)
@@ -154,7 +155,7 @@ class EnvironmentLanes(PlantLanes):
                 observed, _, _, _, info = env.step(levers[lane])
                 self._show(lane, observed, info)
 
-    def _show(self, lane: int, observed: NDArray[np.float32], info: dict[str, Any]) -> None:
+    def _show(self, lane: int, observed: NDArray[np.float32], info: Table) -> None:
         self.observed[lane] = observed
         self.strokes[lane] = [info["truth"][name] for name in STROKES]
         self.tip[lane] = [info["truth"][name] for name in TIP]

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.storage.reading import Table
+
 Array = NDArray[np.float64]
 OnProgress = Callable[[str, float], None]
 """Called with the stage that begins or goes on, and the share of the whole screening that is done, 0 to 1."""
@@ -317,7 +319,7 @@ class ScreeningResult:
 
     def to_json(self) -> dict[str, object]:
         """Plain JSON values: arrays as lists, a number that is not finite as None."""
-        plain: dict[str, Any] = _plain(self)
+        plain: Table = _plain(self)
         plain["lag_table"] = _plain(self.lag_table())
         plain["proposal"]["kept"] = list(self.proposal.kept)
         plain["proposal"]["dropped"] = list(self.proposal.dropped)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from edp import __version__
 from edp.export.description import entry_of
 from edp.export.monitor.parts import MonitorParts
 from edp.export.si_names import si_channels
+from edp.storage.reading import Table
 
 SCHEMA = 1
 SUMMARIES = ("mean", "spread", "gain", "lag", "peak")
 """Of each residual and block."""
 
 
-def description(parts: MonitorParts, name: str) -> dict[str, Any]:
+def description(parts: MonitorParts, name: str) -> Table:
     """Plain values that JSON can hold."""
     chain = parts.chain
     return {

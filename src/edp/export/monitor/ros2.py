@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 from edp import __version__
 from edp.export.description import as_json
@@ -15,6 +14,7 @@ from edp.export.monitor.fmu import OUTPUTS
 from edp.export.monitor.parts import MonitorParts
 from edp.export.monitor.write import monitor_files
 from edp.export.ros2.target import message_names, source_guess
+from edp.storage.reading import Table
 
 NODE = "monitor"
 MODULES = {
@@ -92,7 +92,7 @@ def _about(parts: MonitorParts, name: str) -> dict[str, object]:
     return about | {"outputs": outputs, "targets": targets, "horizons": [{"ticks": 0}], "results": result}
 
 
-def _blanks(parts: MonitorParts, package: str, name: str, about: dict[str, Any]) -> dict[str, object]:
+def _blanks(parts: MonitorParts, package: str, name: str, about: Table) -> dict[str, object]:
     names = [entry["name"] for entry in about["inputs"]]
     sources = [
         f"      - {yaml_scalar(f'{own}={source_guess(own, channel.kind)}')}"

@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from edp.export.description import Description
 from edp.export.onnx.nodes import OPSETS
 from edp.export.onnx.step import INPUTS, State
+from edp.storage.reading import Table
 
 RULES = {
     "order": "inputs and targets in the order of this file, in SI units",
@@ -51,7 +51,7 @@ def content(
     return described.content() | {"rules": RULES, "graphs": graphs}
 
 
-def with_full_starts(about: dict[str, Any], states: Sequence[State]) -> dict[str, object]:
+def with_full_starts(about: Table, states: Sequence[State]) -> dict[str, object]:
     """`content` with whole arrays as the starts of states, for MATLAB."""
     # MATLAB has no rule for the short form of a start.
     step = about["graphs"]["step"]

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 from edp import __version__
 from edp.export.base import TARGETS
@@ -17,6 +16,7 @@ from edp.export.escape import Code, fill, markdown_text, shown_names, xml_text, 
 from edp.export.folder import write_export
 from edp.export.hashes import model_hash
 from edp.signals import Kind
+from edp.storage.reading import Table
 from edp.training.bundle import Bundle
 
 MODULES = ("core.py", "node.py", "tick_node.py", "replay.py", "build.py")
@@ -95,7 +95,7 @@ def _plain(name: str) -> str:
     return f"_{plain}" if plain.startswith(("+", "-", "@")) else plain
 
 
-def _blanks(model: Model, package: str, about: Mapping[str, Any]) -> dict[str, object]:
+def _blanks(model: Model, package: str, about: Table) -> dict[str, object]:
     task, inputs = model.bundle.task, [entry["name"] for entry in about["inputs"]]
     # Behind the measured values of a plant are their flags.
     read = len(inputs) if not model.graph.fed_back else model.bundle.predictor.required + len(task.targets)

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
-from typing import Any
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from edp.export.hashes import model_hash, scale_hash
 from edp.export.simulink.native import Native, functions_for
 from edp.ir.base import Number
 from edp.networks.input_range import HOLD_TICKS, input_limits
+from edp.storage.reading import Table
 
 RULES = {
     "order": "inputs and targets in the order of this file, in SI units",
@@ -81,7 +81,7 @@ class Folder:
         """Network as MATLAB code; None for integer arithmetic and grey boxes."""
         return None if self.model.integer or self.model.hydraulic else Native(self.model.graph)
 
-    def content(self) -> dict[str, Any]:
+    def content(self) -> Table:
         """Return the description in JSON types."""
         about = self.described.content()
         for side in ("inputs", "targets"):
@@ -220,7 +220,7 @@ class Folder:
         code = self.native.code()
         return values | {"code": code, "given": self.native.results(), "functions": functions_for(code)}
 
-    def _readme(self, about: Mapping[str, Any]) -> dict[str, object]:
+    def _readme(self, about: Table) -> dict[str, object]:
         """Tables of the README."""
         name, there = self.model.name, self._there()
         rows = [f"| `{name}_{part}` | {what} | {needs} |" for part, (what, needs) in ABOUT.items() if part in there]

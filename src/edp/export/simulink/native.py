@@ -16,6 +16,7 @@ from edp.export.escape import Code, matlab_comment, matlab_names
 from edp.ir import Array, Graph, Layer, layers, memory
 from edp.ir.base import INPUT
 from edp.ir.layers import BinaryOperation, Function, runs
+from edp.storage.reading import Table
 
 # 47 characters, a part behind them and a number stay within MATLAB's 63.
 LONGEST_LAYER = 47
@@ -61,7 +62,7 @@ class Native:
         )
         return dict(zip(keys, matlab_names(list(short)), strict=True))
 
-    def laid(self, layer: Layer) -> dict[str, Any]:
+    def laid(self, layer: Layer) -> Table:
         """Return the constants of a layer in the order in which MATLAB reads them."""
         tensors = {
             part: values.reshape(-1, 1) if values.ndim == 1 else values for part, values in layer.tensors().items()

@@ -6,13 +6,13 @@ import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError
 from edp.settings.bounds import check_bounds, integer, span
+from edp.settings.tree import Table
 
 Array = NDArray[np.float32]
 FEATURE_LIMIT = 6.0
@@ -167,13 +167,13 @@ class Adaptation:
         values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
-    def to_plain(self) -> dict[str, Any]:
+    def to_plain(self) -> Table:
         """Everything but the arrays, as JSON gives it back."""
         columns, horizons = list(self.columns), list(self.horizons)
         return {"spec": asdict(self.spec), "rate_hz": self.rate_hz, "horizons": horizons, "columns": columns}
 
     @classmethod
-    def from_plain(cls, plain: Mapping[str, Any], arrays: Mapping[str, Array]) -> Adaptation:
+    def from_plain(cls, plain: Table, arrays: Mapping[str, Array]) -> Adaptation:
         """Create an adaptation from `to_plain` and `arrays`.
 
         Raises:
@@ -181,7 +181,7 @@ class Adaptation:
             TypeError: an entry is missing or unknown.
         """
         # JSON has lists only; equality and hashing of an adaptation need tuples.
-        entries: dict[str, Any] = {"horizons": tuple(plain["horizons"]), "columns": tuple(plain["columns"]), **arrays}
+        entries: Table = {"horizons": tuple(plain["horizons"]), "columns": tuple(plain["columns"]), **arrays}
         return cls(spec=AdaptationSpec(**plain["spec"]), rate_hz=plain["rate_hz"], **entries)
 
     @property

@@ -20,6 +20,7 @@ from edp.logs.formats.bag_memory import MemoryFile, NoFolder, place
 from edp.logs.formats.mcap_check import RATIO, SPARE, check_records
 from edp.storage.memory import check_memory
 from edp.storage.paths import is_file_at, is_folder_at
+from edp.storage.reading import Table
 from edp.storage.unpacking import open_zstd, unpack_to
 
 _LONGEST_METADATA = 4 << 20
@@ -51,7 +52,7 @@ def definitions_of(text: Any, message_type: str) -> Definitions | None:
         return Definitions(store.fielddefs) if message_type in store.fielddefs else None
     if len(text.data) > _LONGEST_DEFINITION:
         raise DataError(f"a message definition of {len(text.data)} characters")
-    types: dict[str, Any] = dict(get_typestore(Stores.EMPTY).fielddefs)
+    types: Table = dict(get_typestore(Stores.EMPTY).fielddefs)
     if text.format == MessageDefinitionFormat.MSG:
         return Definitions(types | get_types_from_msg(text.data, message_type))
     # A line of 80 signs separates the types of a definition, by convention of ROS.
@@ -204,7 +205,7 @@ def _plain(kind: str, name: str, sql: str | None) -> bool:
     return kind == "table" and text.startswith("CREATE TABLE") and " AS SELECT" not in text
 
 
-def check_counts(path: Path, counts: Mapping[str, Any], files: list[Path]) -> None:
+def check_counts(path: Path, counts: Table, files: list[Path]) -> None:
     """Refuse counts of messages that the bytes of a bag cannot hold, so that no room is taken for them.
 
     Raises:

@@ -11,6 +11,7 @@ from typing import Any
 from edp.errors import DataError
 from edp.recording import Recording
 from edp.signals import Channel, Kind
+from edp.storage.reading import Table
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class EdpMetadata:
     digest: str | None = None
     truth_digest: str | None = None
 
-    def for_log(self) -> dict[str, Any]:
+    def for_log(self) -> Table:
         """Return the metadata for a `RawLog`."""
         return {
             "rate_hz": self.rate_hz,

@@ -67,6 +67,7 @@ from edp.storage.paths import (
     is_there,
     status_of,
 )
+from edp.storage.reading import Table
 
 KEY_SCHEMA = 1
 """Version of what `StoredLog.key` covers."""
@@ -187,7 +188,7 @@ def _built(logs: dict[str, StoredLog], top: Path, workers: Workers, progress: Pr
     read = progress.stage("log", len(logs))
     read.step(done)
     refused = 0
-    records: dict[int, dict[str, Any]] = {}
+    records: dict[int, Table] = {}
     for number, result in workers.map([_unit(batch) for batch in batches]):
         batch = batches[number]
         records[number] = parse_json((result.content or b"").decode(), f"record of {batch.label}", DataError)
@@ -290,7 +291,7 @@ def _batch_key(keys: Sequence[str]) -> str:
     return hashlib.blake2b("".join(keys).encode(), digest_size=16).hexdigest()
 
 
-def store_batch(batch: LogBatch) -> dict[str, Any]:
+def store_batch(batch: LogBatch) -> Table:
     """Read the logs of a batch into one data file, in a separate process.
 
     Returns:
@@ -353,7 +354,7 @@ def _stored(
     assembly = prepare(raw, sources, log.signal_map, log.repair, log.rows)
     channels = tuple(entry.channel for entry in sources)
     digest = Digest(assembly.rate_hz, channels)
-    meta: dict[str, Any] = dict(raw.meta)
+    meta: Table = dict(raw.meta)
     source = str(log.path)
     name = log.name or raw.name or name_of_file(raw.path)
     for part in parts(assembly, PART_SAMPLES, name):
@@ -379,7 +380,7 @@ def _stored(
     return entry, channels
 
 
-def _merged_meta(meta: dict[str, Any], part: Any) -> dict[str, Any]:
+def _merged_meta(meta: Table, part: Any) -> Table:
     """Merge the metadata of a log with those of one more part; each repair occurs once."""
     repairs = list(meta.get("repairs", []))
     repairs += [repair for repair in part.get("repairs", []) if repair not in repairs]
@@ -394,7 +395,7 @@ def _check_digest(assembly: Assembly, digest: str) -> None:
         )
 
 
-def _records_beside(top: Path, index: StoreIndex) -> Iterator[dict[str, Any]]:
+def _records_beside(top: Path, index: StoreIndex) -> Iterator[Table]:
     """Yield the batch records of an earlier build that are not in the index. Logs of damaged records are read again."""
     present = {file.key for file in index.files}
     for path in entries_of(top / ROWS, "*.json"):

@@ -42,6 +42,7 @@ from edp.monitor.residuals.flow_fit import fit_chambers, fit_oil_range
 from edp.recording import Recording
 from edp.settings.bounds import MOST_ROWS, check_bounds, integer, span
 from edp.signals import KINDS, Kind
+from edp.storage.reading import Table
 from edp.wording import figure, percent
 
 PREFIX = "flow:"
@@ -267,7 +268,7 @@ def _place_of(entry: Any, inputs: int, spools: int) -> ChamberPlaces:
         raise ValueError("a chamber has a sign or a number of pumps that cannot be")
     if not all(np.isfinite(value) for value in numbers.values()) or numbers["cushion"] <= 0.0:
         raise ValueError("a number of a chamber is not finite, or its cushion has no length")
-    values: dict[str, Any] = {**single, **lists, **numbers}
+    values: Table = {**single, **lists, **numbers}
     return ChamberPlaces(**values)
 
 

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.data.twin_channels import TwinChannels
 from edp.settings.bounds import MOST_ROWS, SHARE, integer
+from edp.storage.reading import Table
 
 Array = NDArray[np.float32]
 KNOTS_A_DECADE = 12
@@ -67,7 +66,7 @@ class FreeRunIntervals:
         return {"coverage": self.coverage, "ticks": list(self.ticks), "half_width": widths, "runs": self.runs}
 
     @staticmethod
-    def from_plain(entry: Mapping[str, Any], channels: TwinChannels) -> FreeRunIntervals:
+    def from_plain(entry: Table, channels: TwinChannels) -> FreeRunIntervals:
         """Create intervals from the result of `to_plain`.
 
         Raises:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from edp.report.common.chart import (
     BLUE,
@@ -24,6 +23,7 @@ from edp.report.common.chart import (
 from edp.report.compare.paired import Comparison
 from edp.report.compare.runs import FREE, ComparedRun, Measure
 from edp.report.run.figures import log_ticks
+from edp.storage.reading import Table
 from edp.wording import figure, short_labels
 
 MOST_ROWS = 40
@@ -36,7 +36,7 @@ def compare_charts(comparison: Comparison) -> list[Chart]:
     return [chart for chart in (maker(comparison) for maker in makers) if chart is not None]
 
 
-def _looks(comparison: Comparison) -> list[dict[str, Any]]:
+def _looks(comparison: Comparison) -> list[Table]:
     """Name, colour and symbol of each run; the first, against which the others stand, is dark grey."""
     names = short_labels(run.name for run in comparison.runs)
     colours = (GREY, BLUE, *MUTED)

@@ -18,6 +18,7 @@ from edp.report.twin.facts import holds_free_runs, read_free_runs
 from edp.settings.provenance import Provenance
 from edp.storage import read_object
 from edp.storage.paths import full_path, is_file_at
+from edp.storage.reading import Table
 from edp.storage.runs import unfinished_text
 from edp.wording import figure, unit_text
 
@@ -208,11 +209,11 @@ def _costs(facts: Facts) -> dict[str, float]:
     return _positive(costs)
 
 
-def _table(value: Any) -> Mapping[str, Any]:
+def _table(value: Any) -> Table:
     return value if isinstance(value, dict) else {}
 
 
-def _positive(values: Mapping[str, Any]) -> dict[str, float]:
+def _positive(values: Table) -> dict[str, float]:
     numbers = {name: value for name, value in values.items() if isinstance(value, int | float) and value is not True}
     return {name: float(value) for name, value in numbers.items() if 0 < value < math.inf}
 

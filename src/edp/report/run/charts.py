@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -32,6 +31,7 @@ from edp.report.common.chart import (
 from edp.report.run import figures
 from edp.report.run.facts import INPUTS, NETWORK, TRUTH, Facts, horizon_text, label_of, main_horizon
 from edp.signals import display_offset
+from edp.storage.reading import Table
 from edp.wording import figure, label_by_name, short_labels
 
 MOST_PANELS, MOST_SERIES = 6, 7
@@ -75,7 +75,7 @@ def interval_name(facts: Facts) -> str:
     return f"{100 * coverages[nearest_to_shown(coverages)]:.0f} % interval" if coverages else "Interval"
 
 
-def _look(facts: Facts, model: str) -> dict[str, Any]:
+def _look(facts: Facts, model: str) -> Table:
     """Name, line, symbol and legend place of a model in the figures of errors."""
     network = model == NETWORK
     return {
@@ -245,7 +245,7 @@ def recording_chart(facts: Facts) -> Chart | None:
             network = name == NETWORK
             look = _look(facts, name) | {"size": (11 if network else 8) if dots else 5}
             look |= {"width": 0.0} if dots or not network else {"symbol": ""}
-            coordinates: dict[str, Any] = (
+            coordinates: Table = (
                 {"x": errors[name], "y": order} if dots else {"x": list(range(1, len(order) + 1)), "y": errors[name]}
             )
             hover = "{label}: {x:.4g}" if dots else "{label}: {y:.4g}"
@@ -266,7 +266,7 @@ def learning_chart(facts: Facts) -> Chart | None:
         return None
     symbol = "circle" if len(curves["epoch"]) < 30 else ""
     rates = ["" if rate is None else f" (learning rate {rate:.2g})" for rate in curves["learning_rate"]]
-    shared: dict[str, Any] = {"x": curves["epoch"], "width": 2, "symbol": symbol, "size": 5, "labels": rates}
+    shared: Table = {"x": curves["epoch"], "width": 2, "symbol": symbol, "size": 5, "labels": rates}
     shared["hover"] = "{y:.4g}{label}"
     best_epoch: tuple[Mark, ...] = (GuideLine(x=curves["best"][0], colour=INK, dash="dot"),) if curves["best"] else ()
     loss = (

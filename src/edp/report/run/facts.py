@@ -19,6 +19,7 @@ from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, parse_toml, read
 from edp.storage.headers import check_files
 from edp.storage.paths import is_file_at, is_folder_at
 from edp.storage.provenance import PROVENANCE
+from edp.storage.reading import Table
 from edp.storage.runs import unfinished_text
 from edp.storage.seals import HASH, check_sealed_line, is_sealed_line
 from edp.wording import decimals_for, figure, interval, interval_decimals, listed, number, percent, unit_text
@@ -51,7 +52,7 @@ class Facts:
     Attributes:
         limit: the limit of predictability of the run's data, see `read_limit`.
         foundation: errors on machines that were never seen, of a run over many machines, see
-            `edp.report.run.sheets`.
+            `edp.report.run.tables`.
         predictions: ``recording -> name -> array``; ``truth`` is (time, target), a model (time, horizon, target), SI;
             so are both ends of the network's interval, where it has one.
     """
@@ -61,7 +62,7 @@ class Facts:
     provenance: Provenance | None = None
     history: tuple[Mapping[str, Any], ...] = ()
     scores: ScoresFile | None = None
-    footprint: Mapping[str, Any] | None = None
+    footprint: Table | None = None
     predictions: Mapping[str, Mapping[str, NDArray[np.floating]]] = field(default_factory=dict)
     absent: tuple[str, ...] = ()
     limit: Mapping[str, Any] | None = None
@@ -177,7 +178,7 @@ def read_history(path: Path) -> tuple[Mapping[str, Any], ...]:
     text = read_text(path, JSON_BYTES)
     lines = [(row, line) for row, line in enumerate(text.splitlines(), 1) if line.strip()]
     sealed = any(is_sealed_line(line) for _, line in lines)
-    epochs: list[Mapping[str, Any]] = []
+    epochs: list[Table] = []
     for row, line in lines:
         where = f"'{path}' line {row}"
         if sealed:
@@ -194,7 +195,7 @@ def read_history(path: Path) -> tuple[Mapping[str, Any], ...]:
     return tuple(epochs)
 
 
-def read_limit(path: Path | None, provenance: Provenance | None) -> Mapping[str, Any] | None:
+def read_limit(path: Path | None, provenance: Provenance | None) -> Table | None:
     """The limit in a file, or in the folder that the run's data came from; None where there is none.
 
     Raises:
@@ -215,7 +216,7 @@ def read_limit(path: Path | None, provenance: Provenance | None) -> Mapping[str,
     return dict(limit)
 
 
-def _read_foundation(folder: Path) -> Mapping[str, Any] | None:
+def _read_foundation(folder: Path) -> Table | None:
     """What `edp pretrain` found; None where the run is another."""
     path = folder / "foundation.json"
     if not is_file_at(path):
@@ -438,7 +439,7 @@ def budget_name(footprint: Mapping[str, Any] | None) -> str:
     return str(budget.get("name") or "") if isinstance(budget, Mapping) and budget != asdict(Budget()) else ""
 
 
-def budget_rows(footprint: Mapping[str, Any] | None) -> list[Mapping[str, Any]]:
+def budget_rows(footprint: Table | None) -> list[Table]:
     """Return the verdict by resource against the stated controller; empty without one."""
     return list((footprint or {}).get("verdict", ())) if budget_name(footprint) else []
 

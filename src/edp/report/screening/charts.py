@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -41,6 +41,7 @@ from edp.report.screening.views import (
     stability_views,
     value_views,
 )
+from edp.storage.reading import Table
 from edp.wording import figure, label_by_name
 
 if TYPE_CHECKING:
@@ -102,7 +103,7 @@ def lag_chart(views: Sequence[LagView], rate_hz: float) -> Chart | None:
         for rank, curve in enumerate(view.curves):
             label = f"{labels[curve.channel]} ({curve.best:+d})".replace("-", "−")
             best = f"{curve.channel}, best {curve.best}{'' if curve.certain else ', not certain'}"
-            look: dict[str, Any] = {
+            look: Table = {
                 "colour": LINES[rank % len(LINES)],
                 "name": label,
                 "when": {"target": view.target},

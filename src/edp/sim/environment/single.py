@@ -18,6 +18,7 @@ from edp.sim.environment.truth import Truth
 from edp.sim.episodes.episodes import Episodes, EpisodeStart, Moment
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
+from edp.storage.reading import Table
 
 Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
@@ -60,9 +61,7 @@ class ExcavatorEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._levers = np.zeros((1, at.AXES))
         self._begun, self._ended, self._in_soil = False, False, False
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Table | None = None) -> tuple[Observation, Table]:
         """Begin an episode.
 
         Args:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from edp.sim.machine.family import MASSES_T, WIDEST, member_mass
 from edp.sim.scenario import START_STROKES, Scenario
 from edp.sim.sensors import chain
 from edp.sim.sensors.sensors import shown_names, truth_columns
+from edp.storage.reading import Table
 from edp.wording import typed
 
 OBSERVED = (*TABLE_A1, "CylStroke_1", "CylStroke_2", "CylStroke_3")
@@ -149,7 +149,7 @@ class EnvironmentSpec:
         return shown_names()[name] if name in shown_names() else chain.SENSED + columns[name]
 
 
-def settings_of(settings: EnvironmentSpec | None, changes: Mapping[str, Any]) -> EnvironmentSpec:
+def settings_of(settings: EnvironmentSpec | None, changes: Table) -> EnvironmentSpec:
     """Return the settings (default if None) with the changes applied.
 
     Raises:

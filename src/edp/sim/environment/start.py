@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +16,7 @@ from edp.sim.faults import fault_text
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import check_machine
 from edp.sim.machine.machine_files import family_member, known_mass
+from edp.storage.reading import Table
 
 OF_SPEC = (
     "machine",
@@ -35,9 +35,7 @@ OWN = ("strokes", "oil_temperature")
 MOST_SEED = 2**31 - 1
 
 
-def episode_start(
-    spec: EnvironmentSpec, seed: int, options: Mapping[str, Any] | None
-) -> tuple[EpisodeStart, dict[str, object]]:
+def episode_start(spec: EnvironmentSpec, seed: int, options: Table | None) -> tuple[EpisodeStart, dict[str, object]]:
     """Return the start of an episode, and its description for `info`.
 
     Raises:

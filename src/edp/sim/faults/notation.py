@@ -10,6 +10,7 @@ from typing import Any
 from edp.errors import ConfigError, closest
 from edp.settings.bounds import check_count, shown
 from edp.sim.faults.base import FAULTS, MOST_FAULTS, FaultSpec, among
+from edp.storage.reading import Table
 
 MOST_CHARACTERS = 200
 """Of one fault: kinds and sites are words, numbers have some digits."""
@@ -40,7 +41,7 @@ def parse_fault(text: str) -> FaultSpec:
         sites = f"; sites are {', '.join(kind.sites)}" if kind.sites else ""
         units = f"; sizes are in {', '.join(kind.units)}" if kind.units else ""
         raise ConfigError(f"{where}: {parts} came behind the kind; write {form}{sites}{units}")
-    values: dict[str, Any] = {"kind": name}
+    values: Table = {"kind": name}
     if kind.sites:
         values["site"] = rest.pop(0)
     if kind.units:

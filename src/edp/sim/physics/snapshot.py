@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from edp.errors import DataError, StorageError
 from edp.storage import object_with, parse_json, read_bytes, replacing
 from edp.storage.archives import ArchiveLimits, ZipReader
+from edp.storage.reading import Table
 
 SCHEMA = 4
 MOST_BYTES = 1 << 30
@@ -35,7 +36,7 @@ class Snapshot:
         log: what was logged so far, shape (samples, columns).
     """
 
-    scenario: dict[str, Any]
+    scenario: Table
     samples: int
     state: Any
     arrays: tuple[NDArray[Any], ...]
@@ -50,7 +51,7 @@ class Snapshot:
         facts = {"schema": SCHEMA, "scenario": self.scenario, "samples": self.samples, "state": self.state}
         # JSON has no NaN; `capture` writes numbers that are not finite as text.
         text = json.dumps(facts, allow_nan=False).encode()
-        named: dict[str, Any] = {f"a{i}": array for i, array in enumerate(self.arrays)}
+        named: Table = {f"a{i}": array for i, array in enumerate(self.arrays)}
         named[_FACTS] = np.frombuffer(text, np.uint8)
         named["log"] = np.concatenate(self.log) if self.log else np.zeros((0, 0))
         with replacing(path) as temporary, temporary.open("wb") as stream:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from edp.data.fold_ridge import FoldRidge
 from edp.data.lags import DoubleArray
 from edp.data.prepared import Prepared
 from edp.networks.predictor import Predictor
+from edp.storage.reading import Table
 from edp.training.bagging.spec import BaggingSpec
 from edp.training.bagging.table import BaggingTable
 from edp.training.outcome import TrainingProgress
@@ -39,7 +40,7 @@ class FoldFit:
     table: BaggingTable
     linear: FoldRidge
     tell: Callable[[TrainingProgress], None]
-    history: list[dict[str, Any]] = field(default_factory=list)
+    history: list[Table] = field(default_factory=list)
 
     @property
     def bagging(self) -> BaggingSpec:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import CYLINDERS
+from edp.storage.reading import Table
 
 Doubles = NDArray[np.float64]
 STATIC = ("friction", "static_fraction")
@@ -144,7 +145,7 @@ def with_values(machine: Machine, values: Sequence[float] | Doubles) -> Machine:
         machine: the one whose other numbers stay.
         values: of `MACHINE_NUMBERS`, as `MachineNumber.of` gives them.
     """
-    sections: dict[str, dict[str, Any]] = {}
+    sections: dict[str, Table] = {}
     for number, value in zip(MACHINE_NUMBERS, values, strict=True):
         changed = sections.setdefault(number.section, {})
         old = changed.get(number.key, getattr(getattr(machine, number.section), number.key))

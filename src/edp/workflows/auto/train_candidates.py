@@ -8,7 +8,6 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from edp.config.experiment import Experiment, experiment_toml, plain_tree
 from edp.data.prepared import Prepared
@@ -20,6 +19,7 @@ from edp.progress import SILENT, Progress
 from edp.storage import make_folder, read_object, write_json
 from edp.storage.ledger import TrainingIdentity, WithState
 from edp.storage.paths import full_path, is_file_at
+from edp.storage.reading import Table
 from edp.storage.runs import KeyedRun, Run, run_key
 from edp.training import Diverged, Fitted, TrainingProgress, load_bundle, make_bundle, save_bundle
 from edp.training.bagging.fit import fit_bagged
@@ -176,7 +176,7 @@ class _FoldResult:
     """Result of a training on folds, next to the bundle in its folder."""
 
     promise: Promise
-    history: list[dict[str, Any]]
+    history: list[Table]
     seconds: float
     targets_per_s: float
 
@@ -195,7 +195,7 @@ def _unit(job: CandidateTraining) -> WorkUnit:
     return WorkUnit(f"{__name__}:train_unit", job.label, arguments, job.data.digest, {"job": placed})
 
 
-def train_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState | dict[str, str]:
+def train_unit(identity: TrainingIdentity, where: Table) -> WithState | dict[str, str]:
     """Train a candidate into its folder, and note there how far the training is."""
     job: CandidateTraining = where["job"]
     note = make_folder(job.folder) / NOTE

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import tomli_w
@@ -34,6 +33,7 @@ from edp.sim.machine.machine_files import load_machine
 from edp.storage import make_folder, write_bytes, write_json
 from edp.storage.headers import read_header
 from edp.storage.paths import entries_of, is_file_at
+from edp.storage.reading import Table
 from edp.storage.runs import missing_text
 from edp.training.bundle import as_damage, check_hash, read_arrays, with_plugins, write_arrays
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
@@ -156,7 +156,7 @@ def load_kept(run: str | Path) -> KeptController:
     return KeptController(experiment, plant, models, twin, **golden)
 
 
-def _channel(entry: Mapping[str, Any]) -> Channel:
+def _channel(entry: Table) -> Channel:
     if not all(isinstance(entry[key], str) for key in ("name", "description")):
         raise TypeError("the name or description of a channel is no text")
     return Channel(entry["name"], Kind(entry["kind"]), entry["description"])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -26,6 +25,7 @@ from edp.report.common.provenance import provenance_rows
 from edp.settings.provenance import Provenance, new_provenance
 from edp.storage import make_folder, write_json
 from edp.storage.provenance import PROVENANCE
+from edp.storage.reading import Table
 from edp.storage.runs import Run, check_claimable, check_free, run_key
 from edp.workflows.control.bench import ControlBench, ControlSources, DividedLoops
 from edp.workflows.control.kept import keep_controller
@@ -43,7 +43,7 @@ class ControlRun:
         page: file of the page.
     """
 
-    content: Mapping[str, Any]
+    content: Table
     results: Sequence[LoopResult]
     page: Path
 
@@ -135,7 +135,7 @@ def _content(
     return {"sentence": sentence(content, name), **content}
 
 
-def sentence(content: Mapping[str, Any], controller: str) -> str:
+def sentence(content: Table, controller: str) -> str:
     """The score in one sentence."""
     summary, count = content["summary"], len(content["loops"])
     loops = f"{count} loops" if count > 1 else "one loop"

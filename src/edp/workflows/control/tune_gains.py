@@ -18,7 +18,7 @@ from edp.progress import SILENT, Progress
 from edp.settings.bounds import check_bounds, integer
 from edp.storage import read_object, write_bytes, write_json
 from edp.storage.arrays import numbers_in
-from edp.storage.reading import object_with
+from edp.storage.reading import Table, object_with
 from edp.storage.runs import Run, check_claimable, check_free, run_key
 from edp.workflows.control.bench import ControlBench, ControlSources, DividedLoops
 from edp.workflows.search.space import Real
@@ -59,7 +59,7 @@ class Tuning:
     """
 
     best: ControllerSpec
-    content: Mapping[str, Any]
+    content: Table
 
 
 def tune_gains(
@@ -114,7 +114,7 @@ def tune_gains(
             {name: Real(*ends) for name, ends in space.items()}, chosen.seed, SamplerSpec(kind=chosen.sampler)
         )
         study.suggest({name: _within(getattr(experiment.controller, name), ends) for name, ends in space.items()})
-        rows: list[dict[str, Any]] = []
+        rows: list[Table] = []
         units = run.file(UNITS)
         tuned = DividedLoops(staying, units, f"{key} tuned on")
         best, trials = experiment.controller, progress.stage("trial", chosen.trials)

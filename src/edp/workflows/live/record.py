@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from edp.errors import ConfigError, StorageError
 from edp.live.layout import LiveLayout
 from edp.signals import Channel
+from edp.storage.reading import Table
 
 ROWS, FORECASTS, EVENTS, FACTS = "/edp/recording", "/edp/predictions", "/edp/events", "/edp/info"
 
@@ -48,7 +49,7 @@ class McapRecorder:
         except (OSError, RuntimeError, FileExistsError) as error:
             raise StorageError(f"--record {path}: {error}; choose a new file in a folder that is there") from error
 
-        def channel(topic: str, schema: dict[str, Any]) -> Any:
+        def channel(topic: str, schema: Table) -> Any:
             return foxglove.Channel(topic, schema=schema, message_encoding="json", context=self._context)
 
         numbers = {"type": "object", "additionalProperties": {"type": ["number", "null"]}}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from edp.progress import SILENT, Progress
 from edp.recording import MACHINE, Recording
 from edp.signals import Channel
 from edp.sim.machine.machine_files import load_machine, machine_names
+from edp.storage.reading import Table
 from edp.wording import typed
 from edp.workflows.monitor.fault_sessions import (
     FaultSession,
@@ -162,7 +162,7 @@ def build_dictionary(
         # Two draws at least, then as many as the time allows.
         if not side_by_side.is_elsewhere and draws >= 2 and spent * (draws + 1) / draws > 60.0 * spec.minutes:
             break
-    provenance: dict[str, Any] = {
+    provenance: Table = {
         "machine": machine, "seed": seed, "draws": draws, "sessions": len(faults),
         "seconds_each": spec.before_s + spec.after_s, "processor_s": round(time.process_time() - began, 1),
     }  # fmt: skip

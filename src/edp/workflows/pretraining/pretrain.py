@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from edp import __version__
 from edp.config.experiment import Experiment, plain_tree
@@ -22,6 +20,7 @@ from edp.progress import SILENT, Progress
 from edp.storage import write_json
 from edp.storage.ledger import TrainingIdentity
 from edp.storage.paths import full_path
+from edp.storage.reading import Table
 from edp.storage.runs import Run, check_claimable, check_visible
 from edp.training import Diverged, load_bundle
 from edp.training.bundle import weights_digest
@@ -65,7 +64,7 @@ def pretrain(
     out: str | Path,
     progress: Progress = SILENT,
     workers: Workers = IN_PROCESS,
-) -> dict[str, Any]:
+) -> Table:
     """Train one network over many machines and judge it on others; the same call goes on after a stop.
 
     What comes out is a run like any other, with ``foundation.json`` beside it.
@@ -104,7 +103,7 @@ def pretrain(
     experiment = _carrying(experiment, method.episodic, data.task.rate_hz)
     strategy_factory = None
     if strategy is not None:
-        facts: dict[str, Any] = {"method": order.method, "start": None if begun is None else weights_digest(begun)}
+        facts: Table = {"method": order.method, "start": None if begun is None else weights_digest(begun)}
         facts |= {"meta": asdict(order.meta)} if method.episodic else {}
         chosen = strategy
         strategy_factory = StrategyFactory(facts, lambda prepared: chosen, frozen)
@@ -137,7 +136,7 @@ def _pretrain_on_node(source: DataSource, experiment: Experiment, order: Pretrai
         check_visible(out)
 
 
-def pretrain_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str, str]:
+def pretrain_unit(identity: TrainingIdentity, where: Table) -> dict[str, str]:
     """Train one network over many machines, or continue with it; a diverged run says so in its folder."""
     try:
         pretrain(where["source"], where["experiment"], where["order"], where["out"])
@@ -169,7 +168,7 @@ def _carrying(experiment: Experiment, episodic: bool, rate_hz: float) -> Experim
     return replace(experiment, training=replace(experiment.training, chunks=replace(chunks, carried=carried)))
 
 
-def _result(order: Pretrain, experiment: Experiment, data: Prepared, contexts: Contexts) -> dict[str, Any]:
+def _result(order: Pretrain, experiment: Experiment, data: Prepared, contexts: Contexts) -> Table:
     parts = {part: by_machine(getattr(data, part)) for part in ("train", "validation", "test")}
     return {
         "schema": 1,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.known_linkage import GIGA
 from edp.networks.twin.grey.linkage import balance_by_base, base_of
 from edp.networks.twin.grey.numbers import NumberTable
+from edp.storage.reading import Table
 from edp.wording import typed
 
 Doubles = NDArray[np.float64]
@@ -118,7 +118,7 @@ def _inertia_row(
     }
 
 
-def datasheet_text(rows: Sequence[dict[str, Any]], basis: str = BASIS) -> str:
+def datasheet_text(rows: Sequence[Table], basis: str = BASIS) -> str:
     """Format the rows as a table for readers, headed by the basis of the intervals."""
     width = max(len(f"{row['element']}.{row['name']}") for row in rows)
     lines = [

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from edp.recording import Recording
 from edp.registry import Registry
 from edp.settings.bounds import check_bounds, span
 from edp.signals import Channel, SignalMap
+from edp.storage.reading import Table
 
 Row = NDArray[np.float32]
 RATES_HZ = (0.01, 100_000.0)
@@ -85,7 +86,7 @@ class SourceOptions:
     machine: str | None = None
     seed: int | None = None
     rate_hz: float | None = None
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    settings: Table = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_bounds("the live source", self, rate_hz=span(*RATES_HZ))

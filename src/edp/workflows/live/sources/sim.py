@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,6 +12,7 @@ from edp.errors import ConfigError
 from edp.signals import EXTRA_CHANNELS
 from edp.sim.excitation import EXCITATIONS
 from edp.sim.view import View
+from edp.storage.reading import Table
 from edp.workflows.live.sources.base import SOURCES, LiveSource, Needs, Sink, SourceOptions
 
 EPISODE_S = 3600.0
@@ -44,7 +45,7 @@ class SimSource(LiveSource):
         machine: str,
         rate_hz: float,
         seed: int = 0,
-        settings: Mapping[str, Any] | None = None,
+        settings: Table | None = None,
         further: Sequence[str] = (),
     ) -> None:
         # Gymnasium is an extra, and this brings the compiler of the simulator.
@@ -108,7 +109,7 @@ class SimSource(LiveSource):
                     break
 
 
-def view_of_truth(truth: Mapping[str, Any], full: Any) -> View:
+def view_of_truth(truth: Table, full: Any) -> View:
     """What an operator sees, from the noise-free channels of an environment; `full` are the strokes (m), shape (3,)."""
     strokes, angles, rates, speeds = (
         np.array([truth[f"{kind}_{i}"] for i in (1, 2, 3)])

@@ -7,7 +7,7 @@ import select
 import socket
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from edp.live.addresses import LOOPBACK, resolve_bind
 from edp.logs.units import check_unit, mapped_channel, unit_for
 from edp.settings.bounds import shown
 from edp.signals import VOCABULARY, Channel, Kind, SignalMap
-from edp.storage.reading import parse_json
+from edp.storage.reading import Table, parse_json
 from edp.wording import typed
 from edp.workflows.live.sources.arrivals import Arrivals
 from edp.workflows.live.sources.base import SOURCES, LiveSource, Needs, Row, Sink, SourceOptions, chosen_rate
@@ -182,7 +182,7 @@ def row_of(data: bytes) -> Mapping[str, float]:
 
 def _conversions(signal_map: SignalMap | None) -> Callable[[str, Mapping[str, float]], float]:
     """From a channel's name and a row to its value in SI units."""
-    entries: dict[str, Any] = {entry.name: entry for entry in (signal_map.channels if signal_map else ())}
+    entries: Table = {entry.name: entry for entry in (signal_map.channels if signal_map else ())}
     units = {
         name: unit_for(check_unit(entry.unit, where), mapped_channel(entry).kind, where)
         for name, entry in entries.items()
