@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +40,7 @@ class InputMoments:
         return {name: mean if name in apart else mean.mean(axis=0) for name, mean in means.items()}
 
 
-def _multiplied(layer: Layer, values: Mapping[str, Array]) -> dict[str, Any]:
+def _multiplied(layer: Layer, values: Mapping[str, Array]) -> dict[str, Array]:
     """Return the inputs of the matrices of a layer, ``(time, row, terms)``."""
     if not layer.inputs:
         return {}

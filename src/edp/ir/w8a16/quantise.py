@@ -267,8 +267,15 @@ def _trees(work: _Work, x: layers.TreeSums, input_fracs: list[int]) -> quantised
     threshold = np.clip(floor, -(2**15), 2**15 - 1).astype(np.int16)
     leaf, bits = halves(x.leaf)
     frac = _within(work.frac(x.name), bits)
-    tables: dict[str, Any] = {"feature": x.feature, "threshold": threshold, "leaf": leaf}
-    return quantised.QTreeSums(name=x.name, inputs=(), frac=frac, right=bits - frac, **tables)
+    return quantised.QTreeSums(
+        name=x.name,
+        inputs=(),
+        frac=frac,
+        right=bits - frac,
+        feature=x.feature,
+        threshold=threshold,
+        leaf=leaf,
+    )
 
 
 def _convolution(work: _Work, x: memory.Convolution, input_fracs: list[int]) -> quantised.FixedLayer:
@@ -290,11 +297,11 @@ def _lstm(work: _Work, x: memory.Lstm, input_fracs: list[int]) -> quantised.Fixe
 
 def _gru(work: _Work, x: memory.Gru, input_fracs: list[int]) -> quantised.FixedLayer:
     work.slots[x.name, "h"] = fixed.UNIT_FRAC
-    biases: dict[str, Any] = {
-        name: fixed.to_fixed(values, fixed.GATE_FRAC, fixed.GATE_LIMIT).astype(np.int32)
-        for name, values in (("bias_x", x.bias_x), ("bias_h", x.bias_h))
-    }
-    return quantised.QGru(name=x.name, inputs=(), frac=fixed.UNIT_FRAC, **work.gates(x, input_fracs[0]), **biases)
+    bias_x, bias_h = (
+        fixed.to_fixed(values, fixed.GATE_FRAC, fixed.GATE_LIMIT).astype(np.int32) for values in (x.bias_x, x.bias_h)
+    )
+    matrices = work.gates(x, input_fracs[0])
+    return quantised.QGru(name=x.name, inputs=(), frac=fixed.UNIT_FRAC, bias_x=bias_x, bias_h=bias_h, **matrices)
 
 
 def _min_gru(work: _Work, x: memory.MinGru, input_fracs: list[int]) -> quantised.FixedLayer:

@@ -18,7 +18,7 @@ from edp.jobs.workers import UNITS, UnitResult, WorkUnit, forget_units
 from edp.progress import SILENT, Progress
 from edp.storage import make_folder, read_object, write_json
 from edp.storage.ledger import TrainingIdentity, WithState
-from edp.storage.paths import full_path, is_file_at
+from edp.storage.paths import entries_of, full_path, is_file_at, is_folder_at
 from edp.storage.reading import Table
 from edp.storage.runs import KeyedRun, Run, run_key
 from edp.training import Diverged, Fitted, TrainingProgress, load_bundle, make_bundle, save_bundle
@@ -228,8 +228,9 @@ def _read_trained(job: CandidateTraining, result: UnitResult) -> TrainedCandidat
 def remove_trained_units(run: Path) -> None:
     """Remove what trainings left for a continued run, once the choice is written."""
     forget_units(run / UNITS)
-    for fitted in (run / "candidates").glob(f"*/{FITTED}"):
-        shutil.rmtree(fitted.parent, ignore_errors=True)
+    for candidate in entries_of(run / "candidates"):
+        if is_folder_at(candidate / FITTED):
+            shutil.rmtree(candidate, ignore_errors=True)
 
 
 class _Display:
