@@ -180,8 +180,8 @@ def show_selection(selection: Selection) -> None:
     from edp.report.screening import tables
 
     screening, page = selection.screening, selection.files["page"]
-    chosen, flags = tables.kept_table(screening), tables.flags_table(screening)
-    _print_first(chosen, f"keep: {len(chosen.rows)} of {count_of(len(screening.channels), 'channel')}", SHOWN, page)
+    proposed, flags = tables.kept_table(screening), tables.flags_table(screening)
+    _print_first(proposed, f"keep: {len(proposed.rows)} of {count_of(len(screening.channels), 'channel')}", SHOWN, page)
     if flags.rows:
         _print_first(flags, f"flags: {len(flags.rows)}", SHOWN_FLAGS, page)
     print_table(tables.ranges_table(screening))

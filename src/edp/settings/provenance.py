@@ -90,9 +90,9 @@ class Provenance:
         Raises:
             StorageError: a value has another form.
         """
-        own = {entry.name for entry in fields(cls)} - {"more"}
-        more = {key: value for key, value in table.items() if key not in own}
-        stated = {key: value for key, value in table.items() if key in own}
+        names = {entry.name for entry in fields(cls)} - {"more"}
+        more = {key: value for key, value in table.items() if key not in names}
+        stated = {key: value for key, value in table.items() if key in names}
         return replace(read_part(cls, stated, where, WHAT, ADVICE), more=more)
 
     @classmethod
