@@ -12,11 +12,11 @@ from edp import storage
 from edp.config.experiment import load_experiment, override
 from edp.data.feature_files import read_set_table
 from edp.errors import ConfigError, DataError, EdpError, StorageError
+from edp.evaluation.compression import read_compression
 from edp.evaluation.controller import load_budget
 from edp.evaluation.study import read_study
 from edp.logs.source import load_data_set, load_signal_map
 from edp.report import read_facts
-from edp.report.compression.facts import read_compression
 from edp.report.run.facts import read_limit
 from edp.report.transfer.facts import read_transfer
 from edp.settings.provenance import read_provenance

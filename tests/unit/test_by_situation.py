@@ -12,7 +12,7 @@ from edp.data.task import TargetMode, Task
 from edp.evaluation.by_situation import NEAR_STOP, SITUATIONS, Situations
 from edp.evaluation.judge import score_predictions
 from edp.evaluation.scores_file import ModelScores, ScoredTarget, ScoredTask, ScoresFile
-from edp.report.run.sheets import situation_table
+from edp.report.run.tables import situation_table
 from edp.settings.results import plain_value
 from edp.signals import Channel, Kind
 

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 from edp.cli import app
 from edp.config.experiment import load_experiment
 from edp.errors import ConfigError, StorageError
+from edp.evaluation.compression import read_compression
 from edp.evaluation.controller import Budget
 from edp.export.c.sizes import constant_bytes
 from edp.ir.w8a16.quantise import outline
@@ -23,7 +24,7 @@ from edp.networks.backbones import GruSpec, HybridSpec, LstmSpec, TcnSpec
 from edp.networks.blocks import AttentionBridge, TemporalDifference
 from edp.networks.cells import LayerNormLstmCell
 from edp.networks.predictor import build_model
-from edp.report import read_compression, write_compression_page
+from edp.report import write_compression_page
 from edp.storage import read_json
 from edp.training import load_bundle
 from edp.training.bundle import blank_scaler

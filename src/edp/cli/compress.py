@@ -13,7 +13,7 @@ from edp.cli.options import DataOption, MapOption, RepairOption, SettingsOption,
 from edp.cli.progress import shown_progress
 
 if TYPE_CHECKING:
-    from edp.report import CompressionFacts
+    from edp.evaluation.compression import CompressionResult
     from edp.workflows.compression import CompressedRow
 
 
@@ -44,7 +44,7 @@ def compress(
     """
     from edp.config.commands import TRAINING_TABLES, command_settings
     from edp.evaluation.controller import load_budget
-    from edp.report import read_compression, write_compression_page
+    from edp.report import write_compression_page
     from edp.workflows.compression import (
         CompressionSearchRequest,
         CompressionSearchSpec,
@@ -58,15 +58,14 @@ def compress(
     with shown_progress("compress", as_json) as progress:
         compression = search(bundle, request, folder, source, progress)
     page = write_compression_page(folder)
-    facts = read_compression(folder)
 
     def show() -> None:
-        _tables(facts)
+        _tables(compression)
         if compression.best is not None:
             _show_next(compression.best, folder)
         out.print(f"report: {page}")
 
-    emit(as_json, facts.result.to_json() | {"report": str(page)}, show)
+    emit(as_json, compression.to_table() | {"report": str(page)}, show)
 
 
 def _show_next(best: CompressedRow, folder: Path) -> None:
@@ -76,7 +75,7 @@ def _show_next(best: CompressedRow, folder: Path) -> None:
     out.print(f"next: {then}, or edp footprint {best.run}")
 
 
-def _tables(facts: CompressionFacts) -> None:
+def _tables(facts: CompressionResult) -> None:
     from edp.report.compression import facts as words
 
     for horizon in facts.horizons:

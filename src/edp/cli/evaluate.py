@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from edp.cli.console import JsonFlag, emit, out, table
+from edp.cli.console import JsonFlag, emit, out, print_table, table
 from edp.cli.options import (
     MOST_HOURS,
     MOST_MINUTES,
@@ -161,8 +162,8 @@ def evaluate_twin_run(run: Path, source: DataSource | None, predictor: Path | No
         if note := beyond_sentence(scores.models[TWIN].beyond):
             out.print(note, style="bold")
         score_table(scores.models)
-        for print_table in (coverage_table, situation_table, ahead_table):
-            print_table(scores.models[TWIN])
+        for show_table in (coverage_table, situation_table, ahead_table):
+            show_table(scores.models[TWIN])
         out.print(f"scores in {folder / FreeRunFile.NAME}")
         out.print(f"next: edp report {folder}")
 
@@ -255,13 +256,12 @@ def _ahead(scores: ScoresFile, horizon: int) -> str:
 
 def by_situation_table(scores: ScoresFile) -> None:
     """Print the network's error by motion of the axes, at the longest horizon, if the scores contain it."""
-    from edp.report.run.sheets import situation_table
+    from edp.report.run.tables import situation_table
 
     horizon = max(scores.task.horizons)
-    sheet = situation_table(scores, horizon)
-    if sheet is not None:
-        heads = [f"{column.heading}{f', {column.unit}' if column.unit else ''}" for column in sheet.columns]
-        table(f"{sheet.caption}, k = {horizon}", heads, [list(row) for row in sheet.texts()])
+    situations = situation_table(scores, horizon)
+    if situations is not None:
+        print_table(replace(situations, caption=f"{situations.caption}, k = {horizon}"))
 
 
 def _tables_by_output(scores: ScoresFile) -> None:

@@ -55,7 +55,7 @@ def report(
         out.print(headline(facts))
         out.print(f"page: {page}")
 
-    emit(as_json, {"page": str(page), "headline": headline(facts), **facts.content}, show)
+    emit(as_json, {"page": str(page), "headline": headline(facts), **facts.report.to_json()}, show)
 
 
 @app.command("network")

@@ -75,8 +75,8 @@ def pretrain(
 
 def _tables(result: dict[str, object]) -> None:
     """Machines of each part, and the errors on those that test."""
-    from edp.report.run.sheets import contexts_table, parts_table
+    from edp.report.run.tables import contexts_table, machine_parts_table
 
-    for table in (parts_table(result), contexts_table(result)):
+    for table in (machine_parts_table(result), contexts_table(result)):
         print_table(table)
         out.print()

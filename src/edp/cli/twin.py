@@ -166,9 +166,10 @@ def rollout(
     Example: `edp rollout runs/twin logs/monday.parquet --seconds 60 --from 12.5 --out monday_free.parquet`
     """
     from edp.evaluation.beyond import beyond_sentence
-    from edp.workflows.twin import rollout_log
+    from edp.workflows.twin import RolloutRequest, rollout_log
 
-    result = rollout_log(run, source_of(log, signal_map, repair), seconds, start_s, measured, file, plots, page)
+    request = RolloutRequest(seconds=seconds, start_s=start_s, measured=measured, out=file, plots=plots, page=page)
+    result = rollout_log(run, source_of(log, signal_map, repair), request)
     written = {"file": file and str(file), "plots": plots and str(plots), "page": page and str(page)}
     facts = {"start_s": result.start_s, "calibrated_s": result.calibrated_s, **written}
     facts |= plain_value(result.scores) | {"beyond": plain_value(result.beyond)}

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 from edp.errors import ConfigError, StorageError
 from edp.evaluation.controller import Budget, ResourceUsage
-from edp.settings.tree import SettingsTree, Table
-from edp.storage import read_json, write_json
+from edp.settings.results import ResultFile
 from edp.storage.ledger import Opening
 from edp.storage.paths import is_file_at
 
-FILE, SCHEMA = "compression.json", 2
 Scores = Mapping[str, Mapping[str, float]]
 """``mae`` and ``composite`` by horizon: mean over outputs, report units."""
 
@@ -58,7 +57,7 @@ class HeldOutTest:
 
     Attributes:
         seen_before: whether networks were evaluated on them before these.
-        name: of the sealed test set; empty where it stayed closed.
+        name: of the sealed test set; None where it stayed closed.
         opened: when, in ISO 8601.
         openings: of the test set, oldest first.
         scores: of ``teacher`` and ``chosen``.
@@ -66,8 +65,8 @@ class HeldOutTest:
     """
 
     seen_before: bool = False
-    name: str = ""
-    opened: str = ""
+    name: str | None = None
+    opened: str | None = None
     openings: tuple[Opening, ...] = ()
     scores: Mapping[str, Scores] = field(default_factory=dict)
     error: float | None = None
@@ -91,21 +90,20 @@ class RecordingCounts:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class CompressionResult:
+class CompressionResult(ResultFile):
     """Content of ``compression.json``.
 
     Attributes:
-        budget: what the controller grants.
-        task: of the teacher.
         unit: of the scores.
-        recordings: number of recordings.
-        teacher: the teacher in float32.
-        rows: all networks in all formats.
+        teacher: the teacher in float32; `rows`: all networks in all formats.
         front: indices of the rows that no other one surpasses in error, cycles and bytes of parameters.
         chosen: index of the row that fits with the smallest error; None if none fits.
-        held_out_test: scores of teacher and chosen network on recordings that took part in no choice.
         notes: what was left out, and why.
     """
+
+    NAME: ClassVar[str] = "compression.json"
+    SCHEMA: ClassVar[int] = 2
+    ADVICE: ClassVar[str] = "run edp compress again: it reads the finished networks"
 
     budget: Budget
     task: ComparedTask
@@ -116,7 +114,7 @@ class CompressionResult:
     front: tuple[int, ...]
     chosen: int | None
     held_out_test: HeldOutTest = field(default_factory=HeldOutTest)
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...]
 
     def __post_init__(self) -> None:
         indices = (*self.front, *([] if self.chosen is None else [self.chosen]))
@@ -129,33 +127,27 @@ class CompressionResult:
                 raise ConfigError(f"scores: got those of {', '.join(part)}, expected horizons {', '.join(horizons)}")
 
     @property
+    def horizons(self) -> list[str]:
+        """Look-aheads in samples, as keys of scores."""
+        return [str(horizon) for horizon in self.task.horizons]
+
+    def ahead(self, horizon: str) -> str:
+        """Return a horizon in words."""
+        return f"{1e3 * int(horizon) / self.task.rate_hz:.0f} ms ahead (k = {horizon})"
+
+    @property
     def best(self) -> CompressedRow | None:
         """The chosen row."""
         return None if self.chosen is None else self.rows[self.chosen]
 
-    def to_json(self) -> Table:
-        """Return the content as plain values."""
-        closed = {} if self.held_out_test.name else {"held_out_test": {"seen_before": self.held_out_test.seen_before}}
-        return {"schema": SCHEMA} | asdict(self) | closed
 
-    def write(self, folder: Path) -> None:
-        """Write ``compression.json`` into a folder."""
-        write_json(folder / FILE, self.to_json())
-
-
-def read_compression_result(folder: str | Path) -> CompressionResult:
+def read_compression(folder: str | Path) -> CompressionResult:
     """Return the checked content of the ``compression.json`` in a folder.
 
     Raises:
         StorageError: the folder has no such file, or the file is damaged or of another version.
     """
-    file = Path(folder) / FILE
+    file = Path(folder) / CompressionResult.NAME
     if not is_file_at(file):
-        raise StorageError(f"'{folder}' holds no {FILE}; give the folder of edp compress")
-    content = read_json(file)
-    if not isinstance(content, dict) or content.pop("schema", None) != SCHEMA:
-        raise StorageError(f"'{file}' is of another version of EDP; run edp compress again")
-    try:
-        return SettingsTree(what="result").build(CompressionResult, content, f"'{file}'")
-    except ConfigError as error:
-        raise StorageError(f"{error}\nrun edp compress again: it reads the finished networks") from error
+        raise StorageError(f"'{folder}' holds no {file.name}; give the folder of edp compress")
+    return CompressionResult.from_file(file)

@@ -59,14 +59,9 @@ class Decision:
 
 @dataclass(frozen=True, kw_only=True)
 class PhaseRow:
-    """Progress of a phase.
+    """Progress of a phase: trainings that it asked for first, and how they ended; moments are in ISO 8601.
 
-    Attributes:
-        name, title: of the phase.
-        trainings: that it asked for, and that no earlier phase had.
-        trained: of these, those that have ended; `failed` did not end well, `pruned` were ended at a rung.
-        seconds: of training, summed over workers; `wall_s`: by the clock.
-        began, ended: moments in ISO 8601.
+    `seconds` of training are summed over workers, `wall_s` are by the clock.
     """
 
     name: str
@@ -93,13 +88,8 @@ class TrainingRow:
 
     Attributes:
         phase: that asked for it first.
-        number: from 0 in the order of asking.
-        label: what it is.
-        status: ``waiting``, ``done``, ``pruned``, or how it failed.
-        seconds: that it took.
+        status: ``waiting``, ``done``, ``pruned``, or how it failed; `message`: what went wrong.
         score: None if it was pruned or failed.
-        parameters, macs_tick: None if they were not counted.
-        message: what went wrong.
         rung: the last one, if it ended there.
     """
 
@@ -148,16 +138,12 @@ class StudyFile:
     """Content of ``study.json``.
 
     Attributes:
-        state: one of `STATES`.
-        mode: one of `MODES`.
+        state, mode: one of `STATES` and of `MODES`.
         unit: of the scores.
-        preset: name of the settings; `spec`: the settings of the search.
+        spec: settings of the search, from the preset of this name.
         modules: titles by name.
-        decisions: of the phases that have ended.
-        phases: those that have begun.
+        decisions: of the phases that have ended; `phases`: those that have begun.
         history: every training, in the order of asking.
-        openings: of the sealed test sets.
-        created, updated: moments in ISO 8601.
     """
 
     state: str

@@ -10,7 +10,6 @@ from edp.evaluation.controller import Budget, ResourceUsage
 from edp.settings.tree import Table
 from edp.stats.confirm import ModuleEvidence
 from edp.stats.importance import MainEffect
-from edp.stats.power import ConfirmationPlan
 from edp.stats.thesis_confirm import ThesisEvidence
 from edp.stats.variance import PairedVariance, SplitVariance
 
@@ -53,16 +52,10 @@ class ArmFacts(SplitVariance):
 
 @dataclass(frozen=True, kw_only=True)
 class IsolationFacts:
-    """Phase 0.
+    """Phase 0: arms by backbone and feature set, mean scores by feature set, and the chosen feature set.
 
-    Attributes:
-        arms: by backbone and feature set.
-        runs, seeds: number of runs, and of seeds for each.
-        features: the chosen feature set.
-        mean_scores: of each feature set over all backbones.
-        comparisons: of feature sets, by backbone.
-        backbones: comparisons of the best backbone with the others, both with the chosen feature set.
-        variance: of paired differences, for planning.
+    `comparisons` of feature sets are by backbone, `backbones` are compared with the chosen feature set, and `variance`
+    is that of paired differences, for planning.
     """
 
     arms: Mapping[str, ArmFacts]
@@ -80,15 +73,12 @@ class TrialRow:
     """A trial of phase 1, 4 or 5.
 
     Attributes:
-        number: from 0 in the order of asking.
         values: of its dimensions, and of the options of its modules.
-        score: mean over runs; None if it was not trained to its end.
-        mae: the same of the mean absolute error.
+        score, mae: mean over runs; None if it was not trained to its end.
         modules: that were on; None in phase 1.
         parameters, macs_tick: of its network; None if the values make no network.
         statuses: how its trainings ended; phase 1 only.
-        rungs: steps and scores before the end; None without rungs.
-        pruned: whether it was ended at the last rung.
+        rungs: steps and scores before the end; `pruned`: whether it was ended at the last of them.
     """
 
     number: int
@@ -127,13 +117,9 @@ class FinalRound:
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrationFacts:
-    """Phase 1.
+    """Phase 1: `backbone`, values (`baseline`) and experiment (`settings`) of the baseline.
 
-    Attributes:
-        backbones: by name.
-        final: of several backbones in the sound mode.
-        backbone: of the baseline; `baseline`: its values; `settings`: its experiment.
-        front: trials of each backbone that no other surpasses in score and cost; None without a cost.
+    `front` holds the trials of each backbone that no other surpasses in score and cost.
     """
 
     backbones: Mapping[str, CalibratedBackbone]
@@ -199,11 +185,6 @@ class SoundPlanning(PlanningFacts):
     reason: str
     enough: int | None
 
-    @staticmethod
-    def from_plan(plan: ConfirmationPlan, runs: int) -> SoundPlanning:
-        """Return the facts of a plan of which `runs` are made."""
-        return SoundPlanning(**{**vars(plan), "runs": runs, "enough": plan.runs})
-
 
 @dataclass(frozen=True, kw_only=True)
 class ThesisPlanning(PlanningFacts):
@@ -229,10 +210,6 @@ class SoundConfirmation(ConfirmationFacts):
 
     evidence: tuple[ModuleEvidence, ...]
 
-    def by_module(self) -> dict[str, ModuleEvidence]:
-        """Return the evidence by module."""
-        return {entry.module: entry for entry in self.evidence}
-
 
 @dataclass(frozen=True, kw_only=True)
 class ThesisConfirmation(ConfirmationFacts):
@@ -246,11 +223,10 @@ class JointFacts:
     """What phases 4 and 5 share: the best trial, and how often each module was on.
 
     Attributes:
-        settings: of the best trial; its `values`, `modules`, `score` and `costs`.
+        settings: of the best trial, like `values`, `modules`, `score` and `costs`.
         on: fraction of the trials with each module.
-        trials: all of them.
         said_of_pruned: a sentence on trials that were ended at a rung, if any were.
-        front: numbers of the trials that no other surpasses in score and cost; None without a cost.
+        front: numbers of the trials that no other surpasses in score and cost.
     """
 
     settings: Table
@@ -266,12 +242,9 @@ class JointFacts:
 
 @dataclass(frozen=True, kw_only=True)
 class SynthesisFacts(JointFacts):
-    """Phase 4.
+    """Phase 4: scores of ``synthesis`` and ``baseline`` on the test sessions, and the change by the winner there.
 
-    Attributes:
-        test: scores of ``synthesis`` and ``baseline`` on the test sessions; None if a training did not end well.
-        test_gain: change by the winner there; None if it cannot be tested.
-        antagonistic: confirmed modules that the winner does without.
+    `antagonistic` are confirmed modules that the winner does without.
     """
 
     test: Mapping[str, Mapping[str, float | None]]
@@ -281,13 +254,9 @@ class SynthesisFacts(JointFacts):
 
 @dataclass(frozen=True, kw_only=True)
 class ExplorationFacts(JointFacts):
-    """Phase 5.
+    """Phase 5: the change by its winner against that of phase 4 on fresh folds, `fresh` scores of both there.
 
-    Attributes:
-        options: values that were searched, by option of a module.
-        change, low, high, p: of its winner against that of phase 4 on fresh folds (`RelativeChange`).
-        fresh: scores of both there; `runs`: how many.
-        teacher: the phase whose winner is the teacher, and its experiment.
+    `options` are the values that were searched, by option of a module; `teacher` is the phase whose winner is it.
     """
 
     options: Mapping[str, tuple[Scalar, ...]]
@@ -336,12 +305,7 @@ class SecondTest:
 
 @dataclass(frozen=True, kw_only=True)
 class SmallerFacts:
-    """Phase 6; see `edp.evaluation.compression.CompressionResult`. Without the phase `on` is false.
-
-    Attributes:
-        sessions: None if no network was made.
-        second: sessions of the second test set.
-    """
+    """Phase 6; see `edp.evaluation.compression.CompressionResult`. Without the phase `on` is false."""
 
     on: bool = True
     budget: Budget | None = field(default=None, metadata=OPTIONAL)

@@ -146,7 +146,8 @@ def fit_chain(
     ]
     blocks = list(side_by_side(summarised, jobs))
     settle = _settle_blocks(spec, sessions, summaries.block)
-    return fit_from_blocks(spec, summaries, blocks, sessions[0].rate_hz, settle, promised_hours, progress, side_by_side)
+    progress.note("conditioning, views and limit")
+    return fit_from_blocks(spec, summaries, blocks, sessions[0].rate_hz, settle, promised_hours, side_by_side)
 
 
 def check_healthy_sessions(spec: ChainSpec, channels: Sequence[Channel], sessions: Sequence[Recording]) -> None:
@@ -211,11 +212,9 @@ def fit_from_blocks(
     rate_hz: float,
     settle: int,
     promised_hours: float,
-    progress: Progress = SILENT,
     side_by_side: SideBySide = ONE_BY_ONE,
 ) -> FittedChain:
     """Fit a chain like `fit_chain`, given the blocks of the sessions."""
-    progress.note("conditioning, views and limit")
     remaining, doubtful = _without_doubtful(spec, blocks, settle)
     blocks_per_s = rate_hz / summaries.block
     drift = SlowDrift(spec.drift_per_hour / 3600.0 / blocks_per_s, spec.most_drift)

@@ -2,7 +2,6 @@
 
 from edp.report.compare.page import build_compare_page
 from edp.report.compare.paired import Comparison, compare_runs
-from edp.report.compression.facts import CompressionFacts, read_compression
 from edp.report.compression.page import write_compression_page
 from edp.report.control.facts import ControlFacts
 from edp.report.control.page import build_control_page
@@ -19,7 +18,6 @@ from edp.report.twin.page import build_twin_page, build_twin_report
 
 __all__ = [
     "Comparison",
-    "CompressionFacts",
     "ControlFacts",
     "Facts",
     "FreeRunFacts",
@@ -36,7 +34,6 @@ __all__ = [
     "comparison_rows",
     "headline",
     "holds_free_runs",
-    "read_compression",
     "read_facts",
     "read_transfer",
     "write_compression_page",

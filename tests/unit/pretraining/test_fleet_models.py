@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from fleet_reports import fleet_report
 from noted_progress import NotedProgress
 
 from edp.errors import BundleError, ConfigError, DataError, EdpError, StorageError
@@ -163,7 +164,7 @@ def content():
 
 
 def test_reasons_are_what_departs_from_the_fleet(content):
-    facts = fleet_facts(content, "fleet")
+    facts = fleet_facts(fleet_report(content), "fleet")
     why = {one.name: " ".join(one.why) for one in facts.rows}
     assert "grew by 80 %" in why["m3"]
     assert "input lever lies" in why["<b>m4</b>"]
@@ -181,7 +182,7 @@ def test_reasons_are_what_departs_from_the_fleet(content):
 
 def test_a_fleet_of_which_no_machine_could_be_judged_has_a_page(content):
     content["machines"] = [{"machine": "m", "minutes": 1.0, "failed": "too short"}]
-    facts = fleet_facts(content, "fleet")
+    facts = fleet_facts(fleet_report(content), "fleet")
     assert headline(facts) == "None of 1 machines could be judged."
     assert "too short" in build_fleet_page(facts).html()
 
@@ -190,10 +191,10 @@ def test_drift_is_told_from_chance():
     rng = np.random.default_rng(2)
     steady = np.abs(rng.normal(size=60_000))
     worn = steady * np.repeat([1.0, 1.5], 30_000)
-    assert abs(drift_of(steady, 100.0)["t"]) < 4
+    assert abs(drift_of(steady, 100.0).t) < 4
     found = drift_of(worn, 100.0)
-    assert found["t"] > 4
-    assert found["ratio"] == pytest.approx(1.5, abs=0.05)
+    assert found.t > 4
+    assert found.ratio == pytest.approx(1.5, abs=0.05)
     assert drift_of(steady[:5000], 100.0) is None
 
 

@@ -2,6 +2,7 @@
 
 import pytest
 from browser import check_page
+from fleet_reports import fleet_report
 from page_text import check_text
 
 from edp.report.fleet.facts import fleet_facts
@@ -30,10 +31,10 @@ def content() -> dict[str, object]:
 
 
 def test_the_text_of_the_page():
-    check_text(build_fleet_page(fleet_facts(content(), "rigs")).html(), "fleet")
+    check_text(build_fleet_page(fleet_facts(fleet_report(content()), "rigs")).html(), "fleet")
 
 
 @pytest.mark.processes
 def test_the_page_in_a_browser(browser, tmp_path):
-    page = build_fleet_page(fleet_facts(content(), "<b>rigs</b>")).write(tmp_path / "fleet.html")
+    page = build_fleet_page(fleet_facts(fleet_report(content()), "<b>rigs</b>")).write(tmp_path / "fleet.html")
     check_page(browser, page, "fleet")

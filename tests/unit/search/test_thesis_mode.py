@@ -13,6 +13,7 @@ from edp.report import write_study_page
 from edp.storage.ledger import Ledger
 from edp.training.parts import fit_part
 from edp.workflows.search.engine import Dispatcher
+from edp.workflows.search.jobs import job_of
 from edp.workflows.search.plan import load_plan
 from edp.workflows.search.runner import Resources, run_search
 from edp.workflows.search.trainings import (
@@ -149,8 +150,9 @@ def test_the_judging_sessions_validate_and_predictions_are_made_window_by_window
     """The same training judged as a stream of one epoch's length differs: there the state is carried on."""
     one = dataclasses.replace(order, epochs=1, updates=24, patience=0, validation=())
     assert train_order(one.to_json())["sessions"] != train_order(order.to_json())["sessions"]
-    assert "validation" not in one.to_json()
-    assert "epochs" not in one.to_json()
+    identity = job_of(one, "data").identity
+    assert "validation" not in identity.split
+    assert "epochs" not in identity.config
 
 
 @pytest.fixture(scope="module")

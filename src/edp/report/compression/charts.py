@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from edp.evaluation.compression import CompressedRow
+from edp.evaluation.compression import CompressedRow, CompressionResult
 from edp.report.common.chart import (
     BLUE,
     DROPPED,
@@ -21,7 +21,7 @@ from edp.report.common.chart import (
     Symbol,
     with_unit,
 )  # fmt: skip
-from edp.report.compression.facts import COSTS, CompressionFacts, cost_of
+from edp.report.compression.facts import COSTS, cost_of, smallest
 
 AHEAD, COST = "horizon", "cost"
 STAGES: tuple[tuple[str, str, Symbol, float, str], ...] = (
@@ -31,12 +31,12 @@ STAGES: tuple[tuple[str, str, Symbol, float, str], ...] = (
 """Key of the scores, name, symbol, its size and its colour."""
 
 
-def profile_chart(facts: CompressionFacts) -> Chart:
+def profile_chart(facts: CompressionResult) -> Chart:
     """Parameters as bars and MAE before and after (left), composite scores with the front marked (right)."""
-    indices = facts.smallest()
-    rows = [facts.result.rows[index] for index in indices]
+    indices = smallest(facts)
+    rows = [facts.rows[index] for index in indices]
     names = [row.name for row in rows]
-    unit, front = facts.result.unit, facts.result.front
+    unit, front = facts.unit, facts.front
     sizes = [row.resource_usage.parameters for row in rows]
     left: list[Mark] = [
         Bars(positions=names, values=sizes, colours=[RULE] * len(rows), name="parameters", hover="{y:,}"),
@@ -66,10 +66,10 @@ def profile_chart(facts: CompressionFacts) -> Chart:
     )  # fmt: skip
 
 
-def front_chart(facts: CompressionFacts) -> Chart:
+def front_chart(facts: CompressionResult) -> Chart:
     """Error over that of the teacher against a cost, with the limit of the budget."""
-    groups = list(dict.fromkeys(row.label for row in facts.result.rows))
-    errors = [_percent(row) for row in facts.result.rows]
+    groups = list(dict.fromkeys(row.label for row in facts.rows))
+    errors = [_percent(row) for row in facts.rows]
     marks: list[Mark] = []
     for cost in COSTS:
         when = {COST: cost}
@@ -78,13 +78,13 @@ def front_chart(facts: CompressionFacts) -> Chart:
             x=[x for x, _ in line], y=[y for _, y in line], name="front", width=2, step="after", when=when, hover=None
         ))  # fmt: skip
         for position, group in enumerate(groups):
-            rows = [row for row in facts.result.rows if row.label == group]
+            rows = [row for row in facts.rows if row.label == group]
             marks.append(DataSeries(
                 x=[cost_of(row, cost) for row in rows], y=[_percent(row) for row in rows], name=group, when=when,
                 symbol="circle", size=9, colour=MUTED[position % len(MUTED)], labels=[row.name for row in rows],
                 hover="{label}: {y:+.2f} %, {x:,}",
             ))  # fmt: skip
-        limit = getattr(facts.result.budget, cost)
+        limit = getattr(facts.budget, cost)
         marks.append(DataSeries(
             x=[limit, limit], y=[min(errors), max(errors)], name="budget", width=2, colour=SOFT, dash="dot", when=when,
             hover=None,
@@ -98,11 +98,11 @@ def front_chart(facts: CompressionFacts) -> Chart:
     return Chart("front", (panel,), file="front_{cost}", title="Error against cost", choices=choices)
 
 
-def _ticks(facts: CompressionFacts) -> tuple[tuple[float, str], ...]:
+def _ticks(facts: CompressionResult) -> tuple[tuple[float, str], ...]:
     """Five round errors for each horizon, evenly spread on a logarithmic axis."""
     ticks = set()
     for horizon in facts.horizons:
-        values = [row.scores[horizon]["mae"] for row in facts.result.rows]
+        values = [row.scores[horizon]["mae"] for row in facts.rows]
         low, high = min(values), max(values)
         # A perfect error of zero has no place on a logarithmic axis.
         ticks |= {float(f"{low * (high / low) ** (step / 4):.2g}") for step in range(5)} if low > 0 else set()
@@ -117,10 +117,10 @@ def _percent(row: CompressedRow) -> float:
     return 100 * (row.error - 1)
 
 
-def _front(facts: CompressionFacts, cost: str) -> list[tuple[float, float]]:
+def _front(facts: CompressionResult, cost: str) -> list[tuple[float, float]]:
     """Points that no other one betters in error at no greater cost."""
     line: list[tuple[float, float]] = []
-    for x, y in sorted((cost_of(row, cost), _percent(row)) for row in facts.result.rows):
+    for x, y in sorted((cost_of(row, cost), _percent(row)) for row in facts.rows):
         if not line or y < line[-1][1]:
             line.append((x, y))
     return line

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-
 from edp.errors import count_of
-from edp.evaluation.compression import CompressedRow, CompressionResult, read_compression_result
+from edp.evaluation.compression import CompressedRow, CompressionResult
 from edp.table import Column, Table, Value, figures
 from edp.wording import listed, number, percent
 
@@ -14,31 +11,15 @@ LIMITS = {"cycles": "cycles", "parameter_bytes": "parameters", "ram_bytes": "mem
 COSTS = {"cycles": "Cycles per tick, high estimate", "parameter_bytes": "Memory for parameters [bytes]"}
 
 
-@dataclass(frozen=True)
-class CompressionFacts:
-    """Result of a compression, and the folder where it lies."""
-
-    result: CompressionResult
-    folder: Path
-
-    def smallest(self) -> list[int]:
-        """Indices of a row for each network: that of its smallest format; the teacher in float32 comes first."""
-        rows, smallest = self.result.rows, dict[tuple[str, bool], int]()
-        for index, row in enumerate(rows):
-            network = row.run, row.recipe == "teacher" and row.number_format == "float32"
-            best = smallest.setdefault(network, index)
-            if row.resource_usage.parameter_bytes < rows[best].resource_usage.parameter_bytes:
-                smallest[network] = index
-        return sorted(smallest.values(), key=lambda index: (rows[index].recipe != "teacher", index))
-
-    @property
-    def horizons(self) -> list[str]:
-        """Look-aheads in samples, as keys of scores."""
-        return [str(horizon) for horizon in self.result.task.horizons]
-
-    def ahead(self, horizon: str) -> str:
-        """A horizon in words."""
-        return f"{1e3 * int(horizon) / self.result.task.rate_hz:.0f} ms ahead (k = {horizon})"
+def smallest(facts: CompressionResult) -> list[int]:
+    """Indices of a row for each network: that of its smallest format; the teacher in float32 comes first."""
+    rows, smallest = facts.rows, dict[tuple[str, bool], int]()
+    for index, row in enumerate(rows):
+        network = row.run, row.recipe == "teacher" and row.number_format == "float32"
+        best = smallest.setdefault(network, index)
+        if row.resource_usage.parameter_bytes < rows[best].resource_usage.parameter_bytes:
+            smallest[network] = index
+    return sorted(smallest.values(), key=lambda index: (rows[index].recipe != "teacher", index))
 
 
 def cost_of(row: CompressedRow, name: str) -> float:
@@ -47,21 +28,11 @@ def cost_of(row: CompressedRow, name: str) -> float:
     return float(usage.cycles[2] if name == "cycles" else usage.parameter_bytes)
 
 
-def read_compression(folder: str | Path) -> CompressionFacts:
-    """Return what `edp compress` wrote into a folder.
-
-    Raises:
-        StorageError: nothing, or something of another version.
-    """
-    return CompressionFacts(read_compression_result(folder), Path(folder))
-
-
-def front_table(facts: CompressionFacts, horizon: str) -> Table:
+def front_table(facts: CompressionResult, horizon: str) -> Table:
     """A table in the form of Table 4.9, with what the controller sees beside it; what is on the front stands out."""
-    result = facts.result
-    teacher, unit = result.teacher.scores[horizon]["mae"], result.unit
+    teacher, unit = facts.teacher.scores[horizon]["mae"], facts.unit
     rows: list[tuple[Value, ...]] = []
-    for row in result.rows:
+    for row in facts.rows:
         usage, mae = row.resource_usage, row.scores[horizon]["mae"]
         rows.append(
             (
@@ -92,12 +63,12 @@ def front_table(facts: CompressionFacts, horizon: str) -> Table:
         Column("Budget", is_text=True),
     )
     caption = f"{facts.ahead(horizon)}, validation part"
-    return Table(caption, columns, tuple(rows), frozenset(result.front), name=f"k{horizon}")
+    return Table(caption, columns, tuple(rows), frozenset(facts.front), name=f"k{horizon}")
 
 
-def held_out_table(facts: CompressionFacts) -> Table | None:
+def held_out_table(facts: CompressionResult) -> Table | None:
     """Teacher and chosen on the sealed test set."""
-    scores = facts.result.held_out_test.scores
+    scores = facts.held_out_test.scores
     if not scores:
         return None
     rows: list[tuple[Value, ...]] = []
@@ -106,7 +77,7 @@ def held_out_table(facts: CompressionFacts) -> Table | None:
         change = 100 * (last["mae"] / first["mae"] - 1)
         composites = first["composite"], last["composite"]
         rows.append((facts.ahead(horizon), first["mae"], last["mae"], change, *composites))
-    unit = facts.result.unit
+    unit = facts.unit
     columns = (
         Column("Horizon"),
         Column("MAE, teacher", unit, figures([row[1] for row in rows])),
@@ -118,35 +89,34 @@ def held_out_table(facts: CompressionFacts) -> Table | None:
     return Table("On recordings that took part in no choice", columns, tuple(rows), name="held_out_test")
 
 
-def headline(facts: CompressionFacts) -> str:
+def headline(facts: CompressionResult) -> str:
     """One sentence: what was found."""
-    best, budget = facts.result.best, facts.result.budget.name
+    best, budget = facts.best, facts.budget.name
     if best is None:
         return f"None of the networks made fits the budget “{budget}”"
     return f"{best.name} fits “{budget}” with an error {percent(best.error - 1, signed=True)} against the teacher's"
 
 
-def verdict(facts: CompressionFacts) -> list[str]:
+def verdict(facts: CompressionResult) -> list[str]:
     """Sentences under the headline."""
-    result = facts.result
-    if result.best is None:
-        near = min(result.rows, key=lambda row: max(value / limit for value, limit in row.over.values()))
+    if facts.best is None:
+        near = min(facts.rows, key=lambda row: max(value / limit for value, limit in row.over.values()))
         over = listed(f"{LIMITS[k]} {v:,} of {limit:,}" for k, (v, limit) in near.over.items())
         return [f"The nearest is {near.name}: {over}."]
-    usage, budget = result.best.resource_usage, result.budget
+    usage, budget = facts.best.resource_usage, facts.budget
     lines = [
         f"It takes {usage.cycles[2]:,} of {budget.cycles:,} cycles a tick (high estimate) and "
         f"{usage.parameter_bytes:,} of {budget.parameter_bytes:,} bytes for parameters."
     ]
-    if result.held_out_test.error is not None:
-        change = percent(result.held_out_test.error - 1, signed=True)
+    if facts.held_out_test.error is not None:
+        change = percent(facts.held_out_test.error - 1, signed=True)
         lines.append(f"On the sealed test set its MAE is {change} against the teacher's.")
     return lines
 
 
-def caveats(facts: CompressionFacts) -> list[str]:
+def caveats(facts: CompressionResult) -> list[str]:
     """What the figures can and cannot show."""
-    held_out, parts = facts.result.held_out_test, facts.result.recordings
+    held_out, parts = facts.held_out_test, facts.recordings
     lines = [
         "Cycles, program and memory beside constants are estimates; MACs are counted, and so are the bytes of all "
         "constants, as the exported C code holds them (INT8 has no such code: one byte for each weight). The high "
@@ -167,18 +137,18 @@ def caveats(facts: CompressionFacts) -> list[str]:
         lines.append(
             f"The sealed test set was opened {len(held_out.openings)} times; openings after the first show less."
         )
-    return [*lines, *facts.result.notes]
+    return [*lines, *facts.notes]
 
 
-def tiles(facts: CompressionFacts) -> list[tuple[str, str, str]]:
+def tiles(facts: CompressionResult) -> list[tuple[str, str, str]]:
     """Key figures: value, unit, meaning."""
-    best, unit = facts.result.best, facts.result.unit
+    best, unit = facts.best, facts.unit
     if best is None:
         return []
     horizon, usage = facts.horizons[-1], best.resource_usage
     return [
         (number(best.scores[horizon]["mae"]), unit, f"MAE {facts.ahead(horizon)}"),
-        (number(facts.result.teacher.scores[horizon]["mae"]), unit, "MAE of the teacher"),
+        (number(facts.teacher.scores[horizon]["mae"]), unit, "MAE of the teacher"),
         (f"{usage.parameter_bytes / 1e3:.1f}", "kB", "for parameters"),
         (f"{usage.cycles[2] / 1e3:,.0f}", "k", "cycles per tick, high estimate"),
         (f"{usage.macs_tick / 1e3:,.1f}", "k", "MACs per tick"),

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from edp.evaluation.compression import read_compression
 from edp.report.common.page import Page, Paragraph, Points, Section, write_report
 from edp.report.compression import facts as words
 from edp.report.compression.charts import front_chart, profile_chart
-from edp.report.compression.facts import read_compression
 from edp.storage.paths import full_path
 
 
@@ -25,9 +25,9 @@ def write_compression_page(folder: str | Path, pictures: bool = True) -> Path:
     held_out = words.held_out_table(facts)
     charts = [profile_chart(facts), front_chart(facts)]
     page = Page(
-        title=full_path(facts.folder).name,
+        title=full_path(Path(folder)).name,
         kind="compression",
-        about=["compression", facts.result.budget.name],
+        about=["compression", facts.budget.name],
         headline=words.headline(facts),
         verdict=words.verdict(facts),
         tiles=words.tiles(facts),
@@ -64,7 +64,7 @@ def write_compression_page(folder: str | Path, pictures: bool = True) -> Path:
                 [Paragraph("Not opened: no network fits the budget.", "missing")]
                 if held_out is None
                 else [
-                    f"Opened on {facts.result.held_out_test.opened}, for the chosen network and the teacher.",
+                    f"Opened on {facts.held_out_test.opened}, for the chosen network and the teacher.",
                     held_out,
                 ],
             ),
@@ -73,4 +73,4 @@ def write_compression_page(folder: str | Path, pictures: bool = True) -> Path:
         footer="Its pictures and tables lie beside it.",
     )
     files = [*tables, held_out] if held_out else tables
-    return write_report(page, facts.folder / "report.html", files, charts if pictures else [])
+    return write_report(page, Path(folder) / "report.html", files, charts if pictures else [])

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from edp.errors import count_of
+from edp.report.fleet.result import FleetReport, MachineErrors, ReportedMachine
 from edp.table import Column, Table, Value, figures
 from edp.wording import figure, number, percent
 
@@ -62,7 +62,7 @@ class FleetFacts:
         ahead_ms: time that is looked ahead.
         rows: machines, the worst first.
         failed: machines that could not be judged, and why.
-        content: what ``fleet_report.json`` has.
+        report: content of ``fleet_report.json``.
     """
 
     title: str
@@ -70,7 +70,7 @@ class FleetFacts:
     ahead_ms: float
     rows: tuple[FleetRow, ...]
     failed: tuple[tuple[str, str], ...]
-    content: Mapping[str, Any]
+    report: FleetReport
 
     @property
     def median(self) -> float:
@@ -78,76 +78,77 @@ class FleetFacts:
         return float(np.median([row.mae for row in self.rows])) if self.rows else float("nan")
 
 
-def fleet_facts(content: Mapping[str, Any], title: str) -> FleetFacts:
-    """Facts of what ``fleet_report.json`` has."""
-    units = {target["unit"] for target in content["targets"]}
-    judged = [row for row in content["machines"] if "mae" in row]
-    failed = tuple((row["machine"], row["failed"]) for row in content["machines"] if "failed" in row)
-    usual = _Usual(judged, content["targets"])
-    rows = sorted((usual.row(row) for row in judged), key=lambda row: -row.mae)
-    ahead = 1e3 * content["horizon"] / content["rate_hz"]
+def fleet_facts(report: FleetReport, title: str) -> FleetFacts:
+    """Return what a reader sees of a fleet report."""
+    units = {target.unit for target in report.targets}
+    failed = tuple((row.machine, row.failed) for row in report.machines if row.errors is None)
+    usual = _Usual(
+        [row.errors for row in report.machines if row.errors is not None], [target.name for target in report.targets]
+    )
+    rows = [usual.row(row, row.errors) for row in report.machines if row.errors is not None]
+    ahead = 1e3 * report.horizon / report.rate_hz
     unit = units.pop() if len(units) == 1 else "mixed units"
-    return FleetFacts(title, unit, ahead, tuple(rows), failed, content)
+    return FleetFacts(title, unit, ahead, tuple(sorted(rows, key=lambda row: -row.mae)), failed, report)
 
 
 class _Usual:
     """What is usual in the fleet, and how a machine departs from it."""
 
-    def __init__(self, judged: Sequence[Mapping[str, Any]], targets: Sequence[Mapping[str, str]]) -> None:
-        self.targets = [target["name"] for target in targets]
-        self.by_target = np.median([row["by_target"] for row in judged], axis=0) if judged else np.zeros(0)
-        self.still = float(np.median([row["persistence"] for row in judged])) if judged else 0.0
+    def __init__(self, judged: Sequence[MachineErrors], targets: Sequence[str]) -> None:
+        self.targets = targets
+        self.by_target = np.median([row.by_target for row in judged], axis=0) if judged else np.zeros(0)
+        self.still = float(np.median([row.persistence for row in judged])) if judged else 0.0
         self.inputs: dict[tuple[str, str], tuple[float, float]] = {}
-        for name in judged[0]["inputs"] if judged else ():
+        for name in judged[0].inputs if judged else ():
             for statistic in ("mean", "std"):
-                values = np.array([row["inputs"][name][statistic] for row in judged])
+                values = np.array([getattr(row.inputs[name], statistic) for row in judged])
                 middle = float(np.median(values))
                 self.inputs[name, statistic] = (middle, NORMAL * float(np.median(np.abs(values - middle))))
 
-    def row(self, row: Mapping[str, Any]) -> FleetRow:
-        drift, alarms = row["drift"], row["alarms"]
-        drifts = drift is not None and drift["t"] > SURE_T and drift["ratio"] > DRIFTS
+    def row(self, machine: ReportedMachine, row: MachineErrors) -> FleetRow:
+        drift, alarms = row.drift, row.alarms
+        drifts = drift is not None and drift.t > SURE_T and drift.ratio > DRIFTS
         return FleetRow(
-            name=row["machine"],
-            minutes=row["minutes"],
-            mae=row["mae"],
-            skill=1.0 - row["mae"] / row["persistence"] if row["persistence"] else 0.0,
-            drift=None if drift is None else drift["ratio"],
+            name=machine.machine,
+            minutes=machine.minutes,
+            mae=row.mae,
+            skill=1.0 - row.mae / row.persistence if row.persistence else 0.0,
+            drift=None if drift is None else drift.ratio,
             drifts=drifts,
-            changes=None if alarms is None else alarms.get("changes"),
-            own=row["own"],
+            changes=None if alarms is None or alarms.failed else alarms.changes,
+            own=row.own,
             why=tuple(self._why(row, drifts)),
         )
 
-    def _why(self, row: Mapping[str, Any], drifts: bool) -> list[str]:
+    def _why(self, row: MachineErrors, drifts: bool) -> list[str]:
         reasons = [*self._outputs(row), *self._speed(row)]
-        if drifts:
-            grown = percent(row["drift"]["ratio"] - 1.0)
+        if drifts and row.drift is not None:
+            grown = percent(row.drift.ratio - 1.0)
             reasons.append(f"the error grew by {grown} from the first half of its time to the second")
-        alarms = row["alarms"]
-        if alarms and alarms.get("changes"):
-            reasons.append(f"the monitor told of {count_of(alarms['changes'], 'change')}, first: {alarms['first'][0]}")
+        alarms = row.alarms
+        if alarms is not None and alarms.changes:
+            reasons.append(f"the monitor told of {count_of(alarms.changes, 'change')}, first: {alarms.first[0]}")
         return [*reasons, *self._unusual(row)]
 
-    def _outputs(self, row: Mapping[str, Any]) -> list[str]:
+    def _outputs(self, row: MachineErrors) -> list[str]:
         """The output whose error departs most from the fleet's."""
-        ratios = np.asarray(row["by_target"]) / np.maximum(self.by_target, 1e-30)
+        ratios = np.asarray(row.by_target) / np.maximum(self.by_target, 1e-30)
         worst = int(np.argmax(ratios))
         if ratios[worst] < LARGER:
             return []
         return [f"the error of {self.targets[worst]} is {ratios[worst]:.1f} times the fleet's median"]
 
-    def _speed(self, row: Mapping[str, Any]) -> list[str]:
+    def _speed(self, row: MachineErrors) -> list[str]:
         """Whether its outputs simply change faster."""
-        ratio = row["persistence"] / self.still if self.still else 1.0
+        ratio = row.persistence / self.still if self.still else 1.0
         return [f"its outputs change {ratio:.1f} times as fast as the fleet's"] if ratio > LARGER else []
 
-    def _unusual(self, row: Mapping[str, Any]) -> list[str]:
+    def _unusual(self, row: MachineErrors) -> list[str]:
         """The input that departs most from the fleet's, in robust deviations."""
         words = {"mean": "lies", "std": "varies"}
         far = []
         for (name, statistic), (middle, spread) in self.inputs.items():
-            away = abs(row["inputs"][name][statistic] - middle) / spread if spread > 0 else 0.0
+            away = abs(getattr(row.inputs[name], statistic) - middle) / spread if spread > 0 else 0.0
             far.append((away, name, statistic))
         away, name, figure = max(far, default=(0.0, "", "mean"))
         return [f"input {name} {words[figure]} {away:.0f} deviations off the fleet"] if away > FAR else []

@@ -13,11 +13,11 @@ BINS = 24
 
 def build_fleet_page(facts: FleetFacts) -> Page:
     """Return the page of a fleet."""
-    content, network = facts.content, facts.content["network"]
+    report, network = facts.report, facts.report.network
     return Page(
         title=facts.title,
         kind="fleet",
-        about=["fleet", network["label"]],
+        about=["fleet", network.label],
         headline=headline(facts),
         verdict=verdict(facts),
         tiles=tiles(facts),
@@ -62,11 +62,11 @@ def build_fleet_page(facts: FleetFacts) -> Page:
             Section("failed", "Not judged", [failed_table(facts)]),
         ],
         provenance=[
-            ("Network", f"{network['path']} ({network['weights']})"),
-            ("Store", content["store"]),
-            ("Deltas", content["deltas"] or "none"),
-            ("Monitor", content["monitor"] or "none"),
-            ("EDP", content["edp"]),
+            ("Network", f"{network.path} ({network.weights})"),
+            ("Store", report.store),
+            ("Deltas", report.deltas or "none"),
+            ("Monitor", report.monitor or "none"),
+            ("EDP", report.edp),
         ],
     )
 

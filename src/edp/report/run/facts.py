@@ -52,7 +52,7 @@ class Facts:
     Attributes:
         limit: the limit of predictability of the run's data, see `read_limit`.
         foundation: errors on machines that were never seen, of a run over many machines, see
-            `edp.report.run.sheets`.
+            `edp.report.run.tables`.
         predictions: ``recording -> name -> array``; ``truth`` is (time, target), a model (time, horizon, target), SI;
             so are both ends of the network's interval, where it has one.
     """

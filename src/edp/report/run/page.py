@@ -15,7 +15,6 @@ from edp.report.run import tables
 from edp.report.run.charts import DOTS_AT_MOST, run_charts, signal_chart, signals_of
 from edp.report.run.choice import candidates_table, model_tables, promise_line, promise_table, read_choice
 from edp.report.run.residuals import correlogram, fit_table
-from edp.report.run.sheets import contexts_table, machines_table, parts_table, situation_table
 from edp.storage.paths import full_path
 from edp.wording import moment, unbroken
 
@@ -196,9 +195,9 @@ def _unseen(facts: run.Facts) -> list[Part | None]:
     return [
         "Whole machines were held out. If the network identifies its machine as it runs, the error falls with the time "
         "since its state was reset.",
-        contexts_table(foundation, unit),
-        parts_table(foundation),
-        Fold("Each machine", [machines_table(foundation, unit)]),
+        tables.contexts_table(foundation, unit),
+        tables.machine_parts_table(foundation),
+        Fold("Each machine", [tables.machines_table(foundation, unit)]),
     ]
 
 
@@ -235,7 +234,7 @@ def _errors(facts: run.Facts, charts: Mapping[str, Chart]) -> list[Part | None]:
             [
                 "What the axis did, told from measured channels; but for the last a tick may stand in several rows. "
                 "Shares are means over the axes.",
-                None if facts.scores is None or horizon is None else situation_table(facts.scores, horizon),
+                None if facts.scores is None or horizon is None else tables.situation_table(facts.scores, horizon),
             ],
             "By situation",
         ),

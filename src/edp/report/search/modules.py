@@ -26,8 +26,8 @@ OTHER = "Other"
 
 def modules_tables(study: StudyFile) -> tuple[Table, ...]:
     """Table 4.5: phases 2 and 3 side by side, and every test of phase 3."""
-    sheets = (_modules_thesis if study.mode == "thesis" else _modules_sound)(study)
-    return tuple(sheet for sheet in sheets if sheet is not None)
+    tables = (_modules_thesis if study.mode == "thesis" else _modules_sound)(study)
+    return tuple(table for table in tables if table is not None)
 
 
 def ordered(names: Sequence[str]) -> list[tuple[str, str]]:
@@ -41,7 +41,7 @@ def ordered(names: Sequence[str]) -> list[tuple[str, str]]:
 @of_phase(SoundScreening, ())
 def _modules_sound(study: StudyFile, facts: SoundScreening) -> tuple[Table | None, ...]:
     confirmation = study.facts(SoundConfirmation)
-    evidence = {} if confirmation is None else confirmation.by_module()
+    evidence = {} if confirmation is None else {entry.module: entry for entry in confirmation.evidence}
     rows, marked = [], set()
     for group, name in ordered(facts.registered):
         effect = facts.modules[name]

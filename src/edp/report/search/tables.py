@@ -20,7 +20,7 @@ from edp.wording import count_text, duration, moment, number, percent
 
 def study_tables(study: StudyFile) -> dict[str, Table]:
     """Every table that there are facts for, by name."""
-    sheets = (
+    tables = (
         variance_table(study),
         features_table(study),
         calibration_table(study),
@@ -32,7 +32,7 @@ def study_tables(study: StudyFile) -> dict[str, Table]:
         openings_table(study),
         phases_table(study),
     )
-    return {sheet.name: sheet for sheet in sheets if sheet is not None and sheet.rows}
+    return {table.name: table for table in tables if table is not None and table.rows}
 
 
 @of_phase(IsolationFacts, None)

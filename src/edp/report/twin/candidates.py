@@ -39,7 +39,7 @@ def choice_sentence(rows: Sequence[CandidateRow]) -> str:
     return f"{text}; {label} {rank} ({error:.2f})."
 
 
-def candidate_sheet(rows: Sequence[CandidateRow]) -> Table:
+def candidate_table(rows: Sequence[CandidateRow]) -> Table:
     """The candidates as a table, the chosen one marked."""
     lines: list[tuple[Value, ...]] = [(row.label, row.error, row.seconds, row.why) for row in rows]
     marked = frozenset(i for i, row in enumerate(rows) if row.chosen)

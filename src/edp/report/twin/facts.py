@@ -30,7 +30,7 @@ from edp.evaluation.free_run_file import (
     StrokeErrors,
 )
 from edp.evaluation.guard import twin_verdict
-from edp.report.twin.candidates import candidate_sheet, choice_sentence, read_candidates
+from edp.report.twin.candidates import candidate_table, choice_sentence, read_candidates
 from edp.settings.provenance import Provenance
 from edp.storage import read_object
 from edp.storage.headers import check_files
@@ -229,18 +229,18 @@ def tiles(facts: FreeRunFacts) -> list[tuple[str, str, str]]:
 def free_run_tables(facts: FreeRunFacts) -> dict[str, Table]:
     """Every table by name; those of which nothing is known are left out."""
     twin = facts.twin
-    sheets = [
-        *([actuator_sheet(facts.models)] if mixed_units(twin) else []),
-        _summary_sheet("models", "The twin and its floors", "Model", facts.models, frozenset({0})),
-        _summary_sheet("recordings", "By recording, the worst first", "Recording", _worst(twin.by_recording)),
-        _summary_sheet("driving", "By way of driving", "Way of driving", twin.by_driving),
-        _situation_sheet(twin),
-        *([candidate_sheet(facts.candidates)] if facts.candidates else []),
-        *([] if twin.intervals is None else [_coverage_sheet(twin.intervals)]),
-        *([] if twin.ahead is None else [_ahead_sheet(facts, twin.ahead)]),
-        *([] if twin.beside is None else [_beside_sheet(twin.beside)]),
+    tables = [
+        *([actuator_table(facts.models)] if mixed_units(twin) else []),
+        _summary_table("models", "The twin and its floors", "Model", facts.models, frozenset({0})),
+        _summary_table("recordings", "By recording, the worst first", "Recording", _worst(twin.by_recording)),
+        _summary_table("driving", "By way of driving", "Way of driving", twin.by_driving),
+        _situation_table(twin),
+        *([candidate_table(facts.candidates)] if facts.candidates else []),
+        *([] if twin.intervals is None else [_coverage_table(twin.intervals)]),
+        *([] if twin.ahead is None else [_ahead_table(facts, twin.ahead)]),
+        *([] if twin.beside is None else [_beside_table(twin.beside)]),
     ]
-    return {sheet.name: sheet for sheet in sheets if sheet.rows}
+    return {table.name: table for table in tables if table.rows}
 
 
 def _worst(summaries: Mapping[str, RunSummary]) -> dict[str, RunSummary]:
@@ -256,7 +256,7 @@ def _worst(summaries: Mapping[str, RunSummary]) -> dict[str, RunSummary]:
     return dict(ranked[:MOST_ROWS])
 
 
-def _summary_sheet(
+def _summary_table(
     name: str,
     caption: str,
     first: str,
@@ -283,7 +283,7 @@ def _summary_sheet(
     return Table(caption, (Column(first), count, *shown, Column("Diverged")), tuple(rows), marked, name=name)
 
 
-def _situation_sheet(twin: FreeRunScores) -> Table:
+def _situation_table(twin: FreeRunScores) -> Table:
     rows: list[tuple[Value, ...]] = []
     for name, row in twin.situations.items():
         strokes = None if row.stroke_error is None else row.stroke_error.mean
@@ -297,7 +297,7 @@ def _situation_sheet(twin: FreeRunScores) -> Table:
     return Table("At end stops, at rest and in motion", heads, tuple(rows), name="situations")
 
 
-def _coverage_sheet(intervals: IntervalCoverage) -> Table:
+def _coverage_table(intervals: IntervalCoverage) -> Table:
     covered = [(row.at_s, row.parts()) for row in intervals.at]
     parts = list(covered[0][1]) if covered else []
     rows: list[tuple[Value, ...]] = []
@@ -313,7 +313,7 @@ def _coverage_sheet(intervals: IntervalCoverage) -> Table:
     return Table(caption, tuple(heads), tuple(rows), name="intervals")
 
 
-def _ahead_sheet(facts: FreeRunFacts, first: AheadErrors) -> Table:
+def _ahead_table(facts: FreeRunFacts, first: AheadErrors) -> Table:
     caption = f"{figure(first.seconds)} s ahead of measured ports, told the commands in between"
     if mixed_units(facts.twin):
         return ahead_by_actuator(facts.models, caption)
@@ -328,7 +328,7 @@ def _ahead_sheet(facts: FreeRunFacts, first: AheadErrors) -> Table:
     return Table(caption, (Column("Model"), *shown), tuple(rows), frozenset({0}), name="ahead")
 
 
-def _beside_sheet(beside: PredictorComparison) -> Table:
+def _beside_table(beside: PredictorComparison) -> Table:
     rows: list[tuple[Value, ...]] = [
         (part, row.twin.unit, row.twin.mean, row.predictor.mean) for part, row in beside.errors.items()
     ]
@@ -348,7 +348,7 @@ def mixed_units(scores: FreeRunScores) -> bool:
     return bool(scores.velocity_mae.units)
 
 
-def actuator_sheet(models: Mapping[str, FreeRunScores]) -> Table:
+def actuator_table(models: Mapping[str, FreeRunScores]) -> Table:
     """A row for each actuator and model: errors of its velocity, and of its stroke by time, with their units."""
     columns = {
         name: [

@@ -24,7 +24,7 @@ from edp.storage.runs import Run
 from edp.training.bagging.boosting import TreeLearner
 from edp.training.bagging.dead_band import band, dead_bands
 from edp.training.bagging.learner import FoldFit, HeadPart, Learner
-from edp.training.bagging.perceptrons import PerceptronLearner, losses_of, record
+from edp.training.bagging.perceptrons import CheckedErrors, PerceptronLearner, losses_of, record
 from edp.training.bagging.radial import RadialLearner
 from edp.training.bagging.spec import BaggingSpec
 from edp.training.bagging.stacking import stacking_weights
@@ -176,4 +176,6 @@ def _record_linear(work: FoldFit) -> None:
     """Record the single history row of a training without steps."""
     error = torch.from_numpy(work.linear.left_out - work.table.targets)
     validation = float(losses_of(work.spec)[0].penalty(error).mean())
-    record(work, 1, 0, math.nan, validation, float(error.abs().mean()), error.abs().mean(dim=0).numpy(), 0.0)
+    absolute = error.abs()
+    each = absolute.mean(dim=0).numpy()
+    record(work, CheckedErrors(1, 0, math.nan, validation, float(absolute.mean()), each, 0.0))

@@ -6,6 +6,7 @@ import itertools
 import math
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -96,7 +97,8 @@ class PerceptronLearner:
     def _check(self, check: int, updates: int, loss: float) -> None:
         judged = [group.judge(self.columns, self.residuals) for group in self.groups]
         validation, absolute = (float(np.mean(values)) for values in zip(*judged, strict=True))
-        record(self.work, check, updates, loss, validation, absolute, absolute * self.spread, self.rate)
+        each = absolute * self.spread
+        record(self.work, CheckedErrors(check, updates, loss, validation, absolute, each, self.rate))
 
     def _report(
         self,
@@ -138,32 +140,46 @@ class PerceptronLearner:
         return HeadPart(np.concatenate(blocks), bias, np.zeros(len(bias)))
 
 
-def record(
-    work: FoldFit,
-    check: int,
-    updates: int,
-    loss: float,
-    validation: float,
-    absolute: float,
-    each: DoubleArray,
-    rate: float,
-) -> None:
-    """Add a row to the history; `each` is the absolute error of each output in standard deviations."""
+@dataclass(frozen=True)
+class CheckedErrors:
+    """Errors of the rows left out at one check of a training on folds.
+
+    Attributes:
+        check: number of the check, from 1.
+        updates: done so far.
+        loss: of the training; not a number if nothing was trained.
+        validation: loss on the rows left out.
+        absolute: absolute error on them, in standard deviations, mean over outputs.
+        each: the same for each output.
+        rate: learning rate.
+    """
+
+    check: int
+    updates: int
+    loss: float
+    validation: float
+    absolute: float
+    each: DoubleArray
+    rate: float
+
+
+def record(work: FoldFit, checked: CheckedErrors) -> None:
+    """Add a row to the history."""
     scale = work.net.code.width.flatten().numpy()
     factors = np.array([KINDS[kind].report_factor for kind in work.data.target_kinds])
     factors = np.tile(factors, len(work.data.task.horizons))
-    best = all(validation <= row["validation_loss"] for row in work.history)
+    best = all(checked.validation <= row["validation_loss"] for row in work.history)
     for row in work.history if best else ():
         row["best"] = False
     work.history.append(
         {
-            "epoch": check,
-            "updates": updates,
-            "train_loss": validation if math.isnan(loss) else loss,
-            "validation_loss": validation,
-            "validation_score": absolute,
-            "validation_mae": float(np.mean(each * scale * factors)),
-            "learning_rate": rate,
+            "epoch": checked.check,
+            "updates": checked.updates,
+            "train_loss": checked.validation if math.isnan(checked.loss) else checked.loss,
+            "validation_loss": checked.validation,
+            "validation_score": checked.absolute,
+            "validation_mae": float(np.mean(checked.each * scale * factors)),
+            "learning_rate": checked.rate,
             "seconds": 0.0,
             "best": best,
         }

@@ -7,15 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edp import __version__
-from edp.errors import EdpError
+from edp.errors import DataError, EdpError
 from edp.jobs import Workers
-from edp.jobs.workers import UNITS, WorkUnit, forget_units
+from edp.jobs.packing import pack, unpack
+from edp.jobs.workers import UNITS, UnitResult, WorkUnit, forget_units
 from edp.logs.source import DataSource
 from edp.networks.predictor import describe
 from edp.networks.running import stream_errors
@@ -23,9 +22,20 @@ from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.report.fleet.facts import FleetFacts, fleet_facts
 from edp.report.fleet.page import build_fleet_page
+from edp.report.fleet.result import (
+    ErrorDrift,
+    FleetReport,
+    InputSpread,
+    MachineAlarms,
+    MachineErrors,
+    RecordingError,
+    ReportedMachine,
+    ReportedNetwork,
+    ReportedTarget,
+)
 from edp.signals import KINDS
 from edp.storage import check_writable, read_bytes, write_json
-from edp.storage.ledger import TrainingIdentity
+from edp.storage.ledger import TrainingIdentity, WithState
 from edp.storage.paths import files_below, full_path, status_of
 from edp.training import Bundle, load_bundle
 from edp.training.blas import one_blas_thread
@@ -36,7 +46,6 @@ from edp.workflows.fleet.personal import read_fleet
 from edp.workflows.monitor import run_monitor
 
 RESULT, PAGE = "fleet_report.json", "report.html"
-SCHEMA = 1
 BLOCK_S = 10.0
 """Blocks of which drift is told: longer than a network remembers what it misjudged."""
 LEAST_BLOCKS = 8
@@ -87,29 +96,31 @@ def report_fleet(
     machines_done = progress.stage("machine", len(units))
 
     results = list(workers.map_in_order(units, machines_done, folder / UNITS))
-    pairs = zip(machines, results, strict=True)
-    rows = [{"machine": machine.name, "minutes": machine.minutes, **result.values} for machine, result in pairs]
     task = bundle.task
-    content = {
-        "schema": SCHEMA,
-        "edp": __version__,
-        "network": {"path": str(question.network), "weights": digest, "label": describe(bundle.predictor.spec)},
-        "store": str(question.store),
-        "deltas": None if question.deltas is None else str(question.deltas),
-        "monitor": None if question.monitor is None else str(question.monitor),
-        "horizon": task.horizons[0],
-        "rate_hz": task.rate_hz,
-        "targets": [
-            {"name": name, "unit": KINDS[kind].report_unit}
+    report = FleetReport(
+        network=ReportedNetwork(str(question.network), digest, describe(bundle.predictor.spec)),
+        store=str(question.store),
+        deltas=None if question.deltas is None else str(question.deltas),
+        monitor=None if question.monitor is None else str(question.monitor),
+        horizon=task.horizons[0],
+        rate_hz=task.rate_hz,
+        targets=tuple(
+            ReportedTarget(name, KINDS[kind].report_unit)
             for name, kind in zip(task.targets, bundle.target_kinds, strict=True)
-        ],
-        "machines": rows,
-    }
-    write_json(folder / RESULT, content)
-    facts = fleet_facts(content, full_path(Path(question.store)).name)
+        ),
+        machines=tuple(_reported(machine, result) for machine, result in zip(machines, results, strict=True)),
+    )
+    write_json(folder / RESULT, report.to_json())
+    facts = fleet_facts(report, full_path(Path(question.store)).name)
     build_fleet_page(facts).write(folder / PAGE)
     forget_units(folder / UNITS)
     return facts
+
+
+def _reported(machine: StoredMachine, result: UnitResult) -> ReportedMachine:
+    if result.content is None:
+        return ReportedMachine(machine.name, machine.minutes, failed=str(result.values["failed"]))
+    return ReportedMachine(machine.name, machine.minutes, unpack(result.content, MachineErrors))
 
 
 def _deltas(folder: Path) -> dict[str, Path]:
@@ -147,44 +158,50 @@ def _state_of(folder: Path) -> str:
 
 
 @one_blas_thread()
-def judge_machine(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str, Any]:
-    """Errors, drift, inputs and alarms of one machine."""
-    bundle = _bundle(where["network"], identity.config["weights"])
-    source = MachineSource(Path(where["store"]), machine=identity.config["machine"])
+def judge_machine(identity: TrainingIdentity, where: Mapping[str, str | None]) -> WithState | dict[str, str]:
+    """Return errors, drift, inputs and alarms of one machine, or why it cannot be evaluated."""
+    bundle = _bundle(str(where["network"]), identity.config["weights"])
+    source = MachineSource(Path(str(where["store"])), machine=identity.config["machine"])
     try:
-        return _judged(bundle, source, where)
+        return WithState({}, pack(_errors_of(bundle, source, where)))
     except EdpError as error:
         # A machine with other channels than the network's must not end the fleet's report.
         return {"failed": str(error)}
 
 
-def _judged(bundle: Bundle, source: MachineSource, where: Mapping[str, Any]) -> dict[str, Any]:
+def _errors_of(bundle: Bundle, source: MachineSource, where: Mapping[str, str | None]) -> MachineErrors:
+    """Evaluate a machine.
+
+    Raises:
+        EdpError: its recordings do not go with the network, or are too short.
+    """
     recordings = source.read()
     task, network = bundle.task, bundle.predictor
     series = [task.series(recording) for recording in recordings]
-    if where["delta"] is not None:
-        network = with_delta(network, read_delta(where["delta"]))
+    delta, monitor = where["delta"], where["monitor"]
+    if delta is not None:
+        network = with_delta(network, read_delta(delta))
     factor = np.array([KINDS[kind].report_factor for kind in bundle.target_kinds])
     errors = [np.abs(error) * factor for horizon, error in stream_errors(network, series) if horizon == 0]
     if not errors:
         shortest = task.max_horizon + network.spec.window
-        return {"failed": f"no recording is longer than window and horizon together, {shortest} samples"}
+        raise DataError(f"no recording is longer than window and horizon together, {shortest} samples")
     start, k = network.spec.window, task.horizons[0]
     still = [np.abs(part.targets[start + k :] - part.targets[start : part.samples - k]) * factor for part in series]
     pooled = np.concatenate(errors)
-    return {
-        "mae": float(pooled.mean()),
-        "by_target": [float(value) for value in pooled.mean(axis=0)],
-        "persistence": float(np.concatenate([part for part in still if len(part)]).mean()),
-        "recordings": [{"name": part.name, "mae": float(one.mean())} for part, one in zip(series, errors)],
-        "drift": drift_of(np.concatenate([error.mean(axis=1) for error in errors]), task.rate_hz),
-        "inputs": _inputs(recordings, [channel.name for channel in bundle.inputs]),
-        "own": where["delta"] is not None,
-        "alarms": None if where["monitor"] is None else _alarms(Path(where["monitor"]), source),
-    }
+    return MachineErrors(
+        mae=float(pooled.mean()),
+        by_target=tuple(float(value) for value in pooled.mean(axis=0)),
+        persistence=float(np.concatenate([part for part in still if len(part)]).mean()),
+        recordings=tuple(RecordingError(part.name, float(one.mean())) for part, one in zip(series, errors)),
+        drift=drift_of(np.concatenate([error.mean(axis=1) for error in errors]), task.rate_hz),
+        inputs=_inputs(recordings, [channel.name for channel in bundle.inputs]),
+        own=delta is not None,
+        alarms=None if monitor is None else _alarms(Path(monitor), source),
+    )
 
 
-def drift_of(error: NDArray[np.floating], rate_hz: float) -> dict[str, float] | None:
+def drift_of(error: NDArray[np.floating], rate_hz: float) -> ErrorDrift | None:
     """How the error of the second half of the time stands to that of the first, by blocks.
 
     Args:
@@ -192,7 +209,7 @@ def drift_of(error: NDArray[np.floating], rate_hz: float) -> dict[str, float] | 
         rate_hz: ticks a second.
 
     Returns:
-        ``ratio`` of both means and Welch's ``t`` between the blocks of both; None where there are too few blocks.
+        None where there are too few blocks.
     """
     size = round(BLOCK_S * rate_hz)
     blocks = error[: len(error) // size * size].reshape(-1, size).mean(axis=1)
@@ -202,25 +219,25 @@ def drift_of(error: NDArray[np.floating], rate_hz: float) -> dict[str, float] | 
     first, second = blocks[:half], blocks[half:]
     spread = float(np.sqrt(first.var(ddof=1) / len(first) + second.var(ddof=1) / len(second)))
     difference = float(second.mean() - first.mean())
-    return {"ratio": float(second.mean() / max(first.mean(), 1e-30)), "t": difference / spread if spread else 0.0}
+    return ErrorDrift(float(second.mean() / max(first.mean(), 1e-30)), difference / spread if spread else 0.0)
 
 
-def _inputs(recordings: list[Recording], names: list[str]) -> dict[str, dict[str, float]]:
+def _inputs(recordings: list[Recording], names: list[str]) -> dict[str, InputSpread]:
     """Mean and deviation of each input, SI units."""
     values = np.concatenate([recording.select(names) for recording in recordings]).astype(np.float64)
     means, spreads = values.mean(axis=0), values.std(axis=0)
-    return {name: {"mean": float(m), "std": float(s)} for name, m, s in zip(names, means, spreads, strict=True)}
+    return {name: InputSpread(float(m), float(s)) for name, m, s in zip(names, means, spreads, strict=True)}
 
 
-def _alarms(monitor: Path, source: DataSource) -> dict[str, Any]:
+def _alarms(monitor: Path, source: DataSource) -> MachineAlarms:
     """How many changes a monitor told of, and the first of them; or why it could not watch."""
     try:
         watched = run_monitor(monitor, source)
     except EdpError as error:
-        return {"failed": str(error)}
+        return MachineAlarms(failed=str(error))
     changes = watched.changes
-    first = [same[0].sentence for same in changes[:3]]
-    return {"changes": len(changes), "alarms": len(watched.alarms), "hours": watched.hours, "first": first}
+    first = tuple(same[0].sentence for same in changes[:3])
+    return MachineAlarms(len(changes), len(watched.alarms), watched.hours, first)
 
 
 @lru_cache(maxsize=1)

@@ -105,25 +105,29 @@ class SearchContext:
         # The mask is made for all runs up to the last, since folds of a run depend on those before it.
         mask = self.folds(max(runs) + 1)
         names = np.array(self.development)
-        return [
-            TrainingRequest(
-                settings,
-                self.source,
-                tuple(names[~mask[run]].tolist()),
-                tuple(names[mask[run]].tolist()),
-                # A seed a run and not an arm: common random numbers make differences between arms smaller.
-                self.seed("run", run, seed),
-                self.spec.updates,
-                **self.several(tuple(names[mask[run]].tolist())),
-            )
-            for run in runs
-        ]
+        requests = []
+        for run in runs:
+            train, judged = (tuple(names[rows].tolist()) for rows in (~mask[run], mask[run]))
+            # A seed a run and not an arm: common random numbers make differences between arms smaller.
+            seed_of_run = self.seed("run", run, seed)
+            requests.append(self.order(settings, train, judged, seed_of_run, self.spec.updates, judged))
+        return requests
 
-    def several(self, validation: tuple[str, ...]) -> Table:
-        """What an order of several epochs says beside; nothing of one epoch."""
+    def order(
+        self,
+        settings: Table,
+        train: tuple[str, ...],
+        judged: tuple[str, ...],
+        seed: int,
+        updates: int,
+        validation: tuple[str, ...],
+    ) -> TrainingRequest:
+        """Order a training; sessions of `validation` choose the best of several epochs, and nothing of one."""
+        sessions = (settings, self.source, train, judged)
         if self.spec.epochs == 1:
-            return {}
-        return {"epochs": self.spec.epochs, "patience": self.spec.patience, "validation": validation}
+            return TrainingRequest(*sessions, seed, updates)
+        epochs, patience = self.spec.epochs, self.spec.patience
+        return TrainingRequest(*sessions, seed, updates, epochs=epochs, patience=patience, validation=validation)
 
     def seed(self, *parts: object) -> int:
         """A seed of its own for each purpose, from the root."""

@@ -32,8 +32,8 @@ class Module:
     """
 
     title: str
-    change: Mapping[str, Any] = field(default_factory=dict)
-    block: Mapping[str, Any] | None = None
+    change: Table = field(default_factory=dict)
+    block: Table | None = None
     options: Mapping[str, Sequence[Any]] = field(default_factory=dict)
     alter: Callable[[Table], None] | None = None
 
@@ -89,7 +89,7 @@ def _block(name: str, title: str, **fixed: Any) -> None:
 
 
 def _change(
-    name: str, title: str, part: str, change: Mapping[str, Any], options: Mapping[str, Sequence[Any]] | None = None
+    name: str, title: str, part: str, change: Table, options: Mapping[str, Sequence[Any]] | None = None
 ) -> None:
     placed = {f"model.{part}.{key}": values for key, values in (options or {}).items()}
     THESIS_MODULES.register(name)(Module(title, {"model": {part: change}}, options=placed))
@@ -319,7 +319,7 @@ def _added(settings: Table, names: set[str]) -> Table:
     return changed_settings
 
 
-def _leaves(table: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+def _leaves(table: Mapping[str, object], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
     for key, value in table.items():
         if isinstance(value, Mapping):
             yield from _leaves(value, (*path, key))

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from edp.config.experiment import Experiment, experiment_toml
 from edp.data.frozen import ByFrozen, Session
@@ -24,7 +23,7 @@ from edp.workflows.compression.pipeline import TEACHER
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.phases.compression import NAME
 from edp.workflows.search.smaller import Recipe, network_of
-from edp.workflows.search.trainings import TrainingRequest, experiment_of
+from edp.workflows.search.trainings import Outcome, experiment_of
 
 FOLDER, CHOSEN = "networks", "chosen"
 
@@ -37,31 +36,11 @@ def frozen_split(folder: Path, context: SearchContext, digests: Mapping[str, str
         context: with the sessions set apart.
         digests: of all sessions by name.
     """
-
-    def known(names: tuple[str, ...]) -> tuple[Session, ...]:
-        return tuple(Session(name=name, digest=digests[name]) for name in names)
-
-    return ByFrozen(
-        test=known(context.test),
-        second=known(context.second),
-        validation=known(context.validation),
-        train=known(context.training),
-        study=str(full_path(folder)),
+    parts = (context.test, context.second, context.validation, context.training)
+    test, second, validation, train = (
+        tuple(Session(name=name, digest=digests[name]) for name in names) for names in parts
     )
-
-
-def network_name(order: TrainingRequest) -> str:
-    """``teacher`` for the teacher in single precision, else ``chosen``."""
-    recipe = Recipe.from_json(order.recipe or {})
-    return TEACHER if (recipe.units, recipe.final) == (None, "float32") else CHOSEN
-
-
-@dataclass(frozen=True)
-class JudgedNetwork:
-    """A network that was judged on the second sealed test set: what was ordered, and the record's result."""
-
-    order: TrainingRequest
-    result: Mapping[str, Any]
+    return ByFrozen(test=test, second=second, validation=validation, train=train, study=str(full_path(folder)))
 
 
 def write_networks(
@@ -69,7 +48,7 @@ def write_networks(
     source: DataSource,
     context: SearchContext,
     split: ByFrozen,
-    networks: Mapping[str, JudgedNetwork],
+    outcomes: Sequence[Outcome],
 ) -> dict[str, Path]:
     """Write the networks that were judged on the second sealed test set as runs, once phase 6 has decided.
 
@@ -78,7 +57,7 @@ def write_networks(
         source: where the recordings are.
         context: with the decisions.
         split: of the runs.
-        networks: by name.
+        outcomes: of the trainings that were evaluated there.
 
     Returns:
         Folder of each run; none before phase 6 has decided. Without one of its own the chosen network is the teacher.
@@ -86,18 +65,19 @@ def write_networks(
     Raises:
         EdpError: recordings that cannot be read any more, or a folder that cannot be written.
     """
-    if NAME not in context.decided or not networks:
+    if NAME not in context.decided or not outcomes:
         return {}
     recordings = source.read()
     written: dict[str, Path] = {}
-    for name, judged in networks.items():
-        recipe = Recipe.from_json(judged.order.recipe or {})
-        experiment = replace(recipe.experiment(experiment_of(judged.order)), split=split)
+    for outcome in outcomes:
+        recipe = Recipe.from_json(outcome.order.recipe or {})
+        name = TEACHER if (recipe.units, recipe.final) == (None, "float32") else CHOSEN
+        experiment = replace(recipe.experiment(experiment_of(outcome.order)), split=split)
         first = recordings[0]
         task = experiment.task.resolve(first.rate_hz, first.channel_names, experiment.model.physics)
         # Scaling follows from the training sessions, not from the second test set.
         data = prepare(recordings, task, split, experiment.model.window)
-        network = network_of(judged.result["weights"], task, experiment.model)
+        network = network_of((outcome.result or {})["weights"], task, experiment.model)
         written[name] = folder / FOLDER / name
         _write_run(written[name], network, experiment, data, _provenance(source, experiment, data, recipe))
     return written

@@ -164,7 +164,7 @@ def _spec(table: Table, where: str) -> SearchSpec:
 
 
 def space_of(
-    table: Mapping[str, Any], over: Space | None = None, where: str = "of a study", key: str = "space"
+    table: Table, over: Space | None = None, where: str = "of a study", key: str = "space"
 ) -> dict[str, Range]:
     """A space from its form in a settings file, laid over another one; `key` is its name there.
 

@@ -29,12 +29,12 @@ from edp.storage.portable import cores
 from edp.wording import typed
 from edp.workflows.search.context import SearchContext, is_enough, set_apart
 from edp.workflows.search.engine import Dispatcher, run_phases
-from edp.workflows.search.networks import JudgedNetwork, frozen_split, network_name, write_networks
+from edp.workflows.search.networks import frozen_split, write_networks
 from edp.workflows.search.phases import PHASES
 from edp.workflows.search.plan import SearchPlan, plain_spec
 from edp.workflows.search.sessions import SESSIONS_FILE, divide_logs
 from edp.workflows.search.study_log import StudyLog
-from edp.workflows.search.trainings import TrainingRequest, settings_of
+from edp.workflows.search.trainings import Outcome, TrainingRequest, settings_of
 
 TEST_SET = "test sessions"
 TEACHER = "teacher.toml"
@@ -191,7 +191,7 @@ def run_search(
             study_log.openings = ledger.openings()
             study_log.end(state)
         split = frozen_split(target, context, data.digests)
-        networks = write_networks(target, source, context, split, observer.judged_networks)
+        networks = write_networks(target, source, context, split, list(observer.second.values()))
         teacher = _write_teacher(target, context, split)
         return SearchResult(target, context, state, ledger.digest(), study_log.trained, source, teacher, networks)
 
@@ -235,13 +235,13 @@ class _Observer:
     """Passes on what happens, and opens a sealed test set when a batch is to be judged on its sessions.
 
     Attributes:
-        judged_networks: networks that were judged on the second test set, by name: order and result.
+        second: outcomes of trainings that were evaluated on the second test set, by key.
     """
 
     def __init__(self, ledger: Ledger, study_log: StudyLog, context: SearchContext, progress: Progress) -> None:
         self.ledger, self.study_log, self.context = ledger, study_log, context
         self.progress = self.stage = progress
-        self.judged_networks: dict[str, JudgedNetwork] = {}
+        self.second: dict[str, Outcome] = {}
 
     def on_phase(self, name: str, context: SearchContext) -> None:
         self.study_log.on_phase(name, context)
@@ -274,7 +274,7 @@ class _Observer:
 
     def on_record(self, record: Record, order: TrainingRequest, trained: bool) -> None:
         if record.result is not None and set(order.judged) & set(self.context.second):
-            self.judged_networks[network_name(order)] = JudgedNetwork(order, record.result)
+            self.second[record.key] = Outcome.of(order, record)
         self.study_log.on_record(record, order, trained)
         self.study_log.report(self.stage)
 

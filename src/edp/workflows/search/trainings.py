@@ -107,23 +107,8 @@ class TrainingRequest:
 
     def to_json(self) -> Table:
         """Plain values, from which `from_json` makes the same order."""
-        return {
-            "settings": self.settings,
-            "source": dict(self.source),
-            "train": list(self.train),
-            "judged": list(self.judged),
-            "seed": self.seed,
-            "updates": self.updates,
-            "until": self.until,
-            "stops": list(self.stops),
-            **({} if self.recipe is None else {"recipe": self.recipe}),
-        } | self.several()
-
-    def several(self) -> Table:
-        """What is said of a training of several epochs, plain; nothing of one epoch, whose keys stay what they were."""
-        if self.epochs == 1:
-            return {}
-        return {"epochs": self.epochs, "patience": self.patience, "validation": list(self.validation)}
+        plain: Table = plain_tree(self)
+        return plain
 
     @staticmethod
     def from_json(plain: Table) -> TrainingRequest:

@@ -2,7 +2,16 @@
 
 from edp.workflows.twin.forecast_logs import ForecastLogs, forecast_logs
 from edp.workflows.twin.judge_twin import evaluate_twin
-from edp.workflows.twin.rollout import Rollout, rollout_log
+from edp.workflows.twin.rollout import Rollout, RolloutRequest, rollout_log
 from edp.workflows.twin.train_twin import TrainedTwin, train_twin
 
-__all__ = ["ForecastLogs", "Rollout", "TrainedTwin", "evaluate_twin", "forecast_logs", "rollout_log", "train_twin"]
+__all__ = [
+    "ForecastLogs",
+    "Rollout",
+    "RolloutRequest",
+    "TrainedTwin",
+    "evaluate_twin",
+    "forecast_logs",
+    "rollout_log",
+    "train_twin",
+]

@@ -53,27 +53,34 @@ class Rollout:
     beyond: Mapping[str, CommandExcess]
 
 
-def rollout_log(
-    run: str | Path,
-    source: DataSource,
-    seconds: float = 60.0,
-    start_s: float | None = None,
-    measured: Sequence[str] = (),
-    out: str | Path | None = None,
-    plots: str | Path | None = None,
-    page: str | Path | None = None,
-) -> Rollout:
-    """Let the twin of a run answer the commands of a log.
+@dataclass(frozen=True, kw_only=True)
+class RolloutRequest:
+    """Part of a log that a twin runs along, and files of the result.
 
-    Args:
-        run: run folder of a twin.
-        source: one log; without a map it is read with that of the run.
+    Attributes:
         seconds: length of the free run.
         start_s: its start in the log; None: as early as the prefix allows.
         measured: channels that stay measured throughout (mixed mode).
         out: file for `Rollout.recording`; its ending chooses the format.
         plots: folder for plots of it.
         page: file for a page of it (HTML).
+    """
+
+    seconds: float = 60.0
+    start_s: float | None = None
+    measured: Sequence[str] = ()
+    out: str | Path | None = None
+    plots: str | Path | None = None
+    page: str | Path | None = None
+
+
+def rollout_log(run: str | Path, source: DataSource, request: RolloutRequest) -> Rollout:
+    """Simulate the twin of a run along the commands of a log.
+
+    Args:
+        run: run folder of a twin.
+        source: one log; without a map it is read with that of the run.
+        request: part of the log, and files to write.
 
     Raises:
         EdpError: several logs, another rate or kind, times outside the log, or a channel that the twin does not answer.
@@ -81,9 +88,9 @@ def rollout_log(
     bundle = load_twin(run)
     twin = bundle.twin
     recording = matched(twin.channels, _only(read_as_before(source, bundle.provenance.origin.reader).read()))
-    measured_columns = _columns(twin, measured)
+    measured_columns = _columns(twin, request.measured)
     series = twin.channels.task().series(recording)
-    start, ticks = _span(twin, recording, seconds, start_s)
+    start, ticks = _span(twin, recording, request.seconds, request.start_s)
     first = start - twin.prefix_ticks
     commands, truth = series.inputs[None, first : start + ticks], series.targets[None, first : start + ticks + 1]
     prefix = twin.prefix_ticks
@@ -94,7 +101,7 @@ def rollout_log(
     answers, _ = twin.rollout(commands[:, prefix:], state, ports)
     runs = runs_of(twin, (recording.name,), answers, truth[:, prefix:])
     spec = FreeRunJudgeSpec()
-    at_s = sorted({*(at for at in spec.at_s if at < seconds), ticks / twin.channels.rate_hz})
+    at_s = sorted({*(at for at in spec.at_s if at < request.seconds), ticks / twin.channels.rate_hz})
     # Intervals are calibrated on runs in which every port is free; a measured one would make them wrong, not narrow.
     intervals = None if measured_columns else bundle.intervals
     half = None if intervals is None else intervals.at(np.arange(1, ticks + 1)).astype(np.float32)
@@ -106,14 +113,14 @@ def rollout_log(
         None if intervals is None else intervals.ticks[-1] / recording.rate_hz,
         commands_beyond(bundle.provenance.more.get(RANGES), twin.channels, [commands[0, prefix:]]),
     )
-    if out is not None:
-        write_recording(result.recording, out)
-    if plots is not None:
-        write_rollout_plots(result.recording, FREE, (start + 1) / recording.rate_hz, plots)
-    if page is not None:
+    if request.out is not None:
+        write_recording(result.recording, request.out)
+    if request.plots is not None:
+        write_rollout_plots(result.recording, FREE, (start + 1) / recording.rate_hz, request.plots)
+    if request.page is not None:
         content = FreeRunFile(channels=reported_channels(twin.channels), models={TWIN: result.scores})
         title = f"{recording.name} from {typed(result.start_s)} s"
-        build_twin_page(FreeRunFacts(title, content, shown_runs(runs, intervals))).write(page)
+        build_twin_page(FreeRunFacts(title, content, shown_runs(runs, intervals))).write(request.page)
     return result
 
 

@@ -159,16 +159,10 @@ def recipe_of(context: SearchContext, order: CompressionRequest | None = None) -
 
 def order_of(context: SearchContext, settings: Table, recipe: Recipe, judged: Sequence[str] = ()) -> TrainingRequest:
     """The order that makes a network of a recipe and judges it, by default on the sessions that compare."""
-    return TrainingRequest(
-        settings,
-        context.source,
-        context.training,
-        tuple(judged) or context.validation,
-        context.seed(NAME),
-        context.spec.final_updates,
-        recipe=recipe.to_json(),
-        **context.several(context.validation),
-    )
+    validation, updates = context.validation, context.spec.final_updates
+    sessions = tuple(judged) or validation
+    order = context.order(settings, context.training, sessions, context.seed(NAME), updates, validation)
+    return replace(order, recipe=recipe.to_json())
 
 
 def plan_of(context: SearchContext, settings: Table) -> CompressionPlan:

@@ -15,9 +15,10 @@ from edp.wording import percent, typed
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.modules import fitting, options_of, title_of
 from edp.workflows.search.phases.base import PHASES, Course, relative_change
-from edp.workflows.search.phases.joint import JointStart, ask_together, winner_of
+from edp.workflows.search.phases.joint import ask_together, winner_of
 from edp.workflows.search.phases.screening import baseline_of
 from edp.workflows.search.space import Value
+from edp.workflows.search.study import Trial
 from edp.workflows.search.trainings import Outcome
 
 
@@ -37,7 +38,7 @@ class Exploration:
         free = fitting(base, context.channels, spec.modules)
         earlier = context.facts(SynthesisFacts)
         # The winner of phase 4 is the warm start: phase 5 is to find at least that.
-        starts = [JointStart(earlier.values, earlier.modules)]
+        starts = [Trial(0, earlier.values, earlier.modules)]
         options = {name: options_of(base, name, context.shaped) for name in free}
         switches = [*free, *spec.toggles]
         answers = yield from ask_together(context, "exploration", switches, spec.free_trials, starts, options)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from edp.config.experiment import Table
 from edp.errors import DataError, count_of
@@ -20,20 +20,12 @@ from edp.workflows.search.trainings import Outcome, TrainingRequest
 Asked = Generator[list[TrainingRequest], list[Outcome], list[Trial]]
 
 
-@dataclass(frozen=True)
-class JointStart:
-    """A warm start: values, and the modules that are on."""
-
-    values: Candidate
-    modules: Sequence[str]
-
-
 def ask_together(
     context: SearchContext,
     name: str,
     modules: Sequence[str],
     trials: int,
-    starts: Sequence[JointStart],
+    starts: Sequence[Trial],
     options: Mapping[str, Mapping[str, Choice]] | None = None,
 ) -> Asked:
     """Questions about modules on or off, rates inside the window and what was deferred, with warm starts first.

@@ -51,7 +51,7 @@ def _sound(context: SearchContext) -> Decision:
         sentences.append(
             f"{count_of(runs, 'run')} are made nevertheless; effects below what they can show will be missed."
         )
-    return Decision("planning", SoundPlanning.from_plan(plan, runs), tuple(sentences))
+    return Decision("planning", SoundPlanning(**{**vars(plan), "runs": runs, "enough": plan.runs}), tuple(sentences))
 
 
 def _thesis(context: SearchContext) -> Decision:

@@ -14,8 +14,9 @@ from edp.wording import behind, percent, typed
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.modules import title_of
 from edp.workflows.search.phases.base import PHASES, Course, relative_change
-from edp.workflows.search.phases.joint import JointStart, ask_together, winner_of
+from edp.workflows.search.phases.joint import ask_together, winner_of
 from edp.workflows.search.phases.screening import baseline_of
+from edp.workflows.search.study import Trial
 from edp.workflows.search.trainings import SCORES, Outcome, TrainingRequest
 
 
@@ -34,7 +35,7 @@ class Synthesis:
         switches = [*confirmed, *context.spec.toggles]
         base, values, _ = baseline_of(context)
         # All confirmed modules, and none of them: the sampler begins with both ends.
-        starts = [JointStart(values, modules) for modules in ([confirmed, []] if confirmed else [[]])]
+        starts = [Trial(0, values, tuple(modules)) for modules in ([confirmed, []] if confirmed else [[]])]
         if context.spec.mode == "thesis":  # whose phase 4 has no warm start (3.3.5)
             starts = []
         answers = yield from ask_together(context, "synthesis", switches, context.spec.joint_trials, starts)
@@ -79,16 +80,9 @@ def final_orders(context: SearchContext, settings: Table) -> list[TrainingReques
         # With several epochs the sessions of a fold choose the best epoch; test sessions never do.
         first = context.orders(settings, [0])[0]
         train, validation = first.train, first.judged
+    updates = context.spec.final_updates
     return [
-        TrainingRequest(
-            settings,
-            context.source,
-            train,
-            context.test,
-            context.seed("final", seed),
-            context.spec.final_updates,
-            **context.several(validation),
-        )
+        context.order(settings, train, context.test, context.seed("final", seed), updates, validation)
         for seed in range(context.spec.run_seeds)
     ]
 
