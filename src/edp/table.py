@@ -20,7 +20,7 @@ def plainly(value: Value) -> str:
 
 
 def figures(values: Iterable[Value], signed: bool = False, decimals: int | None = None) -> Show:
-    """Return a function that shows the numbers of one column with one precision.
+    """Return a function that formats the numbers of one column with a common precision.
 
     Args:
         values: the column, whose smallest number sets the decimals.
@@ -111,7 +111,7 @@ class Table:
         return "\n".join(lines) + "\n"
 
     def csv(self) -> str:
-        """Return the table as CSV with full precision; cells without a value are empty, and text is no formula."""
+        """Return the table as CSV in full precision; missing cells are empty, and formulas are escaped."""
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(map(in_cell, self.heads()))

@@ -1,1 +1,1 @@
-"""Judging: held-out scores beside baselines, and what a predictor costs."""
+"""Evaluation: scores on held-out recordings compared with baselines, and the cost of a predictor."""

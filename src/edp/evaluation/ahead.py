@@ -1,4 +1,4 @@
-"""A few ticks ahead of measured ports, told the commands in between: a twin as predictor, beside other networks."""
+"""k-step-ahead evaluation of a twin with measured ports and given commands, compared with other predictors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ EACH = 200
 
 @dataclass(frozen=True, eq=False)
 class Ahead:
-    """What a twin answered some ticks ahead, and what was measured then.
+    """k-step-ahead outputs of a twin and the corresponding measurements.
 
     Attributes:
         channels: of the twin.
@@ -40,7 +40,7 @@ class Ahead:
 
 
 def look_ahead(twin: Twin, series: Sequence[Series], ticks: int, first: int = 0) -> Ahead:
-    """Let a twin answer `ticks` ahead of evenly spread moments, measured up to each and told the commands after it.
+    """Predict `ticks` samples ahead from evenly spaced samples, measured up to each, with given later commands.
 
     Args:
         twin: any formulation.

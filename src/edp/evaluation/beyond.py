@@ -1,4 +1,4 @@
-"""Commands beyond those that taught a twin: its errors and intervals there were never compared with anything."""
+"""Detection of commands outside a twin's training range, where its errors and intervals have not been validated."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def commands_beyond(ranges: Any, channels: TwinChannels, inputs: Sequence[NDArra
 
 
 def _ends(value: Any) -> tuple[float, float] | None:
-    """Two finite numbers that do not fall; None: something else."""
+    """Return two finite ascending numbers; None for any other value."""
     if not isinstance(value, list) or len(value) != 2:
         return None
     if not all(isinstance(end, int | float) and math.isfinite(end) for end in value) or value[0] > value[1]:
@@ -72,7 +72,7 @@ def _ends(value: Any) -> tuple[float, float] | None:
 
 
 def beyond_sentence(beyond: Mapping[str, CommandExcess]) -> str:
-    """What a person must know before they trust errors and intervals there; empty where nothing is beyond."""
+    """Return a warning about errors and intervals outside the training range; empty if there is no excess."""
     if not beyond:
         return ""
     listed = ", ".join(

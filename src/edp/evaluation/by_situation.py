@@ -1,4 +1,4 @@
-"""Errors by what the axes did: at rest, starting, stopping, reversing, fast, at a stop, with the lever released."""
+"""Errors by motion of the axes: steady, starting, stopping, reversing, fast, at an end stop, lever released."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ FASTEST = 0.995
 
 @dataclass(frozen=True)
 class SeenAxis:
-    """What inputs show of the axis of a target.
+    """Inputs that describe the axis of a target.
 
     Attributes:
         target: its column among the targets.
@@ -65,7 +65,7 @@ class Situations:
         self.axes = _seen_axes(data)
 
     def of(self, series: Series, horizon: int, ticks: int) -> list[tuple[int, Mapping[str, Ticks]]]:
-        """By axis its column among the targets, and for each situation where it holds, ``(ticks,)``.
+        """Return per axis its target column and a mask ``(ticks,)`` of each situation.
 
         Args:
             series: measured inputs and targets.
@@ -131,7 +131,7 @@ def _fastest(parts: Sequence[Series], column: int) -> float:
 
 
 def _range(data: Prepared, stroke: str, kind: Kind, parts: Sequence[Series]) -> tuple[int, float, float] | None:
-    """Column and range of a position; None where it is none of the velocity's, or never moves."""
+    """Return column and range of a position; None if it does not belong to the velocity or never moves."""
     places = [n for n, channel in enumerate(data.inputs) if channel.name == stroke and channel.kind is INTEGRAL[kind]]
     if not places:
         return None
@@ -181,7 +181,7 @@ class SituationTally:
         self.seen |= state["seen"]
 
     def rows(self) -> tuple[SituationErrors, ...]:
-        """By situation that occurs: ticks, shares of the time and of the error (means over the axes), error by target.
+        """Return one row per occurring situation: samples, fractions of time and error, error by target.
 
         The error of a target is None where the situation never occurs or cannot be told.
         """

@@ -38,7 +38,7 @@ COVERAGE = 0.95
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelImportanceSpec:
-    """How channels are taken away.
+    """Settings for removing channels.
 
     Attributes:
         repeats: exchanges of each group, each with other recordings.
@@ -75,7 +75,7 @@ class ChannelImportanceSpec:
 
 @dataclass(frozen=True)
 class Growth:
-    """Growth of the mean absolute error, in the target's report unit, with its 95 % interval over stretches."""
+    """Increase of the mean absolute error, in the target's report unit, with its 95 % interval over segments."""
 
     mean: float
     low: float
@@ -105,7 +105,7 @@ class ChannelImportance:
 
 @dataclass(frozen=True)
 class ChannelImportances:
-    """All of them, with the error that they are compared with.
+    """Importances of all channels with the reference error.
 
     Attributes:
         rows: by group, horizon and target; the mean of the targets first.
@@ -186,7 +186,7 @@ def _groups(inputs: Sequence[str], asked_groups: Sequence[Sequence[str]]) -> lis
 
 @dataclass(frozen=True)
 class _Donor:
-    """Where a recording's new course comes from: which recording, from which row on, going round at its end."""
+    """Source of a recording's replacement values: another recording and its first row, cyclic."""
 
     recording: int
     start: int
@@ -209,7 +209,7 @@ def _donors(series: Sequence[Series], rng: np.random.Generator) -> list[_Donor]:
 def _exchanged(
     series: Sequence[Series], columns: Sequence[int], base: Sequence[NDArray[np.float32]], donors: Sequence[_Donor]
 ) -> list[Series]:
-    """The series with `columns` as `base` says and, above that, what lies above it in the donor."""
+    """Return the series with `columns` replaced by `base` plus the donor's deviation from its own base."""
     changed = []
     for part, own, donor in zip(series, base, donors, strict=True):
         rows = (np.arange(part.samples) + donor.start) % series[donor.recording].samples
@@ -221,7 +221,7 @@ def _exchanged(
 
 
 class _Ruler:
-    """Mean absolute errors by stretch, horizon and target, in report units."""
+    """Mean absolute errors by segment, horizon and target, in report units."""
 
     def __init__(self, data: Prepared, skip: int) -> None:
         self.task, self.data = data.task, data
@@ -240,7 +240,7 @@ class _Ruler:
         self.weights = np.array([b - a for _, a, b in self.stretches], dtype=float)
 
     def errors(self, predictions: Sequence[NDArray[np.float32]]) -> Array:
-        """Shape ``(stretch, horizon, 1 + target)``; the mean of the targets first."""
+        """Return the errors, shape ``(stretch, horizon, 1 + target)``, with the mean over targets first."""
         errors = np.empty((len(self.stretches), len(self.task.horizons), len(self.task.targets)))
         for n, (i, start, stop) in enumerate(self.stretches):
             for h, horizon in enumerate(self.task.horizons):
@@ -251,7 +251,7 @@ class _Ruler:
     def rows(
         self, members: tuple[str, ...], exchanged: Array, renewed: Array, explained: float
     ) -> list[ChannelImportance]:
-        """A row for each horizon and target from growths by stretch."""
+        """Return one row per horizon and target from the increases by segment."""
         return [
             ChannelImportance(
                 members, horizon, name, self._growth(exchanged[:, h, n]), self._growth(renewed[:, h, n]), explained

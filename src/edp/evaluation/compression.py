@@ -47,7 +47,7 @@ class CompressedRow:
 
     @property
     def costs(self) -> tuple[float, int, int]:
-        """Error, cycles (high estimate) and bytes of parameters: what a choice compares, in this order."""
+        """Error, cycles (high estimate) and bytes of parameters, the criteria of a choice in this order."""
         return self.error, self.resource_usage.cycles[2], self.resource_usage.parameter_bytes
 
 
@@ -82,7 +82,7 @@ class ComparedTask:
 
 @dataclass(frozen=True)
 class RecordingCounts:
-    """Number of recordings of each part; `test` counts those of the sealed test set."""
+    """Number of recordings of each part; `test` is the sealed test set."""
 
     train: int
     validation: int

@@ -1,4 +1,4 @@
-"""What the other channels, now and before, tell of a channel: one ridge regression for every choice of channels."""
+"""Conditional expectation of channels given the others, present and past: one ridge regression for any groups."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class OthersModel:
 
     @staticmethod
     def fit(parts: Sequence[NDArray[np.float32]], lags: Sequence[int], rows: int) -> OthersModel:
-        """From stretches of inputs, each ``(time, channel)``, thinned evenly to about `rows` rows."""
+        """Fit to segments of inputs, each ``(time, channel)``, thinned evenly to about `rows` rows."""
         total = sum(len(part) for part in parts)
         # Neighbouring rows of a 100 Hz log are nearly equal; thinning costs no information.
         every = max(1, total // rows)
@@ -77,7 +77,7 @@ class OthersModel:
     def expect(
         self, groups: Sequence[Sequence[int]], parts: Sequence[NDArray[np.float32]]
     ) -> tuple[list[list[NDArray[np.float32]]], list[float]]:
-        """What the channels outside of each group tell of its members, and how much of their variance that is.
+        """Return the expectation of each group's members given the other channels, and the explained variance fraction.
 
         Args:
             groups: channels that are estimated together, none of them from another of them.
@@ -103,7 +103,7 @@ class OthersModel:
         return [[values[:, span] for values in expected] for span in spans], [share for _, share in settled]
 
     def _weights(self, group: Sequence[int]) -> tuple[Array, float]:
-        """Weights, shape ``(term, member)``, zero for the group itself; and the explained share of variance."""
+        """Return weights, shape ``(term, member)``, zero for the group itself; and the explained variance fraction."""
         members = np.array([self._present(column) for column in group])
         weights = np.zeros((len(self.owner), len(group)))
         outside_terms = np.flatnonzero(~np.isin(self.owner, group))
@@ -124,7 +124,7 @@ class OthersModel:
 
 
 def collinear(parts: Sequence[NDArray[np.float32]], least: float = 0.9, rows: int = 20_000) -> list[list[int]]:
-    """Groups of channels, two or more, of which every two have at least this absolute rank correlation.
+    """Return groups of two or more channels with at least this absolute rank correlation between every pair.
 
     Args:
         parts: stretches, each ``(time, channel)``.

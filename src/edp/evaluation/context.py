@@ -1,4 +1,4 @@
-"""Value of memory: the error at the same ticks after a reset so many seconds before them."""
+"""Value of memory: the error at the same samples as a function of the time since the last reset."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a controller grants, and what a network is estimated to take of it: cycles, flash and memory."""
+"""Controller budgets, and estimates of the cycles, flash and memory of a network."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class LimitCheck:
 
 @dataclass(frozen=True)
 class ProcessorCore:
-    """A processor core, by its cycles against those of a Cortex-M4F.
+    """Processor core with its cycle counts relative to a Cortex-M4F.
 
     Attributes:
         label: how tables call it.
@@ -94,7 +94,7 @@ CORES = {
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """What a controller grants (thesis 3.5.2 by default).
+    """Resource limits of the target controller (default: thesis, section 3.5.2).
 
     Attributes:
         name: how reports call it.
@@ -124,7 +124,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class ResourceUsage:
-    """What a network takes of a controller in one format; cycles, memory beside weights and program are estimates.
+    """Resource usage of a network in one format; cycles and memory other than weights and program are estimates.
 
     Attributes:
         parameters: trainable numbers, after folding.
@@ -145,7 +145,7 @@ class ResourceUsage:
     flash_bytes: int
 
     def over(self, budget: Budget) -> dict[str, tuple[int, int]]:
-        """Limits that are exceeded: what is taken, and what is granted."""
+        """Return the exceeded limits with usage and limit."""
         # The high estimate of cycles decides: a deadline that is missed at times is missed.
         pairs = {
             "cycles": (self.cycles[2], budget.cycles),
@@ -160,7 +160,7 @@ BUDGET_FILE = SettingsTree(what="budget")
 
 
 def load_budget(path: str | Path) -> Budget:
-    """A budget from a TOML file with the fields of `Budget`; what is left out is as in the thesis.
+    """Load a budget from a TOML file with the fields of `Budget`; missing fields are as in the thesis.
 
     Raises:
         ConfigError: the file cannot be read, or holds something else than a budget.
@@ -171,7 +171,7 @@ def load_budget(path: str | Path) -> Budget:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a network takes as a stream, in one number format, as its exported C code.
+    """Estimated resource usage of a network as a stream, in one number format, as exported C code.
 
     Bytes of constants are counted and are those of the compiled code; the others are estimates, not measurements.
 

@@ -1,4 +1,4 @@
-"""What a predictor costs to store and run, counted analytically, and held against a controller's budget."""
+"""Cost of storing and running a predictor, counted analytically and compared with a controller's budget."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Footprint:
     refused: dict[str, str]
 
     def estimate(self, number_format: str) -> Estimate:
-        """The one of a number format.
+        """Return the estimate of a number format.
 
         Raises:
             ExportError: the network has no form in it.
@@ -86,7 +86,7 @@ class Footprint:
         return plain | {"budget": asdict(budget), "verdict": plain_value(self.verdict(budget))}
 
     def verdict(self, budget: Budget) -> list[LimitCheck]:
-        """Compare the network with each limit."""
+        """Return one row per limit: value, limit, unit, whether it fits, and the meaning of the figure."""
         bound = "a lower bound: at least one cycle per MAC on a scalar core"
         rows = [("cycles per prediction, windowed", self.macs_window, budget.cycles, "cycles", bound)]
         for entry in self.estimates:
@@ -104,7 +104,7 @@ class Footprint:
 
 
 def footprint(predictor: Predictor, adaptation: Adaptation | None = None) -> Footprint:
-    """Count a predictor's parameters, multiply-accumulates, activations and state, those of its adaptation included."""
+    """Count a predictor's parameters, multiply-accumulates, activations and state, including its adaptation."""
     costs, window = predictor.costs(), predictor.spec.window
     state = state_numbers(predictor.initial_state(1, torch.zeros(1)))
     if adaptation is not None:
@@ -131,13 +131,13 @@ def footprint(predictor: Predictor, adaptation: Adaptation | None = None) -> Foo
 
 
 def parameters_and_macs(costs: Sequence[Cost]) -> tuple[int, int]:
-    """Trainable numbers as stored, and multiply-accumulates of one tick of the stream, of the parts alone."""
+    """Return the stored trainable parameters, and the multiply-accumulates per stream sample of the parts alone."""
     macs = sum(cost.per_column + cost.per_prediction + cost.pooling for cost in costs)
     return sum(cost.parameters for cost in costs), macs
 
 
 def _sizes(predictor: Predictor, adaptation: Adaptation | None) -> tuple[dict[str, Sizes], dict[str, str]]:
-    """Sizes by number format, and why there are none."""
+    """Return the sizes by number format, and the reasons for missing formats."""
     sizes: dict[str, Sizes] = {}
     refused: dict[str, str] = {}
     for name, in_format in GRAPHS.items():
@@ -150,7 +150,7 @@ def _sizes(predictor: Predictor, adaptation: Adaptation | None) -> tuple[dict[st
 
 
 def adaptation_cost(adaptation: Adaptation) -> Cost:
-    """What an adaptation costs: constants, and multiply-accumulates of a tick that learns."""
+    """Return the cost of an adaptation: constants, and multiply-accumulates of a learning sample."""
     constants = sum(values.size for values in adaptation.arrays().values()) + adaptation.dead_zone.size
     return Cost(
         f"adaptation, {adaptation.features} features",

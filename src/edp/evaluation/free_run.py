@@ -1,4 +1,4 @@
-"""Scores of a twin: free runs on commands alone from measured starts, against what was measured meanwhile."""
+"""Scores of a twin: free-run simulations on commands from measured starts, compared with the measurement."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ LANES = 64
 
 @dataclass(frozen=True, kw_only=True)
 class FreeRunJudgeSpec:
-    """How a twin is judged.
+    """Evaluation settings of a twin.
 
     Attributes:
         seconds: length of a free run; cut to what the longest recording has.
@@ -85,7 +85,7 @@ class FreeRunJudgeSpec:
 
 @dataclass(frozen=True, eq=False)
 class FreeRuns:
-    """Free runs and what was measured meanwhile.
+    """Free-run simulations with the corresponding measurements.
 
     Attributes:
         channels: of the twin.
@@ -115,7 +115,7 @@ class FreeRuns:
 
     @staticmethod
     def joined(parts: Sequence[FreeRuns]) -> FreeRuns:
-        """Runs of twins over the same channels as one, each cut to the shortest."""
+        """Join runs of twins over the same channels, each cut to the shortest."""
         first, ticks = parts[0], min(part.truth.shape[1] for part in parts)
         if len(parts) == 1:
             return first
@@ -125,7 +125,7 @@ class FreeRuns:
         return FreeRuns(first.channels, names, answers, truth, np.concatenate([p.before for p in parts]), low, high)
 
     def only(self, of: NDArray[np.int64]) -> FreeRuns:
-        """Some of the runs, by their places."""
+        """Return the runs with the given indices."""
         names = tuple(self.names[i] for i in of)
         return FreeRuns(self.channels, names, self.answers[of], self.truth[of], self.before[of], self.low, self.high)
 
@@ -135,7 +135,9 @@ class FreeRuns:
         return np.asarray(np.cumsum(steps, axis=1))
 
     def _range(self) -> NDArray[np.float64]:
-        """Range of each stroke ``(velocity,)``; without strokes that of the true integrals, or a second at full speed.
+        """Return the range of each stroke ``(velocity,)``.
+
+        Without strokes from the true integrals, or one second at full speed.
 
         What rests during all runs has no range, and any error would be one astray.
         """
@@ -146,13 +148,13 @@ class FreeRuns:
         return np.asarray(np.maximum(np.ptp(self._integral(self.truth), axis=(0, 1)), fastest * AT_FULL_SPEED_S))
 
     def diverged(self) -> NDArray[np.bool_]:
-        """Runs that left the machine ``(run,)``: a stroke off by more than `ASTRAY` of its range, or no number."""
+        """Return a mask of diverged runs ``(run,)``: stroke error above `ASTRAY` of its range, or not finite."""
         astray = (self.stroke_errors > ASTRAY * self._range()).any(axis=(1, 2))
         return np.asarray(astray | ~np.isfinite(self.answers).all(axis=(1, 2)))
 
 
 def free_runs(twin: Twin, series: Sequence[Series], seconds: float, starts: int) -> FreeRuns:
-    """Let a twin run free from evenly spread starts of each stretch.
+    """Simulate a twin in free run from evenly spaced starts of each segment.
 
     Args:
         twin: any formulation.
@@ -214,7 +216,7 @@ def _run_ticks(channels: TwinChannels, prefix: int, series: Sequence[Series], se
 
 
 def runs_of(twin: Twin, names: tuple[str, ...], answers: Array, truth: Array) -> FreeRuns:
-    """Answers of a twin beside what was measured.
+    """Combine the outputs of a twin with the measurements.
 
     Args:
         twin: that answered.
@@ -226,7 +228,7 @@ def runs_of(twin: Twin, names: tuple[str, ...], answers: Array, truth: Array) ->
 
 
 def calibrated(unseen: Sequence[tuple[Twin, Sequence[Series]]], spec: FreeRunJudgeSpec) -> FreeRunIntervals:
-    """Intervals of a twin's free runs, from free runs of what it was not trained on.
+    """Return free-run intervals of a twin, calibrated on free runs outside its training data.
 
     Args:
         unseen: the twin beside the validation part; or of a twin that is the mean of several, or that was fitted anew
@@ -250,7 +252,7 @@ def calibrated(unseen: Sequence[tuple[Twin, Sequence[Series]]], spec: FreeRunJud
 
 
 def _unseen_runs(unseen: Sequence[tuple[Twin, Sequence[Series]]], seconds: float, starts: int) -> FreeRuns:
-    """Free runs of each twin beside its own stretches."""
+    """Return free runs of each twin on its own segments."""
     return FreeRuns.joined([free_runs(twin, series, seconds, starts) for twin, series in unseen])
 
 
@@ -287,7 +289,7 @@ def free_run_scores(
 
 
 def coverage_of(runs: FreeRuns, spec: FreeRunJudgeSpec, intervals: FreeRunIntervals) -> IntervalCoverage:
-    """Share of the free runs whose truth lies in the interval at each horizon, by kind of channel, and half widths."""
+    """Return the fraction of free runs inside the interval at each horizon, by kind of channel, and the half widths."""
     channels, ticks = runs.channels, _ticks(runs, spec.covered_at_s)
     rows = []
     for at, tick in ticks:
@@ -307,7 +309,7 @@ def coverage_of(runs: FreeRuns, spec: FreeRunJudgeSpec, intervals: FreeRunInterv
 
 
 def _errors(runs: FreeRuns, at_s: Sequence[float]) -> FreeRunErrors:
-    """Velocity MAE, stroke errors by time, pressure NRMSE and the share of diverged runs."""
+    """Return velocity MAE, stroke errors by time, pressure NRMSE and the fraction of diverged runs."""
     channels, count = runs.channels, len(runs.channels.velocities)
     velocity_mae = np.abs(runs.answers - runs.truth)[..., :count].mean(axis=(0, 1), dtype=np.float64)
     ends = channels.strokes or channels.velocities
@@ -330,6 +332,6 @@ def _summary(runs: FreeRuns, at_s: Sequence[float]) -> RunSummary:
 
 
 def _ticks(runs: FreeRuns, at_s: Sequence[float]) -> list[tuple[float, int]]:
-    """Times within the runs, each with its tick."""
+    """Return the times within the runs, each with its sample."""
     ticks = [(at, max(1, round(at * runs.channels.rate_hz))) for at in at_s]
     return [(at, tick) for at, tick in ticks if tick <= runs.truth.shape[1]]

@@ -62,7 +62,7 @@ class StrokeErrors(ChannelErrors, _Moment):
 
 @dataclass(frozen=True, kw_only=True)
 class PressureErrors:
-    """Root-mean-square errors of pressures in standard deviations (NRMSE); None for a pressure at rest."""
+    """Root-mean-square errors of pressures in standard deviations (NRMSE); None for a constant pressure."""
 
     mean: float | None
     by_channel: ByChannel
@@ -122,14 +122,14 @@ class HorizonErrors:
         check_bounds("by_horizon", self, seconds=POSITIVE)
 
     def part(self, name: str) -> ErrorLine:
-        """Return the errors of one of `PARTS`."""
+        """Return the errors of a part named in `PARTS`."""
         line: ErrorLine = getattr(self, name)
         return line
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotionErrors:
-    """Errors while actuators do one thing: they are at an end stop, at rest, or in motion.
+    """Errors in one motion state of the actuators: at an end stop, standing still, or moving.
 
     Attributes:
         share: fraction of the time over all actuators.
@@ -146,7 +146,7 @@ class MotionErrors:
 
 @dataclass(frozen=True, kw_only=True)
 class PartCoverage:
-    """Fraction of free runs whose truth lies in the interval, and half widths of the interval."""
+    """Fraction of free runs inside the interval, and half widths of the interval."""
 
     share: float
     by_channel: Mapping[str, float] = field(default_factory=dict)
@@ -155,7 +155,7 @@ class PartCoverage:
 
 @dataclass(frozen=True, kw_only=True)
 class CoverageAt(_Moment):
-    """Coverage at a time after the start, by kind of channel; `calibrated` tells whether intervals reach so far."""
+    """Coverage at a time after the start, by kind of channel; `calibrated` is False beyond the calibrated horizon."""
 
     calibrated: bool = True
     velocities: PartCoverage | None = None
@@ -292,7 +292,7 @@ class ReportedChannel:
 
 @dataclass(frozen=True, kw_only=True)
 class AnswerChannels:
-    """Channels that a twin answers, by kind."""
+    """Output channels of a twin, by kind."""
 
     velocities: tuple[ReportedChannel, ...]
     strokes: tuple[ReportedChannel, ...]
@@ -301,7 +301,7 @@ class AnswerChannels:
 
 @dataclass(frozen=True, kw_only=True)
 class FreeRunFile(ResultFile):
-    """Content of ``free_run.json``: scores of the twin (`TWIN`) and of its floors, with hashes of files beside it."""
+    """Content of ``free_run.json``: scores of the twin (`TWIN`) and its baselines, with hashes of related files."""
 
     NAME = "free_run.json"
     SCHEMA = 2

@@ -1,4 +1,7 @@
-"""Parts of the scores of free runs: by horizon, by recording, at end stops, at rest; each kind of channel apart."""
+"""Parts of free-run scores: by horizon, by recording, at end stops and standstill.
+
+Separate for each kind of channel.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,7 @@ HORIZONS_A_DECADE = 6
 
 
 def by_channel(channels: Sequence[Channel], values: NDArray[Any], integral: bool = False) -> ChannelErrors:
-    """Return the mean of each channel in its unit of reports, and over all channels if they share a unit.
+    """Return the mean of each channel in report units, and over all channels if they share a unit.
 
     Args:
         channels: of the columns.
@@ -91,7 +94,7 @@ def nrmse_by_channel(
 
 
 def by_horizon(channels: TwinChannels, errors: Array, stroke_errors: NDArray[np.float64]) -> HorizonErrors:
-    """Mean absolute error of each answer at horizons that grow geometrically, in units of reports.
+    """Return the mean absolute error of each output at geometrically spaced horizons, in report units.
 
     Args:
         channels: of the twin.
@@ -117,14 +120,14 @@ def by_horizon(channels: TwinChannels, errors: Array, stroke_errors: NDArray[np.
 
 
 def by_name(names: Sequence[str], summary: Callable[[NDArray[np.int64]], RunSummary]) -> dict[str, RunSummary]:
-    """A summary of the runs of each name, in the order in which the names came."""
+    """Return a summary of the runs of each name, in the order of first occurrence."""
     return {name: summary(np.flatnonzero(np.array(names) == name)) for name in dict.fromkeys(names)}
 
 
 def situations(
     channels: TwinChannels, answers: Array, truth: Array, low: Array, high: Array
 ) -> dict[str, MotionErrors]:
-    """Errors at end stops, at rest and in motion, by what was measured; a situation that never occurs is left out.
+    """Return the errors at end stops, at standstill and in motion by the measurement; absent situations are omitted.
 
     An actuator is at an end stop within `AT_STOP` of its stroke, at rest where it is slower than `AT_REST` of its
     fastest velocity. The machine is at a stop where an actuator is, and at rest (idling) where all of them are:
@@ -164,7 +167,7 @@ def situations(
 
 
 def _where(channels: Sequence[Channel], errors: Array, axes: NDArray[np.bool_]) -> ChannelErrors:
-    """Mean of each channel over its own ticks; None where it has none, and no mean over channels then."""
+    """Return the mean of each channel over its own samples; None without any, and then without a mean over channels."""
     counts = axes.sum(axis=(0, 1))
     sums = np.where(axes, errors.astype(np.float64), 0.0).sum(axis=(0, 1))
     seen = [i for i, count in enumerate(counts) if count]
@@ -173,5 +176,5 @@ def _where(channels: Sequence[Channel], errors: Array, axes: NDArray[np.bool_]) 
 
 
 def _integrated(unit: str) -> str:
-    """Unit of the integral over seconds of what is in `unit`."""
+    """Return the unit of the integral over seconds of a quantity in `unit`."""
     return unit.removesuffix("/s")

@@ -278,7 +278,7 @@ class LostOutput:
 
 
 def lost_outputs(scores: ScoresFile) -> list[LostOutput]:
-    """The outputs on which some baseline has less root-mean-square error at some horizon, the worst first.
+    """Return the outputs on which a baseline has a lower RMSE at some horizon, the worst first.
 
     Args:
         scores: the content of ``scores.json``.
@@ -350,7 +350,7 @@ def _free_run_logs(own: FreeRunErrors, scores: FreeRunErrors) -> dict[str, list[
 
 
 def _free_run_logs_by_recording(own: FreeRunScores, scores: FreeRunScores) -> dict[str, list[float]]:
-    """The same of each recording, over all actuators."""
+    """Return the error ratios of each recording, over all actuators."""
     theirs = scores.by_recording
     return {
         name: [value for logs in _free_run_logs(summary, theirs[name]).values() for value in logs]
@@ -397,7 +397,7 @@ def change_verdict(change: float, by_unit: Mapping[str, float], reference: Error
 
 
 def free_run_error(scores: FreeRunErrors, reference: FreeRunErrors) -> float:
-    """Error of free runs over that of a reference on the same runs: what `twin_beaten_by` compares, as one number.
+    """Return the free-run error relative to a reference on the same runs, as one number; see `twin_beaten_by`.
 
     Args:
         scores: see `edp.evaluation.free_run.free_run_scores`.
@@ -422,7 +422,7 @@ def _free_run_errors(scores: FreeRunErrors) -> dict[str, dict[float, float]]:
 
 
 def _logarithm(network: ByHorizon, model: ByHorizon, target: str, horizons: Sequence[int]) -> float:
-    """Mean over horizons of the logarithm of the network's error over a model's; NaN where one of them is zero."""
+    """Return the mean over horizons of the log error ratio between network and model; NaN if an error is zero."""
     values = []
     for horizon in horizons:
         ours, theirs = (error_at(entry, horizon, target, MEASURE) for entry in (network, model))

@@ -1,4 +1,4 @@
-"""Judge a predictor on held-out recordings beside honest baselines, on the same ticks and in the same units."""
+"""Evaluation of a predictor on held-out recordings with baselines on the same samples and in the same units."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ SKIP = integer(0, MOST_TICKS)
 
 @dataclass(frozen=True, kw_only=True)
 class JudgeSpec:
-    """How to judge.
+    """Evaluation settings.
 
     Attributes:
         baselines: names of registered baselines.
@@ -80,7 +80,7 @@ class Evaluation:
 
 
 class _Kept:
-    """Gathers what pictures need, while predictions pass by."""
+    """Collector of the data needed for plots, while predictions are evaluated."""
 
     def __init__(self, series: Sequence[Series]) -> None:
         self.series, self.tensors = series[:KEPT_RECORDINGS], dict[str, NDArray[Any]]()
@@ -93,14 +93,14 @@ class _Kept:
                 self._keep(i, "inputs", part.inputs[:KEPT_TICKS][:, :inputs])
 
     def seen(self, predictions: Numbered, name: str) -> Iterator[tuple[int, NDArray[np.float32]]]:
-        """The same predictions, kept under a name on their way where pictures show them."""
+        """Yield the predictions unchanged, and store those shown in plots under a name."""
         for number, values in predictions:
             if number < len(self.series) and name in SHOWN_MODELS:
                 self._keep(number, name, values)
             yield number, values
 
     def bounds(self, bounds: Numbered, which: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
-        """The same intervals ``(time, coverage, 2, horizon, target)``, one of them kept."""
+        """Yield the intervals ``(time, coverage, 2, horizon, target)`` unchanged, and store one of them."""
         for number, values in bounds:
             for end, side in enumerate(("network_low", "network_high") if number < len(self.series) else ()):
                 self._keep(number, side, values[:, which, end])
@@ -154,7 +154,7 @@ def by_effort(names: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class JudgedModel:
-    """One model's entry in ``scores.json``, and what pictures show of it, by ``recording/name``."""
+    """Entry of one model in ``scores.json``, and its plot data by ``recording/name``."""
 
     entry: ModelScores
     tensors: Mapping[str, NDArray[np.float32]]
@@ -162,7 +162,7 @@ class JudgedModel:
 
 @dataclass(frozen=True, eq=False)
 class JudgedPart:
-    """What a network measures on a part of the test recordings, and what pictures show of it.
+    """Metrics of a network on a part of the test recordings, and its plot data.
 
     Attributes:
         measured: of the part.
@@ -182,7 +182,7 @@ def network_parts(data: Prepared) -> int:
 
 
 def _groups_of_part(data: Prepared, number: int) -> list[list[int]]:
-    """Groups of streams of one part: consecutive ones, by where the middle of their ticks lies in all."""
+    """Return the stream groups of one part: consecutive groups, by the position of the middle of their samples."""
     groups = stream_groups(data.test)
     ticks = np.array([sum(data.test[i].samples for i in group) for group in groups], dtype=np.float64)
     middles = np.cumsum(ticks) - ticks / 2
@@ -205,7 +205,7 @@ def check_scored(data: Prepared, spec: JudgeSpec) -> None:
 
 
 def first_scored(predictor: Predictor, data: Prepared, spec: JudgeSpec) -> int:
-    """The tick from which on every stretch is scored, of all models alike."""
+    """Return the sample from which every segment is scored, equal for all models."""
     # A whole window from reset: before that the network's memory is not filled. Baselines lack history for longer
     # than the preset `auto` waits: without the rows in which sensors settle a rival looks far better than it is.
     history = baseline_task(data, spec).history if spec.baselines else 0
@@ -215,7 +215,7 @@ def first_scored(predictor: Predictor, data: Prepared, spec: JudgeSpec) -> int:
 
 
 class ModelBench:
-    """Where models are measured one by one, on the same ticks: all here, or each in a process of its own.
+    """Evaluation of models one by one on the same samples: all here, or each in a separate process.
 
     Args:
         predictor: the network.
@@ -233,11 +233,11 @@ class ModelBench:
         self.ruler = Ruler(data, self.skip)
 
     def network(self, label: str, seconds: float) -> JudgedModel:
-        """Run the network along the test part; its label and training time are those of reports."""
+        """Run the network on the test part; label and training time appear in reports."""
         return self.network_of(map(self.network_part, range(network_parts(self.data))), label, seconds)
 
     def network_part(self, number: int) -> JudgedPart:
-        """Run the network along one of the `network_parts` of the test part."""
+        """Run the network on one of the `network_parts` of the test part."""
         net, test, pictures = self.predictor, self.data.test, _Kept(self.data.test)
         groups, coverages = _groups_of_part(self.data, number), net.spec.output.coverages
         predictions = pictures.seen(streamed(net, net.predict, test, groups=groups), "network")
@@ -248,7 +248,7 @@ class ModelBench:
         return JudgedPart(measured, within, pictures.tensors)
 
     def network_of(self, parts: Iterable[JudgedPart], label: str, seconds: float) -> JudgedModel:
-        """The network's entry from its parts, in their order; its label and training time are those of reports."""
+        """Return the network's entry from its parts, in order; label and training time appear in reports."""
         coverages = self.predictor.spec.output.coverages
         measured, within = self.ruler.unmeasured(), self.ruler.unmeasured_intervals(coverages)
         tensors: dict[str, NDArray[np.float32]] = {}
@@ -275,7 +275,7 @@ class ModelBench:
         return JudgedModel(scores, pictures.tensors)
 
     def together(self, models: Mapping[str, JudgedModel], left_out: Sequence[str] = ()) -> Evaluation:
-        """All models as one evaluation; `left_out` names baselines that were asked for and not run."""
+        """Combine all models into one evaluation; `left_out` names requested baselines that did not run."""
         pictures = _Kept(self.data.test)
         pictures.truth(len(self.data.inputs))
         tensors = {**pictures.tensors}
@@ -298,7 +298,10 @@ def _weighted(overall: ByHorizon, intervals: Mapping[str, Sequence[IntervalScore
 
 
 def _on_validation(baseline: Baseline, data: Prepared, skip: int) -> ByHorizon:
-    """Overall scores on the validation part, which also chose its sizes; none where it is too short."""
+    """Return overall scores on the validation part, which also selected the baseline's sizes.
+
+    Empty if it is too short.
+    """
     if max((part.samples for part in data.validation), default=0) - data.task.max_horizon <= skip:
         return {}
     # As epochs are judged: of a large validation part evenly spread stretches.
@@ -322,7 +325,7 @@ def _check_memory(predictor: Predictor, data: Prepared, spec: JudgeSpec) -> None
 
 
 def baseline_predictions(kind: type[B], data: Prepared, spec: JudgeSpec) -> tuple[Callable[[Prepared], Predictions], B]:
-    """A baseline fitted on the training part: what it predicts on the test part of this or other data, and itself."""
+    """Fit a baseline to the training part; return a function for its predictions on test data, and the baseline."""
     baseline = _fitted(kind, data, spec)
     return lambda other: [values for _, values in _predicted(baseline, other, other.test)], baseline
 
@@ -341,7 +344,7 @@ def _predicted(
 
 
 def score_predictions(predictions: Iterable[NDArray[np.float32]], data: Prepared, skip: int) -> ModelScores:
-    """Scores of predictions ``(time, horizon, target)`` of each of ``data.test``, as `judge` gives them for a model.
+    """Return scores of predictions ``(time, horizon, target)`` for each of ``data.test``, as `judge` does.
 
     Args:
         predictions: in SI units.
@@ -355,12 +358,12 @@ def score_predictions(predictions: Iterable[NDArray[np.float32]], data: Prepared
 
 
 def score_network(predictor: Predictor, data: Prepared, skip: int) -> ModelScores:
-    """As `score_predictions`, of a network that is run as a stream over ``data.test``."""
+    """Return scores like `score_predictions` for a network run as a stream over ``data.test``."""
     return Ruler(data, skip).measure(streamed(predictor, predictor.predict, data.test))
 
 
 def baseline_task(data: Prepared, spec: JudgeSpec) -> BaselineTask:
-    """The baselines' task: present values only where an input measures them, or a feature derived from one."""
+    """Return the task of the baselines: present values only where an input, or a derived feature, measures them."""
     inputs = (*data.task.features.channels, *_derived(data))
     present = tuple(inputs.index(target) if target in inputs else None for target in data.task.targets)
     longest = min(series.samples for series in [*data.train, *data.test]) - data.task.max_horizon - 1
@@ -370,7 +373,7 @@ def baseline_task(data: Prepared, spec: JudgeSpec) -> BaselineTask:
 
 
 def _derived(data: Prepared) -> list[str]:
-    """Derived features that baselines read: those which their history of the channels does not hold.
+    """Return the derived features that baselines read: those not contained in their channel history.
 
     These are the targets' present values, and what is derived from channels that are hidden from the network: a
     comparison is fair only where both sides know the same.
@@ -380,7 +383,7 @@ def _derived(data: Prepared) -> list[str]:
 
 
 def _as_baselines_read(data: Prepared, parts: Sequence[Series]) -> list[Series]:
-    """Series whose inputs are channels and derived features: none hidden, none of the start or of a physics base."""
+    """Return series with channels and derived features as inputs, without hidden, initialisation or physics inputs."""
     names, own = _derived(data), len(data.task.features.channels)
     if not names and own == len(data.task.inputs):
         return list(parts)

@@ -64,7 +64,7 @@ class Trace(TorchDispatchMode):
         self._enter_answer(network)
 
     def _enter_answer(self, network: nn.Module) -> None:
-        """An output is asked for its answer, not called as a module."""
+        """Enter the output layer, whose `answer` is called in place of the module."""
         output = getattr(network, "output", None)
         if output is None:
             return
@@ -88,7 +88,7 @@ class Trace(TorchDispatchMode):
         super().__exit__(*error)
 
     def read(self, values: Any) -> None:
-        """Take a tree of tensors for data: what the network is fed."""
+        """Mark a tree of tensors as data fed to the network."""
         # Without the mark of data every product would pass for one of weights, computed once.
         self._data |= {_storage(value) for value in _tensors(values)}
 
@@ -172,7 +172,7 @@ def macs_of(name: str, args: Any, result: Tensor) -> int:
 
 
 def arithmetic_of(name: str, args: Iterable[Any], result: Tensor) -> int:
-    """Arithmetic of a physics base: what makes numbers from inputs counts.
+    """Return the arithmetic operations of a physics base call that depend on inputs.
 
     What the machine's numbers alone give, tensors of at most one dimension, is computed once.
     """
@@ -181,7 +181,7 @@ def arithmetic_of(name: str, args: Iterable[Any], result: Tensor) -> int:
 
 
 def trace(predictor: Predictor, ticks: int, state: State | None = None) -> tuple[Trace, State]:
-    """A call whose operations are recorded, on `ticks` zeros from `state` or from reset, and the next state."""
+    """Record the operations of a call on `ticks` zeros from `state` or from reset; return them and the next state."""
     # Zeros suffice: the operations of a tick do not depend on its numbers.
     like = next(predictor.parameters())
     x = like.new_zeros(1, ticks, predictor.front.inputs)
@@ -193,7 +193,7 @@ def trace(predictor: Predictor, ticks: int, state: State | None = None) -> tuple
 
 
 def check_counted(predictor: Predictor) -> None:
-    """Hold the multiply-accumulates that the parts of a network count against those of a tick that runs.
+    """Compare the declared multiply-accumulates of a network's parts with those of one executed sample.
 
     Raises:
         ConfigError: a part counts others than it runs, or computes with an operation that hides what it multiplies.

@@ -1,4 +1,4 @@
-"""What predictions of one model measure, recording by recording: parts of it can be gathered apart and added."""
+"""Metrics of one model's predictions, recording by recording; partial metrics can be computed separately and added."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class MeasuredIntervals:
 
 
 class SpeedTally:
-    """Mean absolute error in bins of the target's magnitude, outputs pooled; `edges` are those of the bins."""
+    """Mean absolute error in bins of the target's magnitude, outputs pooled; `edges` bound the bins."""
 
     def __init__(self, edges: Values) -> None:
         self.edges = edges

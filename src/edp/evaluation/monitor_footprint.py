@@ -1,4 +1,4 @@
-"""What an exported monitor costs: its networks as of predictors, and the chain in double precision."""
+"""Cost of an exported monitor: its networks like predictors, and the chain in double precision."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class ChainCycles:
 
 
 def chain_work(parts: MonitorParts) -> dict[str, float]:
-    """What the chain does at a tick, on average, by the names of `CORE_COSTS`."""
+    """Return the average operations of the chain per sample, by the names of `CORE_COSTS`."""
     chain, summaries, points = parts.chain, parts.summaries, parts.points
     products = 2.0 * summaries * points + sum(watch.matrix.size for watch in chain.watches)
     doubles = sum(map(_watch_doubles, chain.watches)) + VERDICT * summaries + POINT * points
@@ -120,7 +120,7 @@ def _slices(parts: MonitorParts) -> list[float]:
 
 
 def _shares(watch: WatchPart) -> list[float]:
-    """Of each pass of a detector through its directions; the second of a CUSUM has a product alone."""
+    """Return the cost of each pass of a detector through its directions; the second CUSUM pass is one product."""
     each = DETECTOR[watch.detector]
     return [0.75 * each, 0.25 * each] if watch.detector == "cusum" else watch.passes * [each]
 
@@ -145,18 +145,18 @@ class NetworkCost:
 
     @property
     def estimate(self) -> Estimate:
-        """Of one run."""
+        """Estimate of one run."""
         return self.footprint.estimate(self.number_format)
 
     def cycles(self, core: str) -> tuple[float, float, float]:
-        """Low and typical estimate of a tick on average, and the high one of one of its ticks."""
+        """Return the low and typical estimates averaged over samples, and the high estimate of a single sample."""
         low, typical, high = self.estimate.cycles[core]
         return self.runs * low / self.every, self.runs * typical / self.every, self.runs * high
 
 
 @dataclass(frozen=True)
 class MonitorFootprint:
-    """What a monitor takes on a controller.
+    """Resource usage of a monitor on a controller.
 
     Attributes:
         networks: each of them.
@@ -199,7 +199,7 @@ class MonitorFootprint:
         }
 
     def verdict(self, budget: Budget) -> list[LimitCheck]:
-        """Compare the monitor with each limit."""
+        """Return one row per limit, like `Footprint.verdict`."""
         low, typical, high = self.cycles[budget.core]
         text = f"high estimate of the longest tick; low {low:,}, typical {typical:,}"
         memory, flash = self.constants + self.ram_bytes, self.constants + self.program_bytes
@@ -213,7 +213,7 @@ class MonitorFootprint:
 
 
 def monitor_footprint(parts: MonitorParts) -> MonitorFootprint:
-    """Count what a monitor takes as its exported C code.
+    """Count the resource usage of a monitor as exported C code.
 
     Raises:
         ExportError: a part has no form in C.
@@ -238,7 +238,7 @@ def monitor_footprint(parts: MonitorParts) -> MonitorFootprint:
 
 
 def _network_cycles(networks: Sequence[NetworkCost], core: str) -> tuple[float, float, float]:
-    """Low and typical estimate of all networks at a tick on average, and the high one of the longest tick.
+    """Return the estimates of all networks: low and typical averaged over samples, high of the longest one.
 
     Networks that run at the same ticks add up; of several periods the longest ticks are taken to fall together.
     """
@@ -265,8 +265,10 @@ def _network(part: NetworkPart | TwinPart) -> NetworkCost:
 
 
 def state_bytes(parts: MonitorParts) -> int:
-    """Of the chain: sums of two blocks, summaries, drift, evidence, detectors, in double precision; and of the sources
-    what stands beside their networks: values that are held, predictions that wait, sums.
+    """Return the state size of the chain and the sources.
+
+    The chain holds sums of two blocks, summaries, drift, evidence and detectors in double precision; the sources hold
+    values and due predictions in addition to their networks.
     """
     chain, summaries, inputs, residuals = parts.chain, parts.summaries, len(parts.inputs), len(parts.residuals)
     sums = (8 + 2 * len(chain.drivers)) * residuals + len(chain.level) + len(chain.moving)

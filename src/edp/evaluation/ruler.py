@@ -66,7 +66,10 @@ class Ruler:
         self.edges = np.linspace(0.0, speeds.quantiles([0.995])[0] or 1.0, SPEED_BINS + 1)
 
     def truth(self, number: int) -> Values:
-        """Of a test series, ``(tick, horizon, target)``; ticks whose targets lie beyond the end are left out."""
+        """Return the measured targets of a test series, shape ``(tick, horizon, target)``.
+
+        Samples whose target is beyond the end are omitted.
+        """
         series = self.data.test[number]
         ticks = max(0, series.samples - self.task.max_horizon)
         future = np.stack([series.targets[k : k + ticks] for k in self.task.horizons], axis=1)
@@ -101,11 +104,11 @@ class Ruler:
         return self.scores(self.gathered(predictions))
 
     def unmeasured(self) -> Measured:
-        """What no prediction has come to yet."""
+        """Return empty accumulators."""
         return Measured(self.task.targets, len(self.task.horizons), self.edges, self.task.integrate)
 
     def gathered(self, predictions: Numbered) -> Measured:
-        """What predictions of all recordings, or of a part of them, measure."""
+        """Return the metrics of predictions of all recordings, or of a part."""
         measured = self.unmeasured()
         for number, values in predictions:
             truth = self.truth(number)
@@ -142,11 +145,11 @@ class Ruler:
         )
 
     def unmeasured_intervals(self, coverages: Sequence[float]) -> MeasuredIntervals:
-        """What no interval has come to yet."""
+        """Return empty accumulators of interval metrics."""
         return MeasuredIntervals((len(self.task.horizons), len(coverages), len(self.task.targets)))
 
     def gathered_intervals(self, bounds: Numbered, coverages: Sequence[float]) -> MeasuredIntervals:
-        """What intervals of all recordings, or of a part of them, measure."""
+        """Return the metrics of intervals of all recordings, or of a part."""
         measured = self.unmeasured_intervals(coverages)
         for number, pairs in bounds:
             truth = self.truth(number)[self.skip :]

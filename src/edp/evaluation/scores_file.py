@@ -112,7 +112,7 @@ class SituationErrors:
 
 @dataclass(frozen=True, kw_only=True)
 class IntervalScores:
-    """How prediction intervals of one nominal coverage hold the truth.
+    """Scores of prediction intervals with one nominal coverage.
 
     Attributes:
         coverage: nominal.
@@ -167,7 +167,7 @@ class ModelScores:
 
 @dataclass(frozen=True, kw_only=True)
 class OutsideRange:
-    """A channel outside of its range in training, in a fraction `share` of the samples."""
+    """Channel outside its training range, for a fraction `share` of the samples."""
 
     channel: str
     share: float
@@ -175,7 +175,7 @@ class OutsideRange:
 
 @dataclass(frozen=True, kw_only=True)
 class TargetChange:
-    """How changes of a target differ from those in training.
+    """Difference between the changes of a target and those in the training data.
 
     Attributes:
         target: name.
@@ -195,7 +195,7 @@ class TargetChange:
 
 @dataclass(frozen=True, kw_only=True)
 class DataSituation:
-    """How the evaluated recordings differ from those in training.
+    """Differences between the evaluated recordings and the training recordings.
 
     Attributes:
         outside: channels that leave their range, most of the time first.
@@ -208,7 +208,7 @@ class DataSituation:
 
 @dataclass(frozen=True, kw_only=True)
 class DrawnSample:
-    """Which part of the recordings was evaluated: hours of all hours, in segments; `what` says it in words."""
+    """Evaluated part of the recordings: hours out of all hours, in segments; `what` describes it."""
 
     hours: float
     of_hours: float
@@ -269,7 +269,7 @@ def check_mean(name: str, values: Means) -> None:
 
 
 def earlier_scores(folder: Path, key: str) -> ScoresFile | None:
-    """Return the scores of an earlier evaluation with this key and with its predictions; None if there are none."""
+    """Return the scores of an earlier evaluation with this key and its predictions; None without one."""
     if not is_file_at(folder / ScoresFile.NAME) or not is_file_at(folder / PREDICTIONS):
         return None
     scores = ScoresFile.read(folder)

@@ -1,4 +1,4 @@
-"""Whether the recordings that judge a model are another situation than those that trained it."""
+"""Comparison of the evaluation recordings with the training recordings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LEAST_RATIO = 2.0
 
 
 def situation_of(data: Prepared) -> DataSituation:
-    """Return what is out of the ordinary in ``data.test``, compared with the training and validation parts."""
+    """Return the unusual properties of ``data.test`` compared with the training and validation parts."""
     trained = [part for part in (*data.train, *data.validation) if part.samples]
     if not trained:
         return DataSituation(outside=(), changes=())  # a bundle alone does not know what trained it
@@ -66,7 +66,7 @@ def _outside(
 def _changes(
     parts: Sequence[Series], horizon: int, bound: NDArray[np.floating] | None = None
 ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Root-mean-square change of each target, and the largest; with a bound the share that is larger than it."""
+    """Return the root-mean-square and largest change of each target; with a bound, the fraction above it."""
     squares = np.zeros(parts[0].targets.shape[1])
     largest, above, count = np.zeros_like(squares), np.zeros_like(squares), 0
     for part in parts:

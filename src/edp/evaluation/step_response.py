@@ -1,4 +1,4 @@
-"""Answers of a twin to a step of one command, while the others stay: what an engineer asks a plant model first."""
+"""Responses of a twin to a step of one command with constant other commands."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SPAN = (0.05, 0.95)
 
 
 def step_responses(twin: Twin, series: Sequence[Series]) -> StepResponses:
-    """Differences between free runs with and without a step of a command, from moments of recordings on.
+    """Return the differences between free runs with and without a step of a command, from samples of recordings.
 
     At each moment all commands are held as they are. Once one of them jumps by half of its range, towards the middle of
     it, and the difference is counted as that of a jump upwards: the response is what the jump alone does.

@@ -39,7 +39,7 @@ F = TypeVar("F")
 
 @dataclass(frozen=True)
 class Decision:
-    """What a phase found and decided.
+    """Result and decision of a phase.
 
     Attributes:
         phase: its name.
@@ -77,7 +77,7 @@ class PhaseRow:
 
     @property
     def heading(self) -> str:
-        """As ``Phase 2.5: power``."""
+        """Heading such as ``Phase 2.5: power``."""
         number = NUMBERS.get(self.name)
         return f"Phase {number}: {self.title}" if number else self.title.capitalize()
 
@@ -117,7 +117,7 @@ class StudyData:
 
 @dataclass(frozen=True)
 class SessionSets:
-    """Sessions that train and evaluate in turn, test sessions, and those of the second test set."""
+    """Sessions for training and validation, test sessions, and sessions of the second test set."""
 
     development: tuple[str, ...]
     test: tuple[str, ...]
@@ -126,7 +126,7 @@ class SessionSets:
 
 @dataclass(frozen=True)
 class TrainingCounts:
-    """Trainings that are done, that were asked for, and that there will be at most."""
+    """Number of finished, requested and maximum trainings."""
 
     done: int = 0
     asked: int = 0
@@ -185,7 +185,7 @@ class StudyFile:
         return tuple((ahead | begun).values())
 
     def facts(self, kind: type[F]) -> F | None:
-        """Return the facts of a kind; None if the phase has not ended."""
+        """Return the results of a phase by their class; None if the phase has not ended."""
         return facts_of_kind(self.decisions, kind)
 
     def module(self, name: str) -> str:
@@ -209,7 +209,7 @@ class StudyFile:
 
 
 def facts_of_kind(decisions: Sequence[Decision], kind: type[F]) -> F | None:
-    """Return the facts of a kind among decisions, None if there are none."""
+    """Return the results of a class among decisions; None without any."""
     return next((decision.facts for decision in decisions if isinstance(decision.facts, kind)), None)
 
 

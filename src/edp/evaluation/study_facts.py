@@ -1,4 +1,4 @@
-"""What the phases of a model search find: one class for each phase, written into ``study.json``."""
+"""Results of the phases of a model search, one class per phase, stored in ``study.json``."""
 
 from __future__ import annotations
 
@@ -220,7 +220,7 @@ class ThesisConfirmation(ConfirmationFacts):
 
 @dataclass(frozen=True, kw_only=True)
 class JointFacts:
-    """What phases 4 and 5 share: the best trial, and how often each module was on.
+    """Common results of phases 4 and 5: the best trial, and how often each module was active.
 
     Attributes:
         settings: of the best trial, like `values`, `modules`, `score` and `costs`.

@@ -75,7 +75,7 @@ class Tally:
             self.count += state.count
 
     def _sum_all(self) -> _Sums:
-        """The sums, with all ticks in them that were kept one by one."""
+        """Move single samples into the sums and return the sums."""
         self._sums = self._sums or _Sums(len(self.targets))
         for part in self._kept:
             self._sums.update(*part)
@@ -83,7 +83,7 @@ class Tally:
         return self._sums
 
     def scores(self) -> ByTarget:
-        """By target, and their mean."""
+        """Return the scores by target, and their mean."""
         if self._sums is not None:
             return named_scores(self.targets, self._sums.scores())
         predicted, truth = (np.concatenate(side) for side in zip(*self._kept, strict=True))
@@ -91,7 +91,7 @@ class Tally:
 
 
 class _Sums:
-    """What scores are made of, for each target."""
+    """Sums from which scores are computed, for each target."""
 
     def __init__(self, targets: int) -> None:
         self.truth = Moments(targets)

@@ -1,4 +1,4 @@
-"""Jobs and executors: a pool of this machine and a cluster answer to the same calls, and every job ends in a record."""
+"""Jobs and executors: local pool and cluster have the same interface, and every job ends with a record."""
 
 from __future__ import annotations
 
@@ -61,11 +61,11 @@ class Executor(Protocol):
         ...
 
     def wait_any(self, timeout_s: float | None = None) -> Record | None:
-        """The next training that ended, or None when the time is over or nothing is under way."""
+        """Return the next finished training; None after the timeout or if there is nothing to wait for."""
         ...
 
     def cancel(self, key: str) -> None:
-        """Stop a job or take it from the queue; nothing is reported of it any more."""
+        """Stop a job or remove it from the queue, without a record."""
         ...
 
     def running(self) -> list[str]:
@@ -77,7 +77,7 @@ class Executor(Protocol):
         ...
 
     def __enter__(self) -> Self:
-        """The executor itself."""
+        """Return the executor."""
         ...
 
     def __exit__(self, *_: object) -> None:
@@ -86,14 +86,14 @@ class Executor(Protocol):
 
 
 class ClosedAtExit:
-    """What all executors do at the end of a ``with`` block: they stop everything."""
+    """Base of executors that stop all jobs at the end of a ``with`` block."""
 
     def close(self) -> None:
         """Stop everything."""
         raise NotImplementedError
 
     def __enter__(self) -> Self:
-        """The pool itself; leaving the block stops it."""
+        """Return the pool; leaving the block stops it."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -102,7 +102,7 @@ class ClosedAtExit:
 
 
 def ended(job: Job, status: TrainingStatus, message: str, **measured: Any) -> Record:
-    """The record of a job that could not say itself how it ended."""
+    """Return the record of a job that could not report its own end."""
     return Record(job.identity, status, None, message, {"host": platform.node(), **measured})
 
 
@@ -123,7 +123,7 @@ class JobEnd:
 def iterate_ends(
     ledger: Ledger, executor: Executor, jobs: Iterable[Job], wake_s: float | None = None
 ) -> Iterator[JobEnd | None]:
-    """Yield the end of every job: of what the ledger holds first, of the others as soon as they end.
+    """Yield the end of every job: results in the ledger first, others as soon as they end.
 
     Args:
         ledger: of the study; each record is on disk before it is yielded.

@@ -90,11 +90,11 @@ class RayPool(ClosedAtExit):
         self._refs[reference] = job.key
 
     def running(self) -> list[str]:
-        """Keys of the jobs that are with the cluster, at most as many as it has room for."""
+        """Return the keys of the jobs in the cluster, at most as many as it has room for."""
         return list(self._refs.values())[: self.workers]
 
     def wait_any(self, timeout_s: float | None = None) -> Record | None:
-        """The next training that ended; see `Executor.wait_any`."""
+        """Return the next finished training; see `Executor.wait_any`."""
         if not self._ready:
             if not self._refs:
                 return None
@@ -117,7 +117,7 @@ class RayPool(ClosedAtExit):
                 self.ray.cancel(reference, force=True)
 
     def close(self) -> None:
-        """Stop everything and leave the cluster, which goes on."""
+        """Stop all jobs and leave the cluster, which continues to run."""
         for key in list(self._jobs):
             self.cancel(key)
         self.ray.shutdown()
@@ -145,7 +145,7 @@ class RayPool(ClosedAtExit):
         self._ready.append(record)
 
     def _check_nodes(self) -> None:
-        """Every node has this code and these versions: a key says so of each record, so it must be true."""
+        """Check that every node has this code and these versions, since the key of each record states them."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         asked = {}
@@ -179,14 +179,14 @@ class RayPool(ClosedAtExit):
 
 @dataclass(frozen=True)
 class _StateFile:
-    """A file of the state that a training goes on from."""
+    """File with the state from which a training continues."""
 
     name: str
     content: bytes
 
 
 def _perform_there(job: Job, threads: int, start: _StateFile | None) -> tuple[bytes, bytes | None]:
-    """Do a training in a process of Ray on some node: through a pool of one, whose process stays for the next.
+    """Run a training in a Ray process on some node, through a pool of one whose process is reused.
 
     Args:
         job: to do.

@@ -1,4 +1,4 @@
-"""Results of units as bytes in a stated form: plain values as JSON, arrays as safetensors; nothing is unpickled.
+"""Serialisation of unit results: plain values as JSON, arrays as safetensors, without pickle.
 
 Frozen dataclasses are taken apart by field and built again from the classes that the reader names, so that bytes can
 make nothing else.
@@ -30,7 +30,7 @@ MOST_DEPTH = 40
 
 
 def pack(value: Any) -> bytes:
-    """Return a value as bytes: plain values, tuples, enums, arrays of numbers, and frozen dataclasses of these.
+    """Serialise a value: plain values, tuples, enums, numeric arrays, and frozen dataclasses.
 
     Raises:
         TypeError: anything else.
@@ -69,7 +69,7 @@ def _apart(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
 
 
 def unpack(data: bytes, kind: type[T], also: Iterable[type] = ()) -> T:
-    """Return the value of a class that `pack` made bytes of.
+    """Restore a value of a class from the bytes of `pack`.
 
     Args:
         data: the bytes.
@@ -129,7 +129,7 @@ def _together(tree: Any, tensors: dict[str, NDArray[Any]], classes: Mapping[str,
 # Asked for with every unit of work, and the same in each.
 @functools.cache
 def classes_in(kind: type) -> Mapping[str, type]:
-    """A dataclass and all that the types of its fields name, by name."""
+    """Return a dataclass and all classes in the types of its fields, by name."""
     classes: dict[str, type] = {}
     waiting: list[Any] = [kind]
     while waiting:

@@ -1,4 +1,4 @@
-"""A job from its claim to its record: whatever happens in it comes back as a record."""
+"""Execution of a job from its claim to its record; every outcome becomes a record."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ BEGUN = b"begun"
 def perform(
     identity: TrainingIdentity, where: Mapping[str, Any], folder: str | None, begun: Callable[[], None]
 ) -> Record:
-    """Do a training; whatever happens in it comes back as a record.
+    """Run a training; every outcome becomes a record.
 
     Args:
         identity: what to train.
@@ -129,7 +129,7 @@ def call(
 
 
 def resolve(name: str) -> Callable[[TrainingIdentity, Mapping[str, Any]], Any]:
-    """The function called ``package.module:name``.
+    """Return the function named ``package.module:name``.
 
     Raises:
         ConfigError: there is none.
@@ -143,7 +143,7 @@ def resolve(name: str) -> Callable[[TrainingIdentity, Mapping[str, Any]], Any]:
 
 
 def peak_mb() -> float:
-    """Most memory that this process has had, in MiB; 0 where the system does not say."""
+    """Return the peak memory of this process in MiB; 0 if the system does not report it."""
     try:
         import resource
     except ImportError:  # not POSIX
@@ -153,7 +153,7 @@ def peak_mb() -> float:
 
 
 def _out_of_memory(error: BaseException) -> bool:
-    """Python's, NumPy's and PyTorch's ways to say so."""
+    """Return whether an error of Python, NumPy or PyTorch means exhausted memory."""
     # By name: PyTorch's class is not there without torch.
     named = any("OutOfMemoryError" in kind.__name__ for kind in type(error).__mro__)
     return named or isinstance(error, MemoryError) or "can't allocate memory" in str(error)

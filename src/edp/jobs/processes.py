@@ -88,7 +88,7 @@ class _Worker:
         self.turn, self.begun, self.deadline = turn, False, time.monotonic() + START_S
 
     def now(self) -> _Turn:
-        """What it is doing."""
+        """Present job."""
         if self.turn is None:
             raise RuntimeError("an idle worker was taken for a busy one")
         return self.turn
@@ -101,13 +101,13 @@ class _Worker:
             return 0.0
 
     def said(self) -> str:
-        """The end of what the process printed."""
+        """Return the end of the process's output."""
         size = self.output.seek(0, os.SEEK_END)
         self.output.seek(max(0, size - SHOWN_OUTPUT))
         return self.output.read().decode(errors="replace").strip()
 
     def end(self) -> None:
-        """Kill the process and what it started."""
+        """Kill the process and its child processes."""
         with contextlib.suppress(ProcessLookupError, PermissionError):
             # The whole process group: a training may have started processes of its own.
             os.killpg(self.process.pid, signal.SIGKILL)
@@ -161,7 +161,7 @@ class LocalPool(ClosedAtExit):
         return [worker.process.pid for worker in [*self._busy.values(), *self._idle]]
 
     def wait_any(self, timeout_s: float | None = None) -> Record | None:
-        """The next training that ended; see `Executor.wait_any`."""
+        """Return the next finished training; see `Executor.wait_any`."""
         until = float("inf") if timeout_s is None else time.monotonic() + timeout_s
         while not self._ready:
             if not self._busy:
@@ -249,7 +249,7 @@ class LocalPool(ClosedAtExit):
         self._idle.append(worker)
 
     def _hold_to_caps(self, worker: _Worker) -> None:
-        """Kill what is over a cap; a process that did jobs before may hold their memory, so a fresh one decides."""
+        """Kill a job above a limit. A process that ran other jobs may hold their memory, so a new process decides."""
         turn, job = worker.now(), worker.now().job
         if time.monotonic() > worker.deadline:
             if not worker.begun:

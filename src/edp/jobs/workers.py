@@ -49,12 +49,12 @@ WAKE_S = 0.5
 
 
 class UnitError(EdpError):
-    """A unit of work failed in another process; the message names it and says why."""
+    """Failure of a unit of work in another process; the message names the unit and the reason."""
 
 
 @dataclass(frozen=True)
 class WorkUnit:
-    """A piece of work.
+    """Unit of work.
 
     Attributes:
         function: ``package.module:name``, called as ``function(identity, where)``; its arguments are
@@ -80,7 +80,7 @@ class WorkUnit:
         return Job(self.identity(code_version(whole=True), _environment(threads)), self.where)
 
     def identity(self, code: str = "", environment: Mapping[str, str] | None = None) -> TrainingIdentity:
-        """Return what the function of the unit is called with; a key needs code and environment."""
+        """Return the arguments of the unit's function; a key needs code and environment."""
         return TrainingIdentity(self.function, self.arguments, {}, 0, 0, code, self.data, environment or {})
 
 
@@ -291,7 +291,7 @@ def _open_ledger(folder: Path | None) -> Iterator[Ledger]:
 
 
 def forget_units(folder: str | Path) -> None:
-    """Remove results of units, once what they were for is on disk."""
+    """Remove the results of units after the final result is on disk."""
     if is_folder_at(Path(folder, "records")):
         shutil.rmtree(folder, ignore_errors=True)
 

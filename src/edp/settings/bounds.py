@@ -119,7 +119,7 @@ WEIGHT = above(0.0, MOST_WEIGHT)
 
 
 def check_bounds(what: str, spec: object, **bounds: Bound) -> None:
-    """Raise ConfigError if numbers of a settings object are outside their bounds. None passes.
+    """Raise ConfigError if values of a settings object are outside their bounds. None passes.
 
     Args:
         what: how messages call the spec.

@@ -31,7 +31,7 @@ class DataPart:
 
 @dataclass(frozen=True, kw_only=True)
 class DataOrigin:
-    """Where recordings come from.
+    """Origin of recordings.
 
     Attributes:
         source: in words.
@@ -61,7 +61,7 @@ class DataOrigin:
 
 @dataclass(frozen=True, kw_only=True)
 class Provenance:
-    """Where a result comes from.
+    """Provenance of a result.
 
     Attributes:
         edp_version: version of EDP.
@@ -110,12 +110,12 @@ class Provenance:
         return plain_fields(replace(self, more={})) | self.more
 
     def with_entries(self, **entries: Any) -> Self:
-        """Return the provenance with further entries of a command."""
+        """Return the provenance with additional entries of a command."""
         return replace(self, more={**self.more, **entries})
 
     @property
     def origin(self) -> DataOrigin:
-        """Where the recordings come from; nothing is stated for a result without recordings."""
+        """Origin of the recordings; empty for a result without recordings."""
         return self.data or DataOrigin()
 
     def recording_names(self, *parts: str) -> set[str]:

@@ -357,7 +357,7 @@ def _allows_none(hint: Any) -> bool:
 
 @cache
 def _stated(hint: Any) -> Any:
-    """Return the list or mapping in a hint that also allows None; other hints as they are."""
+    """Return the list or mapping type of a hint that also allows None; other hints unchanged."""
     inner = [one for one in typing.get_args(hint) if one is not type(None)]
     is_list = len(inner) == 1 and typing.get_origin(inner[0]) in (tuple, Mapping)
     return inner[0] if is_list and _allows_none(hint) else hint

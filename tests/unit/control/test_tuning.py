@@ -1,6 +1,7 @@
 """Gains that are better on a model: correlation and regret by hand-made costs, drawn settings, the bench."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -67,15 +68,15 @@ def test_seeds_of_the_judgement_never_reach_those_of_the_tuning(tmp_path):
 def test_a_stopped_tuning_continues_after_its_last_trial_and_a_finished_one_is_read(tmp_path, monkeypatch):
     made = []
 
-    def cost(bench, spec):
-        if len(made) == stop_at:
-            raise KeyboardInterrupt
-        made.append(spec)
-        return abs(spec.proportional - 3.0)
+    def run(bench, number, spec, guard=None):
+        if bench.experiment.seed == TUNING_SEED:
+            if len(made) == stop_at:
+                raise KeyboardInterrupt
+            made.append(spec)
+        return SimpleNamespace(score=SimpleNamespace(position_rms_mm=abs(spec.proportional - 3.0)))
 
     monkeypatch.setattr(ControlBench, "check", lambda bench: None)
-    monkeypatch.setattr(ControlBench, "cost", cost)
-    monkeypatch.setattr(ControlBench, "costs", lambda bench, spec: {"a": 1.0, "b": 2.0})
+    monkeypatch.setattr(ControlBench, "run", run)
     experiment = ControlExperiment(task=TASKS["grade"](), controller=CONTROLLERS["pi"](), loops=2)
 
     def tune(folder):
@@ -91,6 +92,7 @@ def test_a_stopped_tuning_continues_after_its_last_trial_and_a_finished_one_is_r
         folder, stop_at = f"stopped_{stop_at}", -1
         assert tune(folder).content == whole.content
         assert made == trials
+        assert not (tmp_path / folder / "units").exists()
     made.clear()
     assert tune("whole").content == whole.content
     assert tune("whole").best == whole.best

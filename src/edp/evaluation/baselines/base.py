@@ -1,4 +1,4 @@
-"""What a baseline is: fitted on whole series, it predicts every horizon at every tick from rows up to that tick."""
+"""Interface of baselines: fitted on whole series, they predict every horizon at every sample from rows up to it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from edp.registry import Registry
 
 @dataclass(frozen=True)
 class BaselineTask(LagTask):
-    """What a baseline predicts from what: a `LagTask` with a seed.
+    """Task of a baseline: a `LagTask` with a seed.
 
     Attributes:
         seed: of row sampling and initial weights.

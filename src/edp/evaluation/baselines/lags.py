@@ -39,7 +39,7 @@ class LagTable:
 
 
 def lag_features(inputs: FloatArray, ticks: NDArray[np.int64], history: int) -> FloatArray:
-    """Inputs at `ticks`, then their change since each earlier lag that `history` reaches.
+    """Return the inputs at `ticks`, then their change since each earlier lag within `history`.
 
     Changes carry the same information as the values and can be split by a tree without resolving the level.
 
@@ -58,7 +58,7 @@ def lag_features(inputs: FloatArray, ticks: NDArray[np.int64], history: int) -> 
 
 
 def sample_table(series: Sequence[Series], task: BaselineTask, means: DoubleArray, cap: int) -> LagTable:
-    """At most `cap` rows drawn without replacement over all series, in order; the same seed draws the same rows."""
+    """Return at most `cap` random rows over all series without replacement, in order; equal seeds give equal rows."""
     lengths = np.array([len(origins(one, task)) for one in series], dtype=np.int64)
     total = int(lengths.sum())
     # Sorted, so that rows keep the order of their recording; without replacement, so that none counts twice.

@@ -14,7 +14,7 @@ from edp.recording import FloatArray
 
 @BASELINES.register("ridge_arx")
 class RidgeArx(Baseline):
-    """One ridge map per horizon and target; penalty and history are chosen on validation for each of them."""
+    """One ridge map per horizon and target, with penalty and history chosen on the validation part."""
 
     label = "Ridge ARX"
     effort = 1

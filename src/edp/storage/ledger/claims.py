@@ -1,4 +1,4 @@
-"""Trainings under way: claims of the processes that do them, and what they leave when they are done."""
+"""Claims of running trainings, and results left by workers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from edp.storage.writing import make_folder, write_bytes
 
 
 def claim(folder: str | Path, key: str) -> Claim:
-    """Claim a training for this process, for as long as it lives or until the claim is left.
+    """Claim a training for this process until it ends or releases the claim.
 
     Raises:
         BusyError: another process trains it.
@@ -38,7 +38,7 @@ class Claim:
     stream: IO[str]
 
     def __enter__(self) -> Claim:
-        """The claim itself."""
+        """Return the claim."""
         return self
 
     def __exit__(
@@ -57,12 +57,12 @@ def free_dead_claims(folder: str | Path) -> None:
 
 
 def leave_arrival(folder: str | Path, record: Record) -> None:
-    """Keep what a worker found, in case that the coordinator is killed before it enters it into the ledger."""
+    """Store a worker's result in case the coordinator is killed before it enters the result into the ledger."""
     write_bytes(Path(folder, "arrived", f"{record.key}.json"), record.to_bytes())
 
 
 def whole(file: Path) -> Record | None:
-    """The final record in a file, where it is one."""
+    """Return the final record in a file; None without one."""
     try:
         record = Record.from_bytes(read_bytes(file, RECORD_BYTES))
     except (OSError, ValueError, KeyError, TypeError, StorageError):
@@ -71,6 +71,6 @@ def whole(file: Path) -> Record | None:
 
 
 def known(folder: str | Path, key: str) -> Record | None:
-    """The final record of a training that the coordinator or a worker has left."""
+    """Return the final record of a training, left by the coordinator or a worker; None without one."""
     # The ledger first: what arrived is entered there, and then removed.
     return whole(Path(folder, "records", f"{key}.json")) or whole(Path(folder, "arrived", f"{key}.json"))

@@ -30,7 +30,7 @@ READ = (
 
 
 class TrainingStatus(StrEnum):
-    """How a training ended."""
+    """Outcome of a training."""
 
     DONE = "done"
     FAILED = "failed"
@@ -99,13 +99,13 @@ def code_version(whole: bool = False) -> str:
 
 
 def _below(path: str, folders: tuple[str, ...]) -> bool:
-    """Whether a path is one of these or in one of them."""
+    """Return whether a path is one of the folders or inside one."""
     return any(path == folder or path.startswith(f"{folder}/") for folder in folders)
 
 
 @dataclass(frozen=True)
 class TrainingIdentity:
-    """Everything that decides what a training gives.
+    """Everything that determines the result of a training.
 
     Attributes:
         job: the function that trains, as ``package.module:name``.
@@ -144,7 +144,7 @@ class TrainingIdentity:
 
 @dataclass(frozen=True)
 class Record:
-    """What became of one training.
+    """Record of one training.
 
     Attributes:
         identity: what decided it.
@@ -166,17 +166,17 @@ class Record:
         return self.identity.key
 
     def reported(self) -> list[Any]:
-        """What an equal training says again, to the bit."""
+        """Return the reproducible part of the record, equal to the bit for equal trainings."""
         return [self.key, str(self.status), self.result, self.message]
 
     def to_bytes(self) -> bytes:
-        """JSON on one line: a checksum, and the record in the canonical form that it is of."""
+        """Return one line of JSON: a checksum and the record in canonical form."""
         body = canonical({"schema": SCHEMA, "key": self.key} | asdict(self))
         return f'{{"checksum":"{_checksum(body.encode())}","record":{body}}}\n'.encode()
 
     @staticmethod
     def from_bytes(data: bytes) -> Record:
-        """The record.
+        """Parse a record.
 
         Raises:
             ValueError: cut off or changed.
@@ -199,7 +199,7 @@ class Record:
 
 
 def body_of(data: bytes) -> bytes:
-    """The canonical text in a record's bytes, its checksum verified; reading it takes longer than this.
+    """Return the canonical text of a record after a check of its checksum, without the slower parsing.
 
     Raises:
         ValueError: cut off or changed.

@@ -1,4 +1,4 @@
-"""What a training that is not over yet goes on from: a file beside its record, checksummed, and not kept for ever."""
+"""States from which trainings continue: checksummed files next to their records, deleted when no longer needed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STATE_BYTES = 4 * 2**30
 
 @dataclass(frozen=True)
 class WithState:
-    """What the function of a training returns where another training goes on from its end.
+    """Result of a training function whose final state another training continues.
 
     Attributes:
         result: plain values, as of any training.
@@ -41,12 +41,12 @@ def leave_state(folder: str | Path, key: str, state: bytes) -> None:
 
 
 def left_state(folder: str | Path, key: str) -> Path:
-    """The file in which `leave_state` keeps it."""
+    """Return the path of the file written by `leave_state`."""
     return Path(folder, "arrived", f"{key}{SUFFIX}")
 
 
 def read_state(file: str | Path) -> bytes | None:
-    """The state in a file; None where there is no file or it is no whole state of the training that it is named for."""
+    """Return the state in a file; None if the file is missing or not a complete state of its training."""
     path = Path(file)
     try:
         data = read_bytes(path, STATE_BYTES)

@@ -1,4 +1,4 @@
-"""The ledger on disk: one file a training, written by one coordinator at a time."""
+"""Ledger on disk: one file per training, written by one coordinator at a time."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from edp.storage.writing import make_folder, remove_unfinished, storage_error, w
 
 @dataclass(frozen=True)
 class Damage:
-    """A file that is no whole record."""
+    """File that is not a complete record."""
 
     file: Path
     why: str
 
 
 def read_records(folder: str | Path) -> tuple[dict[str, Record], list[Damage]]:
-    """All records of a ledger, whoever holds it, and the damaged files; nothing is changed."""
+    """Return all records of a ledger and the damaged files, regardless of its holder. Nothing is changed."""
     whole, damaged = _read(Path(folder, "records"))
     return {key: _taken_apart(Path(folder, "records", f"{key}.json"), whole[key]) for key in whole}, damaged
 
@@ -72,7 +72,7 @@ def _read(folder: Path) -> tuple[dict[str, bytes], list[Damage]]:
 
 @dataclass(frozen=True)
 class Opening:
-    """One opening of a sealed test set: who was judged, why, and when."""
+    """Opening of a sealed test set: evaluated networks, reason and time."""
 
     test_set: str
     judged: tuple[str, ...]
@@ -147,7 +147,7 @@ class Ledger:
             raise
 
     def __enter__(self) -> Ledger:
-        """The ledger itself; leaving the block lets another process coordinate."""
+        """Return the ledger; leaving the block allows another process to coordinate."""
         return self
 
     def __exit__(
@@ -164,19 +164,19 @@ class Ledger:
         return len({*self._records, *self._unread})
 
     def __iter__(self) -> Iterator[Record]:
-        """Records in the order of their keys."""
+        """Iterate over the records in the order of their keys."""
         for key in list(self._unread):
             self.get(key)
         return iter([self._records[key] for key in sorted(self._records)])
 
     def get(self, key: str) -> Record | None:
-        """What became of a training, lost ones too."""
+        """Return the record of a training, including lost ones."""
         if key in self._unread:
             self._records[key] = _taken_apart(self.path / "records" / f"{key}.json", self._unread.pop(key))
         return self._records.get(key)
 
     def finished(self, key: str) -> Record | None:
-        """What became of a training that is not to be tried again."""
+        """Return the record of a training that must not be tried again; None without one."""
         record = self.get(key)
         return record if record is not None and record.status in FINAL else None
 
@@ -204,7 +204,7 @@ class Ledger:
         (self.path / "arrived" / f"{record.key}.json").unlink(missing_ok=True)
 
     def state(self, key: str) -> Path | None:
-        """The file with the state that a training left, where it is whole; a damaged one is set apart."""
+        """Return the state file of a training if it is complete; a damaged file is set aside."""
         file = self.path / "states" / f"{key}{SUFFIX}"
         if not is_there(file):
             return None
@@ -214,13 +214,13 @@ class Ledger:
         return file
 
     def keep_states(self, keys: Collection[str]) -> None:
-        """Remove all states but those of some trainings; records stay."""
+        """Remove all states except those of some trainings; records stay."""
         for file in entries_of(self.path / "states", f"*{SUFFIX}"):
             if file.stem not in keys:
                 file.unlink(missing_ok=True)
 
     def digest(self) -> str:
-        """Hash over all results; what is measured, such as seconds, is left out."""
+        """Return a hash of all results without measured values such as seconds."""
         return digest_of([record.reported() for record in self])
 
     def set_aside(self, statuses: Collection[TrainingStatus]) -> int:
@@ -232,7 +232,7 @@ class Ledger:
         return len(chosen)
 
     def bind(self, facts: Mapping[str, Any]) -> bool:
-        """Bind the ledger to what it is about, such as data and search space; True where it was so bound before.
+        """Bind the ledger to its subject, such as data and search space; return True if it was bound to it before.
 
         Raises:
             ConfigError: it is bound to something else; the message says in which part. Nothing is changed.
@@ -254,7 +254,7 @@ class Ledger:
         return True
 
     def open_test_set(self, name: str, judged: Sequence[str], why: str, again: bool = False) -> Opening:
-        """Record that held-out recordings are judged on; the same opening again, after a stop, counts once.
+        """Record the use of held-out recordings; a repeated opening after a stop counts once.
 
         Args:
             name: of the sealed test set.
@@ -280,7 +280,7 @@ class Ledger:
         return opening
 
     def openings(self, name: str | None = None) -> list[Opening]:
-        """Openings of one sealed test set or of all, oldest first."""
+        """Return the openings of one or all sealed test sets, oldest first."""
         openings = [_opening(file) for file in entries_of(self.path / "openings", "*.json")]
         return [one for one in openings if name in (None, one.test_set)]
 
