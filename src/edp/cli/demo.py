@@ -47,7 +47,7 @@ def demo(
     page = build_report(run)
     seconds = time.monotonic() - began
     line = headline(read_facts(run))
-    facts = {"report": str(page), "run": str(run), "headline": line, "seconds": round(seconds, 1), "scores": scores}
+    facts = {"report": str(page), "run": str(run), "headline": line, "seconds": round(seconds, 1)}
 
     def show() -> None:
         evaluate_command.score_table(scores)
@@ -57,7 +57,7 @@ def demo(
             f"next: edp train YOUR_LOGS --map your_map.toml --out runs/first   (the bundle is in {run / 'bundle'})"
         )
 
-    emit(as_json, facts, show)
+    emit(as_json, facts | {"scores": scores.to_table()}, show)
 
 
 def _say(quiet: bool, text: str) -> None:
