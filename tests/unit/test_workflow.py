@@ -16,6 +16,7 @@ from edp.config.experiment import load_experiment
 from edp.data.prepared import Prepared
 from edp.errors import ConfigError, DataError, EdpError, StorageError
 from edp.evaluation.scores_file import ScoresFile
+from edp.jobs.workers import IN_PROCESS
 from edp.logs import open_log, read_recording, write_recording
 from edp.logs.repair import Repair
 from edp.networks.running import stream_intervals
@@ -301,12 +302,12 @@ def test_repairs_of_the_call_replace_those_of_the_file(logs):
 @pytest.mark.parametrize(("layout", "variable"), [("simulink", "logsout"), ("speedgoat", "data")])
 def test_simulated_data_sets_in_layouts_of_others_read_back_without_truth(tmp_path, layout, variable):
     order = SimulationOrder(minutes=0.1, recordings=1, seed=1, suffix=".mat", layout=layout)
-    (path,) = simulate_data_set(tmp_path, order, 1)
+    (path,) = simulate_data_set(tmp_path, order, IN_PROCESS)
     assert {"CylVels_1", "BmUp"} <= set(open_log(path, SignalMap(variable=variable)).signals)
     (read,) = DataSource.of(tmp_path).read()
     assert (read.channel_names, read.rate_hz) == (tuple(TABLE_A1), 100.0)
     with pytest.raises(StorageError, match="another simulated data set"):
-        simulate_data_set(tmp_path, replace(order, layout="struct"), 1)
+        simulate_data_set(tmp_path, replace(order, layout="struct"), IN_PROCESS)
     truth = read_recording(path, SignalMap(variable="truth"))
     assert set(truth.channel_names) == set(EXTRA_CHANNELS)
 
@@ -322,7 +323,7 @@ def test_simulated_data_sets_in_layouts_of_others_read_back_without_truth(tmp_pa
 )
 def test_orders_for_files_that_cannot_be_are_refused_before_anything_is_written(tmp_path, change, message):
     with pytest.raises(EdpError, match=message):
-        simulate_data_set(tmp_path / "data", SimulationOrder(**change), 1)
+        simulate_data_set(tmp_path / "data", SimulationOrder(**change), IN_PROCESS)
     assert not (tmp_path / "data").exists()
 
 
@@ -333,14 +334,14 @@ def test_simulated_data_sets_go_on_and_refuse_another_plan(tmp_path):
         seen.append((recording.name, kept))
 
     order = SimulationOrder(minutes=0.3, recordings=2, seed=1)
-    paths = simulate_data_set(tmp_path, order, 1, on_done)
+    paths = simulate_data_set(tmp_path, order, IN_PROCESS, on_done)
     held = [path.read_bytes() for path in paths]
     paths[0].unlink()
-    assert simulate_data_set(tmp_path, order, 1, on_done) == paths
+    assert simulate_data_set(tmp_path, order, IN_PROCESS, on_done) == paths
     assert [path.read_bytes() for path in paths] == held
     assert [kept for _, kept in seen] == [False, False, True, False]
     with pytest.raises(StorageError, match="another simulated data set"):
-        simulate_data_set(tmp_path, replace(order, seed=2))
+        simulate_data_set(tmp_path, replace(order, seed=2), IN_PROCESS)
 
 
 def test_footprints_of_settings_runs_and_bundles_agree(logs, tmp_path):
