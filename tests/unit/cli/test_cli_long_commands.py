@@ -2,6 +2,7 @@
 
 import inspect as source_of
 import json
+import re
 import shutil
 import signal
 import time
@@ -11,9 +12,13 @@ import pytest
 from typer.main import get_command
 
 from edp.cli import app
+from edp.errors import StorageError
 from edp.logs import write_recording
 from edp.recording import Recording
+from edp.report.run.facts import read_history
 from edp.signals import VOCABULARY
+from edp.storage import read_json
+from edp.storage.seals import HASH
 from edp.testing.monitor import rig_sessions
 from edp.testing.twins import sample_actuators
 
@@ -252,6 +257,72 @@ def run(edp):
 
 
 FAST = ("inspect", "control", "evaluate")
+REFUSED = re.compile("changed since|match its hash")
+READ_AGAIN = (
+    "report {run}",
+    "evaluate {run} --baselines persistence",
+    "monitor report {out}",
+    "export {out} --to onnx --out {out}/exported",
+)
+"""Commands that read results, tried in turn until one refuses the changed file; the command itself is the last.
+
+``run`` is the innermost run that holds the file.
+"""
+READ_BY_PYTHON = {
+    "transfer.json": "`edp.report.transfer` builds the page from it",
+    "results.json": "`edp.report.control` builds the page from it",
+    "controller/controller.json": "`edp live` and exports of controllers load it",
+    "fleet_report.json": "for programs of others; EDP never reads it",
+    "quality.json": "for programs of others, beside the page that shows it",
+    "screening.json": "for programs of others, beside the page that shows it",
+    "trials.json": "for programs of others, beside the page that shows it",
+    "history.jsonl": "for programs of others, where a twin or a copied network has no report of its training",
+}
+"""Files without a command that reads them here, and who does."""
+
+
+def with_one_change(content):
+    """Return a table with another value at the first place that is neither its schema nor its hash."""
+    for key, value in content.items():
+        if key in ("schema", "kind", HASH):
+            continue
+        if isinstance(value, dict) and value:
+            changed = with_one_change(value)
+            if changed == value:
+                continue
+            return content | {key: changed}
+        return content | {key: 17 if value != 17 else 18}
+    return content
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        pytest.param(command, marks=pytest.mark.slow if divided.is_slow else ())
+        for command, divided in LONG_COMMANDS.items()
+        if divided.kept
+    ],
+)
+def test_every_file_of_a_result_is_refused_once_changed(run, edp, places, tmp_path, command):
+    out = tmp_path / "out"
+    words = [*words_of(command, places, out), "--workers", 1]
+    run(*words)
+    files = [file for file in sorted(out.rglob("*.json*")) if file.stat().st_size]
+    assert files
+    for file in files:
+        whole, name = file.read_text(), str(file.relative_to(out))
+        first, *rest = whole.splitlines(keepends=True) if file.suffix == ".jsonl" else [whole]
+        changed = with_one_change(json.loads(first))
+        assert changed != json.loads(first), name
+        file.write_text("".join([json.dumps(changed) + "\n", *rest]))
+        with pytest.raises(StorageError, match=REFUSED):
+            read_history(file) if file.suffix == ".jsonl" else read_json(file)
+        inner = next((folder for folder in file.parents if (folder / "run.json").exists()), out)
+        lines = [line.format(out=out, run=inner).split() for line in READ_AGAIN]
+        said = (ended.out + ended.err for ended in (edp(*line) for line in (*lines, words)))
+        known = any(name.endswith(known) for known in READ_BY_PYTHON)
+        assert known or any(map(REFUSED.search, said)), f"{name}: no command refuses it"
+        file.write_text(whole)
 
 
 @pytest.mark.parametrize(
