@@ -1,4 +1,4 @@
-"""The report of a run: `facts` reads, `figures` computes, `charts` describes, `page` writes one offline HTML file."""
+"""Report of a run: `facts` reads, `figures` computes, `charts` describes, `page` writes one offline HTML file."""
 
 from edp.report.compare.page import build_compare_page
 from edp.report.compare.paired import Comparison, compare_runs

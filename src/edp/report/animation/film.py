@@ -1,4 +1,4 @@
-"""A film of a scene, MP4 or GIF: frames drawn with NumPy, encoded by ffmpeg where the system has it."""
+"""Film of a scene as MP4 or GIF: frames drawn with NumPy, encoded by ffmpeg where the system has it."""
 
 from __future__ import annotations
 
@@ -90,12 +90,12 @@ class _Front:
         self.tips = arms.sum(axis=1)
 
     def at(self, points: NDArray[np.complexfloating]) -> Points:
-        """Metres before and above the boom foot, as complex numbers, to pixels."""
+        """Return the pixels of points: complex numbers, metres in front of and above the boom foot."""
         z = np.asarray(points, dtype=np.complex128)
         return np.stack(((z.real - self.left) * self.scale, (self.top - z.imag) * self.scale), axis=-1)
 
     def draw(self, image: Image, k: int) -> None:
-        """The machine in frame `k`."""
+        """Draw the machine in frame `k`."""
         scene, u, level = self.scene, self.unit, -self.foot
         far, low = self.left + 1.66 * sum(self.lengths), level - 8.0 * u
         if scene.ground.shape[1]:

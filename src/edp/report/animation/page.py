@@ -1,4 +1,4 @@
-"""Side view of a recording: one offline HTML page that plays the front, with pressures and velocities beside it."""
+"""Side view of a recording on one offline HTML page, with its pressures and velocities."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class ForecastLine:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is shown, at `FRAMES_PER_S`; every array has shape (frame, columns).
+    """Recording as the side view shows it, at `FRAMES_PER_S`; each array has shape (frame, columns).
 
     Attributes:
         name: of the recording.
@@ -88,7 +88,7 @@ def scene_of(
     seconds: float | None = None,
     forecasts: Sequence[ForecastLine] = (),
 ) -> Scene:
-    """What a page or film of a recording shows.
+    """Return the scene of a recording for a page or a film.
 
     Args:
         recording: with joint angles (`JointAngle_1..3`) or strokes (`CylStroke_1..3`).
@@ -170,7 +170,7 @@ class _Columns:
 
 
 def _filled(values: Any) -> Array:
-    """Missing values by straight lines between their neighbours; zeros where there is nothing."""
+    """Return values with gaps filled by straight lines between their neighbours; all zeros without any value."""
     samples = np.asarray(values, dtype=float)
     finite = np.isfinite(samples)
     if finite.all():
@@ -219,7 +219,7 @@ def _angles(shown: _Columns, machine: Machine) -> Array:
 
 
 def stroke_tables(machine: Machine) -> tuple[tuple[Array, Array], ...]:
-    """Strokes (m, ascending) and the joint angles (rad) that go with them, of boom, arm and bucket, 201 of each."""
+    """Return strokes (m, ascending) and joint angles (rad) of boom, arm and bucket, 201 of each."""
     from edp.sim.machine import layout as at
     from edp.sim.machine.parameters import pack
     from edp.sim.physics import linkage
@@ -293,7 +293,7 @@ def _plain(scene: Scene) -> dict[str, object]:
 
 
 def _gappy(values: Array | None) -> list[float | None] | None:
-    """Values with as many digits as a picture shows, and None where there is none."""
+    """Return values rounded to the resolution of a picture, None for missing ones."""
     if values is None:
         return None
     finite = np.abs(values[np.isfinite(values)])
@@ -303,7 +303,7 @@ def _gappy(values: Array | None) -> list[float | None] | None:
 
 
 def geometry_of(machine: Machine) -> dict[str, object]:
-    """What ``side_view.js`` draws a machine from: lengths (m) and angles (degrees) as plain JSON values."""
+    """Return the machine's lengths (m) and angles (degrees) for ``side_view.js`` as plain JSON values."""
     return {
         "length": machine.bodies.length,
         "boom": asdict(machine.boom_cylinder),

@@ -20,7 +20,7 @@ FONT_PER_CELL = 7
 
 
 class Image:
-    """A white picture of `width` by `height` pixels to paint on; coordinates are pixels from the upper left corner."""
+    """White picture of `width` by `height` pixels; coordinates are pixels from the upper left corner."""
 
     def __init__(self, width: int, height: int) -> None:
         self._fine = PIL.Image.new("RGB", (width * FINE, height * FINE), (255, 255, 255))
@@ -31,15 +31,15 @@ class Image:
         self._draw.polygon(_scaled(points), fill=colour)
 
     def line(self, points: Points, colour: Colour, thick: float) -> None:
-        """A line through points, shape (point, 2), `thick` pixels wide."""
+        """Draw a line through points, shape (point, 2), `thick` pixels wide."""
         self._draw.line(_scaled(points), fill=colour, width=max(1, round(thick * FINE)), joint="curve")
 
     def text(self, x: int, y: int, words: str, colour: Colour, size: int) -> None:
-        """A label whose upper left corner is at `x`, `y`; its capitals are five times `size` pixels high."""
+        """Draw a label with its upper left corner at `x`, `y`; its capitals are five times `size` pixels high."""
         self._draw.text((x * FINE, y * FINE), words, fill=colour, font=_font(size), anchor="lt")
 
     def pixels(self) -> NDArray[np.uint8]:
-        """The picture, uint8, shape (height, width, 3)."""
+        """Return the picture, uint8, shape (height, width, 3)."""
         return np.asarray(self._fine.reduce(FINE), dtype=np.uint8)
 
 

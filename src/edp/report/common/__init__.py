@@ -1,1 +1,1 @@
-"""What all pages share: style, tables, figures, templates, wording."""
+"""Parts common to all pages: style, tables, figures, templates, wording."""

@@ -1,4 +1,4 @@
-"""What a figure shows, as plain data: `interactive` draws it on a page, `picture` into files."""
+"""Figures as plain data; `interactive` draws them on a page, `picture` into files."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class ChartAxis:
 
 @dataclass(frozen=True, kw_only=True)
 class Mark:
-    """What a panel can hold.
+    """Element of a panel.
 
     Attributes:
         name: in the legend; marks of one name share an entry, and an empty name has none.
@@ -235,7 +235,7 @@ class Panel:
     second: ChartAxis | None = None
 
     def of(self, chosen: Mapping[str, str]) -> Panel:
-        """The panel with the marks of the options chosen."""
+        """Return the panel with the marks of the chosen options."""
         return replace(self, marks=tuple(mark for mark in self.marks if fits(mark, chosen)))
 
 
@@ -296,12 +296,12 @@ class Chart:
         return -(-len(self.panels) // self.columns)
 
     def first(self) -> Chart:
-        """The chart with the first option of each choice, where nobody can choose another."""
+        """Return the chart with the first option of each choice, for media without choices."""
         chosen = {control.key: control.options[0][0] for control in self.choices}
         return replace(self, panels=tuple(panel.of(chosen) for panel in self.panels), choices=())
 
     def pictures(self) -> Iterator[Chart]:
-        """One chart without choices for each picture: `name` is the file's, `title` and axes say what was chosen."""
+        """Yield one chart without choices for each picture; title and axes state the chosen options."""
         across = next((control for control in self.choices if control.key == self.across), None)
         chosen_by = [control for control in self.choices if control is not across]
         for options in itertools.product(*(control.options for control in chosen_by)):
@@ -326,13 +326,13 @@ def fits(mark: Mark, chosen: Mapping[str, str]) -> bool:
 
 
 def with_unit(text: str, unit: str) -> str:
-    """An axis title, its unit in brackets."""
+    """Return an axis title with its unit in brackets."""
     shown = unit_text(unit)
     return f"{text} [{shown}]" if shown else text
 
 
 def finite(value: float, digits: int = 5) -> float | None:
-    """A value of a few digits, so that a page stays small; None where there is none."""
+    """Return a value rounded to `digits` digits, which keeps pages small; None for a value that is not finite."""
     return float(f"{value:.{digits}g}") if math.isfinite(value) else None
 
 

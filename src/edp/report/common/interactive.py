@@ -59,7 +59,7 @@ class Plot:
     controls: tuple[Control, ...] = ()
 
     def spec(self) -> dict[str, object]:
-        """What the page's script needs, ready for JSON."""
+        """Return the data of the page's script, ready for JSON."""
         keeps = {control.key: control.keeps_zoom for control in self.controls}
         return {"name": self.name, "figure": json.loads(self.figure.to_json()), "controls": keeps}
 
@@ -70,7 +70,10 @@ def plots(charts: Iterable[Chart]) -> dict[str, Plot]:
 
 
 def plot(chart: Chart, title: str = "") -> Plot:
-    """A chart as a figure of a page; the first option of each choice is shown. `title` is for where no heading is."""
+    """Return a chart as a figure of a page with the first option of each choice.
+
+    `title` is for figures without a heading.
+    """
     grid = _grid(chart)
     # A figure is made of plain tables at once: each later change costs plotly as much as making it.
     layout = grid.to_plotly_json()["layout"]
@@ -113,7 +116,7 @@ def plot(chart: Chart, title: str = "") -> Plot:
 
 
 def _put(table: dict[str, Any], changes: Mapping[str, object]) -> None:
-    """Changes into a table, key by key; a table in it keeps what is not changed."""
+    """Put changes into a table, key by key; nested tables keep their other keys."""
     for key, value in changes.items():
         if isinstance(value, dict) and isinstance(table.get(key), dict):
             _put(table[key], value)
@@ -122,12 +125,12 @@ def _put(table: dict[str, Any], changes: Mapping[str, object]) -> None:
 
 
 def _refs(side: Any) -> tuple[str, str]:
-    """How traces name the axes of a panel."""
+    """Return the names by which traces refer to the axes of a panel."""
     return side.xaxis.plotly_name.replace("axis", ""), side.yaxis.plotly_name.replace("axis", "")
 
 
 def _grid(chart: Chart) -> go.Figure:
-    """The axes of all panels, where they lie."""
+    """Return the figure with the axes of all panels in their places."""
     rows, columns = chart.rows, chart.columns
     across = len(chart.shares) == columns > 1
     shares = {"column_widths" if across else "row_heights": list(chart.shares)} if chart.shares else {}
@@ -145,7 +148,7 @@ def _grid(chart: Chart) -> go.Figure:
 
 
 def _frame(chart: Chart) -> dict[str, object]:
-    """What all panels share."""
+    """Return the layout of all panels: margins, legend, font, colours."""
     top = (46 if any(panel.title for panel in chart.panels) else 26) + (0 if chart.legend == "none" else 20)
     return {
         "template": go.layout.Template(),
@@ -192,7 +195,7 @@ def _axis(axis: ChartAxis, upright: bool) -> dict[str, object]:
 
 
 def _rule(rule: GuideLine, across: str, upwards: str) -> dict[str, object]:
-    """A line or a stripe through a panel, from edge to edge, as a shape."""
+    """Return a line or a stripe through a panel, from edge to edge, as a shape."""
     way, other = ("x", "y") if rule.x is not None else ("y", "x")
     at = rule.x if rule.x is not None else rule.y
     refs = {"x": across, "y": upwards}
@@ -291,7 +294,7 @@ def _(mark: Texts) -> list[Trace]:
 
 
 def _hover(mark: Mark) -> dict[str, object]:
-    """The text at a point, in plotly's form."""
+    """Return the text at a point in plotly's form."""
     if mark.hover is None:
         return {"hoverinfo": "skip"}
 
@@ -326,7 +329,7 @@ def _along(x: Positions | Evenly) -> dict[str, object]:
 
 
 def _escaped(positions: Any) -> Any:
-    """Numbers as they are, names escaped."""
+    """Return positions with names escaped and numbers unchanged."""
     return (
         [_text(at) if isinstance(at, str) else at for at in positions]
         if isinstance(positions, list | tuple)
@@ -335,7 +338,7 @@ def _escaped(positions: Any) -> Any:
 
 
 def _text(text: str) -> str:
-    """Plotly reads a subset of HTML in its texts, so what stands in them is escaped, here and nowhere else."""
+    """Escape a text for plotly, which reads a subset of HTML; all texts pass through here."""
     return html.escape(printable_lines(text)).replace("\n", "<br>")
 
 

@@ -43,7 +43,7 @@ class Points:
 
 @dataclass(frozen=True)
 class Terms:
-    """Names and what each of them is.
+    """List of terms, each with its explanation.
 
     Attributes:
         rows: name and text, or `Points` in place of a long text.
@@ -178,7 +178,7 @@ def _shown(parts: Sequence[Part | None]) -> list[Part]:
 
 
 def _parts_within(part: Section | Fold | Subsection) -> Iterator[Part]:
-    """Yield all parts, those of folds and groups, too."""
+    """Yield all parts, including those of folds and subsections."""
     for inner in part.parts:
         if isinstance(inner, Fold | Subsection):
             yield from _parts_within(inner)

@@ -89,7 +89,7 @@ def write_pictures(folder: str | Path, charts: Iterable[Chart]) -> list[Path]:
 
 
 def write_drawings(folder: str | Path, drawings: Mapping[str, Callable[[Figure], None]]) -> list[Path]:
-    """The same for whatever draws into a figure of matplotlib, by the name of its file.
+    """Write drawings by functions that draw into a matplotlib figure; keys are file names.
 
     Raises:
         StorageError: the folder or a file cannot be written.
@@ -135,7 +135,7 @@ def _draw_formats(draw: Callable[[Figure], None], dpi: int) -> dict[str, bytes]:
 
 
 def file_name(target: str) -> str:
-    """A name that any file system takes."""
+    """Return a name that is valid on any file system."""
     # 80 characters stay within the limit of every file system, with a suffix behind them.
     return "".join(c if c.isalnum() or c in "-_" else "_" for c in target)[:80] or "target"
 
@@ -243,7 +243,7 @@ def _finish(axes: Axes, axis: ChartAxis, way: str, names: Mapping[str, int]) -> 
 
 @singledispatch
 def _draw(mark: Mark, axes: Axes, names: Mapping[str, Mapping[str, int]], layer: int, bars: Sequence[Bars]) -> Any:
-    """Draw a mark and return what stands for it in the legend; `bars` are those of its panel, side by side."""
+    """Draw a mark and return its entry in the legend; `bars` are those of its panel, side by side."""
     raise TypeError(f"no drawing for {type(mark).__name__}")
 
 

@@ -1,4 +1,4 @@
-"""Rows of a page that state where a result comes from."""
+"""Rows of a page that state the origin of a result."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ _HEX = re.compile(r"#[0-9a-fA-F]{6}")
 
 
 def template(name: str) -> Template:
-    """The template of a page by its file name; compiled once a process."""
+    """Return the template of a page by its file name; it is compiled once per process."""
     return _environment().get_template(name)
 
 
@@ -36,7 +36,7 @@ def stylesheet(*names: str) -> str:
 
 
 def json_text(value: Any) -> Markup:
-    """Return plain values as JSON that cannot end its script element, whatever names they have."""
+    """Return plain values as JSON that cannot end its script element, whatever their names are."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
 

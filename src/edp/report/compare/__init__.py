@@ -1,1 +1,1 @@
-"""Several runs beside each other: `runs` reads, `paired` compares, `charts` and `page` show."""
+"""Comparison of several runs: `runs` reads, `paired` compares, `charts` and `page` show."""

@@ -31,13 +31,13 @@ MOST_ROWS = 40
 
 
 def compare_charts(comparison: Comparison) -> list[Chart]:
-    """Every figure that there are facts for."""
+    """Return the charts for which facts are present."""
     makers = (change_chart, horizon_chart, recording_chart, learning_chart, cost_chart)
     return [chart for chart in (maker(comparison) for maker in makers) if chart is not None]
 
 
 def _looks(comparison: Comparison) -> list[Table]:
-    """Name, colour and symbol of each run; the first, against which the others stand, is dark grey."""
+    """Return name, colour and symbol of each run; the first one, the reference, is dark grey."""
     names = short_labels(run.name for run in comparison.runs)
     colours = (GREY, BLUE, *MUTED)
     return [
@@ -111,7 +111,7 @@ def _curve(comparison: Comparison, run: ComparedRun, output: str) -> tuple[list[
 
 
 def recording_chart(comparison: Comparison) -> Chart | None:
-    """Error on each common recording, a row a recording, the hardest for the first run at the bottom."""
+    """Return the error on each common recording, one row per recording, sorted by the error of the first run."""
     measures = comparison.measures[:6]
     marks: list[Mark] = []
     base = comparison.errors(comparison.runs[0], measures[0])
@@ -130,7 +130,7 @@ def recording_chart(comparison: Comparison) -> Chart | None:
 
 
 def learning_chart(comparison: Comparison) -> Chart | None:
-    """Validation error of each run against its epochs, or against the time that it had trained."""
+    """Return the validation error of each run against epochs, or against training time."""
     marks: list[Mark] = []
     values: list[float | None] = []
     for run, look in zip(comparison.runs, _looks(comparison), strict=True):

@@ -15,7 +15,7 @@ SHOWN_ERRORS = 4
 
 
 def build_compare_page(comparison: Comparison, title: str = "") -> Page:
-    """Return the page of a comparison; its title is the names of the first two runs if none is given."""
+    """Return the page of a comparison; its default title is the names of the first two runs."""
     measure, first = comparison.measures[0], comparison.runs[0].name
     charts = {chart.name: chart for chart in compare_charts(comparison)}
     errors = [error_table(comparison, one) for one in comparison.measures]
@@ -125,7 +125,7 @@ def recording_table(comparison: Comparison, measure: Measure) -> Table:
 
 
 def model_table(comparison: Comparison) -> Table:
-    """What each run is, and what it takes."""
+    """Return a table of the runs: model, size, cost."""
     costs = list(dict.fromkeys(cost for run in comparison.runs for cost in run.costs))
     rows = tuple(
         (run.name, run.label, *(count_text(run.costs[cost]) if cost in run.costs else None for cost in costs))

@@ -1,4 +1,4 @@
-"""Differences of runs on the recordings that all of them were judged on, with paired intervals."""
+"""Differences between runs on their common recordings, with paired intervals."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Array = NDArray[np.floating]
 
 @dataclass(frozen=True)
 class RunDifference:
-    """What a run's error is more or less than that of the first run.
+    """Difference between the error of a run and that of the first run.
 
     Attributes:
         change: mean difference over the first run's mean error, -0.2 for a fifth less.
@@ -63,7 +63,7 @@ class RunDifference:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Several runs, compared on what they have in common; the first one is what the others are measured against.
+    """Comparison of several runs on their common recordings and measures; the first run is the reference.
 
     Attributes:
         runs: two or more, of one kind.
@@ -78,7 +78,7 @@ class Comparison:
     remarks: tuple[str, ...]
 
     def errors(self, run: ComparedRun, measure: Measure) -> NDArray[np.float64]:
-        """(recording,) errors of a run on the common recordings."""
+        """Return the errors of a run on the common recordings ``(recording,)``."""
         return np.array([run.errors[measure][name] for name in self.recordings])
 
     def error(self, run: ComparedRun, measure: Measure) -> float:
@@ -86,7 +86,7 @@ class Comparison:
         return float(self.errors(run, measure).mean())
 
     def differences(self, measure: Measure) -> dict[str, RunDifference]:
-        """Of each run but the first, by name."""
+        """Return the difference of each run from the first one, by name."""
         first, *others = self.runs
         base = self.errors(first, measure)
         rows = []
@@ -111,7 +111,7 @@ class Comparison:
         return results
 
     def headline(self) -> str:
-        """The first question's answer: which run has less error, and whether that is more than chance."""
+        """State which run has less error, and whether the difference is more than chance."""
         measure, first = self.measures[0], self.runs[0]
         parts = []
         for name, difference in sorted(self.differences(measure).items(), key=lambda item: item[1].change)[:NAMED]:
@@ -130,7 +130,7 @@ class Comparison:
 
 
 def compare_runs(folders: Sequence[str | Path]) -> Comparison:
-    """Compare judged runs on what they have in common.
+    """Compare judged runs on their common recordings and measures.
 
     Args:
         folders: run folders; the others are measured against the first.
@@ -209,7 +209,7 @@ def _enough(change: Array, over: str) -> bool:
 
 
 def _blocks(first: ComparedRun, second: ComparedRun, measure: Measure, names: Sequence[str]) -> NDArray[np.float64]:
-    """(block,) differences of the mean absolute error, in stretches of `BLOCK_S` of the predictions that both kept."""
+    """Return differences of the mean absolute error ``(block,)`` in stretches of `BLOCK_S` of common predictions."""
     if first.kind == FREE or first.rate_hz != second.rate_hz or not first.rate_hz:
         return np.empty(0)
     length = max(round(BLOCK_S * first.rate_hz), 1)

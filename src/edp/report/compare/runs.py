@@ -1,4 +1,4 @@
-"""What a comparison reads of each run: errors by quantity and recording, learning curve, size and cost."""
+"""Facts of each run for a comparison: errors by quantity and recording, learning curve, size, cost."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Measure:
 
     @property
     def when(self) -> str:
-        """What of the output, and how far ahead."""
+        """Name the quantity and the horizon."""
         return f"{figure(1000 * self.ahead_s)} ms ahead" if self.what == "mean absolute error" else self.what
 
 
@@ -93,7 +93,7 @@ class ComparedRun:
     skip: int = 0
 
     def target(self, name: str) -> tuple[int, float] | None:
-        """Column of a target in the arrays, and its factor to the unit of reports; None where there is no such."""
+        """Return the column of a target in the arrays and its factor to the report unit; None for an unknown target."""
         places = {target: (column, factor) for column, (target, factor) in enumerate(self.targets)}
         return places.get(name)
 
@@ -105,7 +105,7 @@ class ComparedRun:
 
 
 def read_runs(folders: Sequence[str | Path]) -> list[ComparedRun]:
-    """The runs of some folders, in that order.
+    """Read the runs of some folders, in that order.
 
     Args:
         folders: run folders, or folders in them that `edp evaluate --data` wrote.
@@ -134,7 +134,7 @@ def read_runs(folders: Sequence[str | Path]) -> list[ComparedRun]:
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """The last part of each path, or as many parts as tell them apart."""
+    """Return the last part of each path, or as many parts as make the names different."""
     for parts in range(1, 6):
         names = ["/".join(path.parts[-parts:]) for path in paths]
         if len(set(names)) == len(names):
@@ -184,7 +184,7 @@ def _network(path: Path, name: str) -> ComparedRun:
 
 
 def _outputs(facts: Facts) -> list[tuple[str, str]]:
-    """Name and unit of what has errors of its own: the mean first, where it means something."""
+    """Return name and unit of each output with errors; the mean comes first if all outputs share a unit."""
     outputs = [(target.name, unit_text(target.unit)) for target in facts.targets]
     if len(outputs) == 1:
         return outputs
@@ -196,7 +196,7 @@ def _digest(provenance: Provenance | None) -> str:
 
 
 def _costs(facts: Facts) -> dict[str, float]:
-    """What a network takes, of what its footprint says; anything of another form is not known."""
+    """Return the costs that the footprint states; entries of an unknown form are left out."""
     footprint = facts.footprint or {}
     costs = {"Parameters": footprint.get("parameters"), "Multiply-accumulates per tick": footprint.get("macs_tick")}
     core = str(_table(footprint.get("budget")).get("core", "cortex_m4f"))
@@ -247,7 +247,7 @@ def _has_header(path: Path) -> bool:
 
 
 def _add(errors: dict[Measure, dict[str, float]], row: ChannelErrors, recording: str, what: str, at: float) -> None:
-    """The errors of one recording: their mean, where the channels share a unit, and each channel's own."""
+    """Add the errors of one recording: each channel's, and their mean if the channels share a unit."""
     values = ({MEAN: row.mean} if row.unit and len(row.by_channel) > 1 else {}) | dict(row.by_channel)
     for output, value in values.items():
         if value is not None:
@@ -255,7 +255,7 @@ def _add(errors: dict[Measure, dict[str, float]], row: ChannelErrors, recording:
 
 
 def recording_that_differs(first: ComparedRun, second: ComparedRun, names: set[str]) -> str:
-    """A recording of one name that is not the same in two runs, as far as both kept it; empty where there is none."""
+    """Return the name of a recording whose content differs between two runs; empty if all common ones agree."""
     for name in sorted(names & first.predictions.keys() & second.predictions.keys()):
         shared = [target for target, _ in first.targets if second.target(target) is not None]
         parts = []

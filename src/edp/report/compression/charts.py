@@ -67,7 +67,7 @@ def profile_chart(facts: CompressionResult) -> Chart:
 
 
 def front_chart(facts: CompressionResult) -> Chart:
-    """Error over that of the teacher against a cost, with the limit of the budget."""
+    """Return error relative to the teacher against cost, with the limit of the budget."""
     groups = list(dict.fromkeys(row.label for row in facts.rows))
     errors = [_percent(row) for row in facts.rows]
     marks: list[Mark] = []

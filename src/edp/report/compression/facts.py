@@ -1,4 +1,4 @@
-"""What a search for a smaller network left on disk, as tables and points."""
+"""Result of a compression as tables and points."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ COSTS = {"cycles": "Cycles per tick, high estimate", "parameter_bytes": "Memory 
 
 
 def smallest(facts: CompressionResult) -> list[int]:
-    """Indices of a row for each network: that of its smallest format; the teacher in float32 comes first."""
+    """Return the index of each network's smallest format; the teacher in float32 comes first."""
     rows, smallest = facts.rows, dict[tuple[str, bool], int]()
     for index, row in enumerate(rows):
         network = row.run, row.recipe == "teacher" and row.number_format == "float32"
@@ -29,7 +29,7 @@ def cost_of(row: CompressedRow, name: str) -> float:
 
 
 def front_table(facts: CompressionResult, horizon: str) -> Table:
-    """A table in the form of Table 4.9, with what the controller sees beside it; what is on the front stands out."""
+    """Return a table in the form of Table 4.9 with memory and time on the controller; rows on the front are marked."""
     teacher, unit = facts.teacher.scores[horizon]["mae"], facts.unit
     rows: list[tuple[Value, ...]] = []
     for row in facts.rows:
@@ -90,7 +90,7 @@ def held_out_table(facts: CompressionResult) -> Table | None:
 
 
 def headline(facts: CompressionResult) -> str:
-    """One sentence: what was found."""
+    """State the result in one sentence."""
     best, budget = facts.best, facts.budget.name
     if best is None:
         return f"None of the networks made fits the budget “{budget}”"
@@ -115,7 +115,7 @@ def verdict(facts: CompressionResult) -> list[str]:
 
 
 def caveats(facts: CompressionResult) -> list[str]:
-    """What the figures can and cannot show."""
+    """Return the limits of the evidence."""
     held_out, parts = facts.held_out_test, facts.recordings
     lines = [
         "Cycles, program and memory beside constants are estimates; MACs are counted, and so are the bytes of all "

@@ -42,7 +42,7 @@ def control_charts(facts: ControlFacts) -> list[Chart]:
 
 
 def path_chart(facts: ControlFacts, choice: Control) -> Chart:
-    """The tip's path beside the reference, seen from the side."""
+    """Return the path of the tip and the reference in side view."""
     marks: list[Mark] = []
     for n, recording in enumerate(facts.recordings):
         when, rows = {LOOP: str(n)}, drawn_rows(recording)
@@ -109,7 +109,7 @@ def levers_chart(facts: ControlFacts, choice: Control) -> Chart:
 
 
 def solver_chart(facts: ControlFacts, choice: Control) -> Chart:
-    """Time of each step of the controller, as the share of steps below it."""
+    """Return the distribution of the controller's time per step."""
     marks: list[Mark] = []
     share = np.linspace(0.0, 1.0, 201)
     for n, times in enumerate(facts.solve_us):
@@ -122,22 +122,22 @@ def solver_chart(facts: ControlFacts, choice: Control) -> Chart:
 
 
 def tip_of(recording: Recording) -> Array:
-    """True tip x, y (m) and attitude (rad), shape (ticks, 3)."""
+    """Return true tip x, y (m) and attitude (rad), shape (ticks, 3)."""
     return recording.select(("TipX_true", "TipY_true", "TipAngle_true"))
 
 
 def reference_of(recording: Recording) -> Array:
-    """Reference of the tip, the same shape."""
+    """Return the reference of the tip, shape (ticks, 3)."""
     return recording.select(("Reference_TipX", "Reference_TipY", "Reference_TipAngle"))
 
 
 def drawn_rows(recording: Recording) -> slice:
-    """Rows of which lines are drawn, evenly spread."""
+    """Return the rows of drawn lines, evenly spread."""
     return slice(0, None, max(1, recording.samples // MOST_DRAWN))
 
 
 def evenly(recording: Recording, rows: slice) -> Evenly:
-    """Times of the drawn rows."""
+    """Return the times of the drawn rows."""
     return Evenly(0.0, (rows.step or 1) / recording.rate_hz)
 
 

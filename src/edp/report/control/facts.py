@@ -42,7 +42,7 @@ class ControlFacts:
 
 
 def verdict(facts: ControlFacts) -> list[str]:
-    """What the loops were, in sentences behind the headline."""
+    """Describe the loops in sentences after the headline."""
     content = facts.content
     summary = content["summary"]
     lines = [
@@ -60,7 +60,7 @@ def verdict(facts: ControlFacts) -> list[str]:
 
 
 def tiles(facts: ControlFacts) -> list[tuple[str, str, str]]:
-    """Key figures: value, unit, what it is."""
+    """Return key figures: value, unit, description."""
     summary = facts.content["summary"]
     rows = [
         (number(summary["position_rms_mm"]), "mm", "position error of the tip (rms, mean over the loops)"),
@@ -76,7 +76,7 @@ def tiles(facts: ControlFacts) -> list[tuple[str, str, str]]:
 
 
 def loop_table(facts: ControlFacts) -> Table:
-    """A row of figures a loop."""
+    """Return one row of figures per loop."""
     heads = (
         ("Position rms", "mm", "position_rms_mm"),
         ("p95", "mm", "position_p95_mm"),
@@ -98,7 +98,7 @@ def loop_table(facts: ControlFacts) -> Table:
 
 
 def event_table(facts: ControlFacts) -> Table:
-    """What controllers logged."""
+    """Return the events that controllers logged."""
     rows: list[tuple[Value, ...]] = [
         (loop["name"], event["tick"], event["ticks"], event["text"]) for loop in facts.loops for event in loop["events"]
     ]
@@ -108,7 +108,7 @@ def event_table(facts: ControlFacts) -> Table:
 
 
 def solver_table(facts: ControlFacts) -> Table:
-    """Times of a step of the controller."""
+    """Return the controller's time per step."""
     rows: list[tuple[Value, ...]] = [
         (loop["name"], *(loop["solve_us"][key] for key in ("median", "p99", "max"))) for loop in facts.loops
     ]

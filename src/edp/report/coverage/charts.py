@@ -1,4 +1,4 @@
-"""Figures of what a data set covers: spectrum, excitation by lags, poses, joint histograms."""
+"""Figures of a data set's coverage: spectrum, excitation by lags, poses, joint histograms."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ DECADES = 4
 
 
 def coverage_charts(coverage: Coverage) -> list[Chart]:
-    """Every figure that a data set has data for."""
+    """Return the figures for which the data set has data."""
     charts = [spectrum_chart(coverage), excitation_chart(coverage), occupancy_chart(coverage.occupancy)]
     charts += [joint_chart(coverage, group) for group in GROUPS]
     return [chart for chart in charts if chart is not None]
@@ -121,7 +121,7 @@ def occupancy_chart(occupancy: Occupancy | None) -> Chart | None:
 
 
 def joint_chart(coverage: Coverage, group: str) -> Chart | None:
-    """Joint histograms of one kind side by side, in shares of the samples on a logarithmic scale."""
+    """Return joint histograms of one kind side by side: fraction of samples on a logarithmic scale."""
     joints = [joint for joint in coverage.joints if joint.group == group][:6]
     if not joints:
         return None
@@ -142,7 +142,7 @@ def joint_chart(coverage: Coverage, group: str) -> Chart | None:
 
 
 def _cells(x: list[float], y: list[float], share: NDArray[np.float64], top: float, unit: str, hover: str) -> Cells:
-    """Decades above a ten-thousandth of the fullest cell; white where nothing was."""
+    """Return decades above a ten-thousandth of the fullest cell; cells without samples are white."""
     floor = top * 10.0**-DECADES
     level = np.log10(np.maximum(share, floor) / max(floor, 1e-30))
     ticks = tuple((float(tick), f"{top * 10.0 ** (tick - DECADES):.2g}") for tick in range(DECADES + 1))

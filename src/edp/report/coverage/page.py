@@ -1,4 +1,4 @@
-"""One offline HTML page of what a data set covers."""
+"""Offline HTML page of a data set's coverage."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NO_COMMANDS = Markup(
 
 
 def build_coverage_page(coverage: Coverage, title: str, quality: DataQuality | None = None) -> Page:
-    """Return the page of what a data set covers.
+    """Return the page of a data set's coverage.
 
     Args:
         coverage: what the data set covers.
@@ -136,7 +136,7 @@ def _pose_text(coverage: Coverage) -> str:
 
 
 def headline(coverage: Coverage) -> str:
-    """What the data cover, in a sentence."""
+    """State the coverage of the data in one sentence."""
     parts = []
     if coverage.occupancy is not None:
         kind = "of the poses" if coverage.occupancy.samples.ndim > 1 else "of the stroke"
@@ -150,7 +150,7 @@ def headline(coverage: Coverage) -> str:
 
 
 def verdict(coverage: Coverage) -> list[str]:
-    """What is missing for learning a model of the machine from these data."""
+    """Return the gaps of these data for learning a model of the machine."""
     lines = []
     inputs = coverage.spectrum
     if inputs is not None and any(inputs.flat_to_hz) and min(inputs.flat_to_hz) < inputs.used_hz:
@@ -193,7 +193,7 @@ def tiles(coverage: Coverage) -> list[tuple[str, str, str]]:
 
 
 def wanted_table(coverage: Coverage) -> Table:
-    """Figures beside what is wanted of them."""
+    """Return figures with their required values."""
     rows = tuple(
         (
             _first_up(w.name),
@@ -251,7 +251,7 @@ def joints_table(coverage: Coverage) -> Table:
 
 
 def distance_table(coverage: Coverage) -> Table | None:
-    """Distance from tests to training beside that within training."""
+    """Return the distance from tests to training, and that within training."""
     far = coverage.distance
     if far is None:
         return None

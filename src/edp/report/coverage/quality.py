@@ -31,7 +31,7 @@ def quality_section(quality: DataQuality) -> Section:
 
 
 def recordings_table(quality: DataQuality) -> Table:
-    """A row for each recording."""
+    """Return one row per recording."""
     rows = tuple(
         (
             report.name,
@@ -59,7 +59,7 @@ def recordings_table(quality: DataQuality) -> Table:
 
 
 def channels_table(quality: DataQuality) -> Table:
-    """Sensor facts of each channel, over all recordings: the worst of each."""
+    """Return the sensor facts of each channel, the worst over all recordings."""
     columns = (
         Column("Channel"),
         Column("Unit"),

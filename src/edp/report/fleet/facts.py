@@ -1,4 +1,4 @@
-"""A fleet as a reader sees it: machines by error, drift and alarms, and for the worst ones what stands out."""
+"""Fleet in figures: machines by error, drift and alarms, with the probable causes of the worst ones."""
 
 from __future__ import annotations
 
@@ -74,12 +74,12 @@ class FleetFacts:
 
     @property
     def median(self) -> float:
-        """Of the machines' errors; not a number where none was judged."""
+        """Return the median error of the machines; NaN if none was judged."""
         return float(np.median([row.mae for row in self.rows])) if self.rows else float("nan")
 
 
 def fleet_facts(report: FleetReport, title: str) -> FleetFacts:
-    """Return what a reader sees of a fleet report."""
+    """Return the figures and sentences of a fleet report."""
     units = {target.unit for target in report.targets}
     failed = tuple((row.machine, row.failed) for row in report.machines if row.errors is None)
     usual = _Usual(
@@ -92,7 +92,7 @@ def fleet_facts(report: FleetReport, title: str) -> FleetFacts:
 
 
 class _Usual:
-    """What is usual in the fleet, and how a machine departs from it."""
+    """Typical values of the fleet and the departure of a machine from them."""
 
     def __init__(self, judged: Sequence[MachineErrors], targets: Sequence[str]) -> None:
         self.targets = targets
@@ -131,7 +131,7 @@ class _Usual:
         return [*reasons, *self._unusual(row)]
 
     def _outputs(self, row: MachineErrors) -> list[str]:
-        """The output whose error departs most from the fleet's."""
+        """Name the output whose error departs most from the fleet's."""
         ratios = np.asarray(row.by_target) / np.maximum(self.by_target, 1e-30)
         worst = int(np.argmax(ratios))
         if ratios[worst] < LARGER:
@@ -144,7 +144,7 @@ class _Usual:
         return [f"its outputs change {ratio:.1f} times as fast as the fleet's"] if ratio > LARGER else []
 
     def _unusual(self, row: MachineErrors) -> list[str]:
-        """The input that departs most from the fleet's, in robust deviations."""
+        """Name the input that departs most from the fleet's, in robust deviations."""
         words = {"mean": "lies", "std": "varies"}
         far = []
         for (name, statistic), (middle, spread) in self.inputs.items():
@@ -155,7 +155,7 @@ class _Usual:
 
 
 def headline(facts: FleetFacts) -> str:
-    """The fleet in a sentence."""
+    """State the result for the fleet in one sentence."""
     if not facts.rows:
         return f"None of {len(facts.failed)} machines could be judged."
     worst = facts.rows[0]
@@ -167,7 +167,7 @@ def headline(facts: FleetFacts) -> str:
 
 
 def verdict(facts: FleetFacts) -> list[str]:
-    """What a reader must know behind the headline."""
+    """Return the sentences after the headline."""
     drifting = sum(row.drifts for row in facts.rows)
     lines = [f"{drifting} of {len(facts.rows)} machines drift: their error grew over the time of their logs."]
     watched = [row for row in facts.rows if row.changes is not None]
@@ -185,7 +185,7 @@ def verdict(facts: FleetFacts) -> list[str]:
 
 
 def tiles(facts: FleetFacts) -> list[tuple[str, str, str]]:
-    """Key figures: value, unit, what it is."""
+    """Return key figures: value, unit, description."""
     errors = [row.mae for row in facts.rows]
     hours = sum(row.minutes for row in facts.rows) / 60.0
     high = float(np.quantile(errors, 0.9)) if errors else float("nan")
@@ -199,7 +199,7 @@ def tiles(facts: FleetFacts) -> list[tuple[str, str, str]]:
 
 
 def worst_table(facts: FleetFacts) -> Table:
-    """The worst machines, and why."""
+    """Return the worst machines with the probable causes."""
     rows: list[tuple[Value, ...]] = [
         (row.name, row.mae, "; ".join(row.why) or "nothing stands out: the network is less exact here")
         for row in facts.rows[:WORST]
@@ -232,5 +232,5 @@ def machine_table(facts: FleetFacts) -> Table:
 
 
 def failed_table(facts: FleetFacts) -> Table:
-    """Machines that could not be judged."""
+    """Return the machines without a judgement, with the reasons."""
     return Table("Machines that could not be judged", (Column("Machine"), Column("Why", is_text=True)), facts.failed)

@@ -88,7 +88,7 @@ def errors_chart(facts: FleetFacts) -> Chart:
 
 
 def drift_chart(facts: FleetFacts) -> Chart:
-    """Error against drift, a point a machine."""
+    """Return error against drift, one point per machine."""
     marks: list[Mark] = []
     for drifts, colour, name in ((False, BLUE, "steady"), (True, MUTED[0], "drifts")):
         rows = [row for row in facts.rows if row.drift is not None and row.drifts is drifts]

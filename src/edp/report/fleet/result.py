@@ -42,7 +42,7 @@ class RecordingError:
 
 @dataclass(frozen=True)
 class MachineAlarms:
-    """What a monitor reported of a machine.
+    """Reports of a monitor on a machine.
 
     Attributes:
         changes: alarms that say the same count once.
@@ -117,7 +117,7 @@ class ReportedMachine:
 
 @dataclass(frozen=True)
 class ReportedNetwork:
-    """Network of a fleet report: where it lies, content address of its weights, and its description."""
+    """Network of a fleet report: its path, content address of its weights, and its description."""
 
     path: str
     weights: str

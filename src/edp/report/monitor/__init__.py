@@ -1,1 +1,1 @@
-"""The page of a monitor's run: alarms, their evidence, and what they could be."""
+"""Page of a monitor's run: alarms, evidence, and possible causes."""

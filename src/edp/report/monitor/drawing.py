@@ -121,7 +121,7 @@ def timeline(trace: RecordingTrace, facts: MonitorFacts) -> Drawing:
 
 
 def overview(facts: MonitorFacts) -> Drawing:
-    """A row a recording: the largest statistic over its limit as a shade, alarms as marks."""
+    """Return one row per recording: the largest statistic over its limit as a shade, alarms as marks."""
     traces = facts.traces.recordings
     if len(traces) > MOST_ROWS:
         with_alarms = {alarm.recording for alarm in facts.alarms}
@@ -146,7 +146,7 @@ def overview(facts: MonitorFacts) -> Drawing:
 
 
 def evidence(alarm: AlarmFacts) -> Drawing:
-    """Which summaries of residuals are off since the onset, and how far, in healthy standard deviations."""
+    """Return the deviations of residual summaries since the onset, in healthy standard deviations."""
     shown = alarm.evidence[:MOST_EVIDENCE]
     most = max([abs(value) for _, value in shown] + [1.0])
     left, right = 260, 70
@@ -177,7 +177,7 @@ def _group_rows(trace: RecordingTrace, facts: MonitorFacts, across: Across) -> t
 
 @dataclass(frozen=True)
 class CellRow:
-    """Where a row of shades lies, what it is called, and how many cells it has at most."""
+    """Position, name and largest number of cells of a row of shades."""
 
     top: float
     block_s: float
@@ -187,7 +187,7 @@ class CellRow:
 
 
 def _cells(values: FloatArray, row: CellRow, texts: Sequence[str]) -> list[Patch]:
-    """A row of shades, a patch a shade; equal neighbours are one rectangle."""
+    """Return a row of shades, one patch per shade; equal neighbours are one rectangle."""
     levels, factor = pooled(values, row.most)
     steps = np.where(np.isnan(levels[:, 0]), -1, np.searchsorted(LEVELS, levels[:, 0], side="right"))
     if len(steps) == 0:
@@ -226,7 +226,7 @@ class Across:
         self.scale = (WIDTH - LEFT - RIGHT) / seconds
 
     def __call__(self, seconds: float) -> float:
-        """The horizontal place of a time."""
+        """Return the horizontal position of a time."""
         return round(LEFT + seconds * self.scale, 1)
 
 
@@ -244,7 +244,7 @@ def _path(points: Sequence[tuple[float, float]]) -> str:
 
 
 def _ticks(seconds: float, across: Across, bottom: float, trace: RecordingTrace | None) -> list[Label]:
-    """Times below a drawing: of the day where a recording's start is known."""
+    """Return the time labels below a drawing: time of day if the recording's start is known."""
     start = start_time(trace.start) if trace is not None else None
     steps = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 14400, 43200, 86400)
     step = next((value for value in steps if seconds / value <= 10), steps[-1])

@@ -79,17 +79,17 @@ class MonitorFacts:
     unseen: str = ""
 
     def trace_of(self, alarm: AlarmFacts) -> RecordingTrace | None:
-        """The trace of the recording of an alarm."""
+        """Return the trace of an alarm's recording."""
         return next((trace for trace in self.traces.recordings if trace.name == alarm.recording), None)
 
     def start_of(self, recording: str) -> datetime | None:
-        """When a recording began, where that is known."""
+        """Return the start time of a recording if it is known."""
         trace = next((trace for trace in self.traces.recordings if trace.name == recording), None)
         return start_time(trace.start) if trace is not None else None
 
 
 def start_time(text: str) -> datetime | None:
-    """The time that ISO 8601 text stands for; None for anything else."""
+    """Return the time of an ISO 8601 text; None for any other text."""
     try:
         return datetime.fromisoformat(text) if text else None
     except ValueError:
@@ -97,7 +97,7 @@ def start_time(text: str) -> datetime | None:
 
 
 def headline(facts: MonitorFacts) -> str:
-    """The answer first: how many alarms in which time, and what they say."""
+    """State the number of alarms, the time, and the causes in one sentence."""
     hours = hours_text(facts.traces.hours)
     if not facts.alarms:
         outside = any(remark.startswith(OUTSIDE) for remark in facts.remarks)
@@ -113,7 +113,7 @@ def headline(facts: MonitorFacts) -> str:
 
 
 def _subject(alarm: AlarmFacts) -> str:
-    """What an alarm is of, without its time."""
+    """Return the subject of an alarm without its time."""
     if not alarm.causes:
         return "unnamed changes"
     first = alarm.causes[0]
@@ -131,7 +131,7 @@ def again_text(facts: MonitorFacts, again: Sequence[AlarmFacts]) -> str:
 
 
 def hours_text(hours: float) -> str:
-    """A time of operation."""
+    """Return a time of operation as text."""
     return f"{hours:.1f} h" if hours >= 1.0 else f"{hours * 60.0:.3g} min"
 
 
@@ -153,7 +153,7 @@ def verdict(facts: MonitorFacts) -> list[str]:
 
 
 def tiles(facts: MonitorFacts) -> list[tuple[str, str, str]]:
-    """Key figures: value, unit, what it is."""
+    """Return key figures: value, unit, description."""
     grades = Counter(alarm.severity for alarm in facts.alarms)
     with_alarms = {alarm.recording for alarm in facts.alarms}
     quiet = sum(trace.name not in with_alarms for trace in facts.traces.recordings)
@@ -173,7 +173,7 @@ SEVERITIES = (("stop", "reasons to stop"), ("warning", "warnings"), ("note", "no
 
 
 def alarm_table(facts: MonitorFacts) -> Table:
-    """A row an alarm."""
+    """Return one row per alarm."""
     rows: list[tuple[Value, ...]] = []
     labels = label_by_name(alarm.recording for alarm in facts.alarms)
     for alarm in facts.alarms[: 10 * MOST_ALARMS]:
@@ -198,7 +198,7 @@ def alarm_table(facts: MonitorFacts) -> Table:
 
 
 def cause_table(alarm: AlarmFacts) -> Table | None:
-    """What an alarm could be, the most likely cause first; None without a dictionary."""
+    """Return the possible causes of an alarm, the most likely first; None without a dictionary."""
     rows: list[tuple[Value, ...]] = [
         (
             cause.words,
@@ -220,7 +220,7 @@ def cause_table(alarm: AlarmFacts) -> Table | None:
 
 
 def confusions_of(facts: MonitorFacts, alarm: AlarmFacts) -> list[str]:
-    """Sentences on what the most likely cause of an alarm cannot be told from with the present sensors."""
+    """State which faults the present sensors cannot separate from the most likely cause of an alarm."""
     if not alarm.causes:
         return []
     first = alarm.causes[0]
@@ -235,7 +235,7 @@ def confusions_of(facts: MonitorFacts, alarm: AlarmFacts) -> list[str]:
 
 
 def confusion_table(facts: MonitorFacts) -> Table:
-    """Faults that cannot be told apart, the worst pairs first."""
+    """Return faults that the sensors cannot separate, the worst pairs first."""
     rows: list[tuple[Value, ...]] = [
         (pair.first, pair.second, pair.error, pair.sensor or MISSING, pair.sensor_error) for pair in facts.confusions
     ]

@@ -115,5 +115,5 @@ def _alarm(facts: MonitorFacts, alarm: words.AlarmFacts, again: Sequence[words.A
 
 
 def _html(macro: str, *values: Any) -> Markup:
-    """Return what a macro of ``monitor.jinja`` writes."""
+    """Return the text of a macro of ``monitor.jinja``."""
     return Markup(getattr(template("monitor.jinja").module, macro)(*values))

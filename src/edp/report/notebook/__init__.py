@@ -1,4 +1,4 @@
-"""What a notebook shows of recordings, predictions, scores and studies: tables as HTML, figures that stand alone."""
+"""Notebook display of recordings, predictions, scores and studies: HTML tables and figures without scripts."""
 
 from edp.report.notebook.figures import BandLine, prediction_figure, recordings_figure, score_figure, study_figure
 from edp.report.notebook.tables import html_of, score_tables, study_html, text_of

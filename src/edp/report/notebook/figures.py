@@ -1,4 +1,4 @@
-"""Figures for a notebook: one choice of what is shown each, so that they need no script around them."""
+"""Figures for a notebook, each with one fixed choice, so that they need no script."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def recordings_figure(recording: Recording, channels: Sequence[str]) -> go.Figur
 
 
 def prediction_figure(lines: Sequence[BandLine], rate_hz: float, title: str) -> go.Figure:
-    """Predictions over what was measured, a row a target, with the interval where there is one."""
+    """Return predictions over measurements, one row per target, with intervals if present."""
     panels, labels = [], label_by_name(line.channel.name for line in lines)
     for line in lines:
         marks: list[Mark] = []
@@ -74,7 +74,7 @@ def prediction_figure(lines: Sequence[BandLine], rate_hz: float, title: str) -> 
 
 
 def score_figure(facts: Facts) -> go.Figure:
-    """Root-mean-square error of every judged model, against the horizon where there are several."""
+    """Return the root-mean-square error of every judged model, against the horizon if there are several."""
     chart = horizon_chart(facts)
     if chart is None:
         raise ConfigError("there are no scores to draw; judge the predictor first")
@@ -82,7 +82,7 @@ def score_figure(facts: Facts) -> go.Figure:
 
 
 def study_figure(study: StudyFile, name: str | None = None) -> go.Figure:
-    """A figure of a study by name; without one the first that there are facts for.
+    """Return a figure of a study by name; the default is the first one with facts.
 
     Raises:
         ConfigError: there is no such figure, or no phase is decided yet.

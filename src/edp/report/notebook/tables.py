@@ -33,7 +33,7 @@ def html_of(tables: Iterable[Table], title: str = "") -> str:
 
 
 def text_of(table: Table, width: int = TERMINAL) -> str:
-    """A table in columns of one width each, for a terminal.
+    """Return a table as text for a terminal, in columns of constant width.
 
     Headings are broken at spaces; columns that do not fit beside the others follow below, behind the names again.
 
@@ -58,7 +58,7 @@ def text_of(table: Table, width: int = TERMINAL) -> str:
 
 
 def _lines(columns: Sequence[Sequence[list[str]]], widths: Sequence[int], chosen: Sequence[int]) -> list[str]:
-    """Lines of some columns: headings of several rows, which stand on the first row of cells, then the cells."""
+    """Return the lines of some columns: headings, which end on the same line, followed by cells."""
     heads = [_broken(columns[i][0], widths[i]) for i in chosen]
     tall = max(map(len, heads)) if any(any(head) for head in heads) else 0
     rows = [[head[len(head) - tall + row] if len(head) - tall + row >= 0 else "" for head in heads]
@@ -68,7 +68,7 @@ def _lines(columns: Sequence[Sequence[list[str]]], widths: Sequence[int], chosen
 
 
 def _broken(words: Sequence[str], width: int) -> list[str]:
-    """Words in lines of at most a width, which holds the longest of them."""
+    """Break words into lines of at most a width; the width is at least that of the longest word."""
     lines = [words[0]]
     for word in words[1:]:
         if len(lines[-1]) + 1 + len(word) <= width:
@@ -79,12 +79,12 @@ def _broken(words: Sequence[str], width: int) -> list[str]:
 
 
 def score_tables(facts: Facts) -> list[Table]:
-    """A table for each horizon: every judged model, the best first."""
+    """Return one table per horizon: every judged model, the best first."""
     return comparison_tables(facts)
 
 
 def study_html(study: StudyFile) -> str:
-    """What a search came to, and how far its phases are."""
+    """Return the result of a search and the progress of its phases."""
     sentences = " ".join([words.headline(study), *words.verdict(study)])
     phases = phases_table(study)
     return f"<div><p>{_safe(sentences)}</p>{html_of([phases] if phases is not None else [])}</div>"

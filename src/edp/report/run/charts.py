@@ -1,4 +1,4 @@
-"""Figures of a run: each takes the plain data of `figures` and says how they look."""
+"""Figures of a run; each takes the plain data of `figures` and gives their look."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ DOTS_AT_MOST = 40  # recordings; above that a rank curve, names on hover
 
 
 def run_charts(facts: Facts) -> list[Chart]:
-    """Every figure that the run has data for."""
+    """Return the figures for which the run has data."""
     makers = (prediction_chart, residual_chart, horizon_chart, speed_chart, recording_chart, learning_chart)
     return [chart for chart in (maker(facts) for maker in makers) if chart is not None]
 
 
 def colour(facts: Facts, model: str) -> str:
-    """The network is blue and the truth dark grey everywhere; a baseline keeps one muted colour in all figures."""
+    """Return the colour of a model: network blue, truth dark grey, each baseline its own muted colour."""
     if model in (NETWORK, TRUTH):
         return BLUE if model == NETWORK else GREY
     # Colours repeat when the baselines outnumber them; marks and names still tell them apart.
@@ -61,7 +61,7 @@ def _place(facts: Facts, model: str) -> int:
 
 
 def name_of(facts: Facts, model: str) -> str:
-    """A model in a legend."""
+    """Return the name of a model in a legend."""
     if model == TRUTH:
         return "Measured"
     label = label_of(facts, model)
@@ -69,7 +69,7 @@ def name_of(facts: Facts, model: str) -> str:
 
 
 def interval_name(facts: Facts) -> str:
-    """The interval that is drawn, in a legend."""
+    """Return the name of the drawn interval in a legend."""
     rows = facts.models[NETWORK].intervals.get(str(main_horizon(facts)), ()) if NETWORK in facts.models else ()
     coverages = [row.coverage for row in rows]
     return f"{100 * coverages[nearest_to_shown(coverages)]:.0f} % interval" if coverages else "Interval"
@@ -100,7 +100,7 @@ def _horizons(facts: Facts, horizons: Sequence[int], keeps_zoom: bool = False) -
 
 
 def _network_last(models: Mapping[str, object]) -> list[str]:
-    """Models in the order in which they are drawn: the network above all others."""
+    """Return models in drawing order; the network is on top."""
     return sorted(models, key=lambda name: name == NETWORK)
 
 
@@ -198,7 +198,7 @@ def _band(row: SpeedBin) -> str:
 
 
 def speed_chart(facts: Facts) -> Chart | None:
-    """Error by speed band, over the share of samples in each band."""
+    """Return error by speed band, above the fraction of samples in each band."""
     horizons = [k for k in figures.headline_first(facts) if figures.speed_bands(facts, k)]
     if not horizons:
         return None
@@ -260,7 +260,7 @@ def recording_chart(facts: Facts) -> Chart | None:
 
 
 def learning_chart(facts: Facts) -> Chart | None:
-    """Loss and validation error by epoch; a dotted line at the epoch whose weights were kept."""
+    """Return loss and validation error by epoch; a dotted line marks the epoch of the kept weights."""
     curves = figures.learning_curves(facts)
     if not curves["epoch"]:
         return None
@@ -284,7 +284,7 @@ def learning_chart(facts: Facts) -> Chart | None:
 
 
 def signal_chart(facts: Facts) -> Chart | None:
-    """The inputs over the time of one recording, a panel a unit; None where none were kept."""
+    """Return the inputs of one recording over time, one panel per unit; None if none were kept."""
     name = signals_of(facts)
     channels = () if facts.scores is None else facts.scores.inputs
     if not name or not channels:
@@ -311,5 +311,5 @@ def signal_chart(facts: Facts) -> Chart | None:
 
 
 def signals_of(facts: Facts) -> str:
-    """The recording whose signals are drawn; empty where there is none."""
+    """Return the name of the recording whose signals are drawn; empty without any."""
     return next((name for name, parts in sorted(facts.predictions.items()) if INPUTS in parts), "")

@@ -1,4 +1,4 @@
-"""What `edp train --preset auto` chose: the error that left-out data promised beside that of the test recordings."""
+"""Choice of `edp train --preset auto`: promised error on left-out data and error on the test recordings."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class ErrorBounds:
 
 @dataclass(frozen=True, kw_only=True)
 class AutoCandidate:
-    """A model that was trained, with its cross-validated errors (`promise`)."""
+    """Trained model with its cross-validated errors (`promise`)."""
 
     label: str
     seconds: float
@@ -153,7 +153,7 @@ def note_test_result(folder: Path, scores: ScoresFile, floor: ModelScores | None
 
 
 def _ratios(errors: Errors, below: Errors) -> Errors:
-    """Of errors, where the lower one is not zero."""
+    """Return ratios of errors, for denominators above zero."""
     return {
         k: {name: error / below[k][name] for name, error in row.items() if below.get(k, {}).get(name, 0.0) > 0}
         for k, row in errors.items()
@@ -169,7 +169,7 @@ def _errors(overall: ByHorizon) -> Errors:
 
 
 def candidates_table(choice: AutoChoice) -> Table:
-    """Each candidate's error on left-out data relative to the one that is kept."""
+    """Return each candidate's error on left-out data relative to the chosen one."""
     chosen, excess = choice.chosen, choice.excess
     rows = []
     for name, one in choice.candidates.items():
@@ -182,7 +182,7 @@ def candidates_table(choice: AutoChoice) -> Table:
 
 
 def model_tables(facts: Facts, choice: AutoChoice) -> list[Table]:
-    """Every model that was tried and every baseline, a table an output: left-out data beside the test recordings.
+    """Return one table per output: every candidate and baseline, on left-out data and on the test recordings.
 
     A candidate's error on left-out data is its cross-validated promise, a baseline's is that on the validation part,
     which also chose its sizes. Only the model that is kept has met the test recordings.
@@ -226,7 +226,7 @@ def _of_output(facts: Facts, choice: AutoChoice, target: ScoredTarget) -> Table:
 
 
 def promise_table(facts: Facts, choice: AutoChoice) -> Table | None:
-    """By output and horizon the error promised and that on the test recordings, both beside a simple model's."""
+    """Return promised and test errors by output and horizon, each with that of a simple model."""
     promised, unknown = choice.candidates[choice.chosen].promise, ErrorBounds(low={}, high={})
     interval = choice.interval or unknown
     skill = choice.skill or Skill(against=FLOOR, promise={}, interval=unknown)
@@ -273,7 +273,7 @@ def promise_table(facts: Facts, choice: AutoChoice) -> Table | None:
 
 
 def promise_line(choice: AutoChoice) -> str:
-    """What became of the promise on the test recordings, in a sentence; empty before they were judged."""
+    """State the promise against the errors on the test recordings; empty before they were judged."""
     tested = choice.results[NETWORK].test if NETWORK in choice.results else {}
     skill = choice.skill
     if choice.interval is None or not tested:
@@ -311,7 +311,7 @@ def _at(errors: Errors, k: int, name: str) -> float | None:
 
 
 def _with_bounds(value: float | None, bounds: list[float | None], places: int) -> str:
-    """A number with its interval, where it has one."""
+    """Return a number with its interval, if it has one."""
     if value is None or None in bounds:
         return number(value, places)
     return f"{number(value, places)} ({number(bounds[0], places)} to {number(bounds[1], places)})"

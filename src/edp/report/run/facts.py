@@ -1,4 +1,4 @@
-"""Read a run folder and state what it says as plain data: no HTML, no figures."""
+"""Content of a run folder as plain data, without HTML and figures."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ METRICS = ("rmse", "mae", "p95", "p99", "r2", "bias", "composite")
 
 @dataclass(frozen=True)
 class Facts:
-    """What a run folder holds; a part that is missing is None or empty, and `absent` names its file.
+    """Content of a run folder; a missing part is None or empty, and `absent` names its file.
 
     Attributes:
         limit: the limit of predictability of the run's data, see `read_limit`.
@@ -81,7 +81,7 @@ class Facts:
 
     @property
     def rate_hz(self) -> float | None:
-        """Samples per second, or None where the run does not say."""
+        """Return the samples per second, or None if the run does not state them."""
         task_rate = None if self.scores is None else self.scores.task.rate_hz
         rate = task_rate or (None if self.provenance is None else self.provenance.origin.rate_hz)
         return float(rate) if rate else None
@@ -94,7 +94,7 @@ class Facts:
 
     @property
     def unit(self) -> str:
-        """The unit that all outputs share; empty where they differ, because then a mean over outputs has none.
+        """Return the common unit of all outputs; empty if they differ, because then a mean over outputs has no unit.
 
         Outputs without a unit have no common one: their numbers may be anything.
         """
@@ -104,7 +104,7 @@ class Facts:
 
     @property
     def averaged(self) -> bool:
-        """Whether a mean over the outputs says something: of one output, or of several in one unit."""
+        """Test whether a mean over the outputs has a meaning: one output, or several in one unit."""
         return len(self.targets) < 2 or bool(self.unit)
 
 
@@ -154,7 +154,7 @@ def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts
 
 
 def read_settings(path: Path) -> str:
-    """The text of a run's settings, which is TOML.
+    """Return the text of a run's settings, which is TOML.
 
     Raises:
         StorageError: it cannot be read, or is none.
@@ -196,7 +196,7 @@ def read_history(path: Path) -> tuple[Mapping[str, Any], ...]:
 
 
 def read_limit(path: Path | None, provenance: Provenance | None) -> Table | None:
-    """The limit in a file, or in the folder that the run's data came from; None where there is none.
+    """Return the limit in a file, or in the folder of the run's data; None if there is none.
 
     Raises:
         StorageError: the file that was named is missing, or a limit is damaged.
@@ -217,7 +217,7 @@ def read_limit(path: Path | None, provenance: Provenance | None) -> Table | None
 
 
 def _read_foundation(folder: Path) -> Table | None:
-    """What `edp pretrain` found; None where the run is another."""
+    """Return the result of `edp pretrain`; None for another run."""
     path = folder / "foundation.json"
     if not is_file_at(path):
         return None
@@ -267,14 +267,14 @@ def _check_predictions(facts: Facts) -> None:
 
 
 def horizon_text(facts: Facts, samples: int) -> str:
-    """A horizon in milliseconds, or in samples where the rate is unknown."""
+    """Return a horizon in milliseconds, or in samples if the rate is unknown."""
     if facts.rate_hz is None:
         return count_of(samples, "sample")
     return f"{figure(1000 * samples / facts.rate_hz)} ms"
 
 
 def main_horizon(facts: Facts) -> int | None:
-    """The longest horizon: the one the headline is about."""
+    """Return the longest horizon, the subject of the headline."""
     return max(facts.horizons, default=None)
 
 
@@ -284,7 +284,7 @@ def score(model: ModelScores | None, horizon: int, metric: str = MEASURE, output
 
 
 def label_of(facts: Facts, name: str) -> str:
-    """How the report calls a model."""
+    """Return the name of a model in reports."""
     model = facts.models.get(name)
     return (model.label if model else "") or name.replace("_", " ")
 
@@ -352,7 +352,7 @@ def comparison_rows(facts: Facts, horizon: int | None = None) -> list[Comparison
 
 
 def headline(facts: Facts) -> str:
-    """The verdict: outputs that a baseline predicts better, then the network's error at the longest horizon.
+    """Return the verdict: outputs that a baseline predicts better, then the network's error at the longest horizon.
 
     Outputs in different units, or without one, have no common mean: each then stands by itself.
     """
@@ -381,7 +381,7 @@ def _figures(facts: Facts, rows: Sequence[ComparisonRow], samples: int) -> str:
 
 
 def limit_line(facts: Facts, samples: int | None) -> str:
-    """The limit at `samples` ahead in a sentence; empty where it is of other signals, or not known there."""
+    """State the limit at `samples` ahead; empty if it belongs to other signals or is unknown there."""
     limit = facts.limit
     if limit is None or samples is None or facts.rate_hz != limit["rate_hz"] or samples not in limit["horizons"]:
         return ""
@@ -401,7 +401,7 @@ def limit_line(facts: Facts, samples: int | None) -> str:
 
 
 def verdict_lines(facts: Facts) -> list[str]:
-    """What the headline means: against the best baseline, over the recordings, against the hardware budget."""
+    """Explain the headline: against the best baseline, over the recordings, against the hardware budget."""
     lines = []
     rows = comparison_rows(facts)
     best = next((row for row in rows if row.change is not None), None)
@@ -445,7 +445,7 @@ def budget_rows(footprint: Table | None) -> list[Table]:
 
 
 def recordings_won(facts: Facts, baseline: str) -> tuple[int, int]:
-    """Recordings on which the network's mean error is below a baseline's, and how many have both scores."""
+    """Count recordings on which the network's mean error is below a baseline's, and those with both scores."""
     samples = str(main_horizon(facts))
 
     def errors(name: str) -> dict[str, float]:
@@ -459,7 +459,7 @@ def recordings_won(facts: Facts, baseline: str) -> tuple[int, int]:
 
 
 def spread_text(facts: Facts) -> str:
-    """How the network's error spreads over the test recordings, as a sentence; empty where it was not computed."""
+    """State the spread of the network's error over the test recordings; empty if it was not computed."""
     spread = facts.models[NETWORK].spread.get(str(main_horizon(facts))) if NETWORK in facts.models else None
     if (
         not facts.averaged

@@ -1,4 +1,4 @@
-"""What each figure shows, as plain data: aligned, downsampled, binned. `charts` says how it looks."""
+"""Data of each figure as plain values: aligned, downsampled, binned; `charts` gives their look."""
 
 from __future__ import annotations
 
@@ -49,19 +49,19 @@ class Line:
 
 
 def horizons_shown(facts: Facts) -> list[int]:
-    """The horizons of the figures with a choice, shortest first: all, or a few with both ends."""
+    """Return the horizons of figures with a choice, shortest first: all, or a few including both ends."""
     return some_of(sorted(facts.horizons), HORIZONS_SHOWN)
 
 
 def some_of(items: Sequence[int], most: int) -> list[int]:
-    """At most `most` of a sequence, evenly spread, both ends kept."""
+    """Return at most `most` items of a sequence, evenly spread, with both ends."""
     if len(items) <= most:
         return list(items)
     return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, most).round().astype(int))]
 
 
 def aligned(predicted: Array, horizon: int) -> Array:
-    """Move predictions to the time they speak of: row t holds what was said at t - horizon; NaN where nothing was.
+    """Move predictions to the time that they predict: row t holds the value stated at t - horizon; NaN without one.
 
     Args:
         predicted: (time, ...) prediction made at t for t + horizon.
@@ -74,7 +74,7 @@ def aligned(predicted: Array, horizon: int) -> Array:
 
 
 def downsample(y: Array, points: int) -> NDArray[np.intp]:
-    """Indices of about `points` samples that keep the shape of a line, peaks included.
+    """Return indices of about `points` samples that keep the shape of a line, peaks included.
 
     MinMaxLTTB on the finite samples; the first sample of each inner gap is kept too, so that a drawn line breaks there.
     """
@@ -92,7 +92,7 @@ def downsample(y: Array, points: int) -> NDArray[np.intp]:
 
 
 def busiest_start(truth: Array, length: int) -> int:
-    """First sample of the stretch of `length` samples in which the outputs move most.
+    """Return the first sample of the stretch of `length` samples with the largest movement of the outputs.
 
     Args:
         truth: (time, target); each output counts in units of its own standard deviation.
@@ -108,7 +108,7 @@ def busiest_start(truth: Array, length: int) -> int:
 
 
 def prediction_lines(facts: Facts, budget: int = POINT_BUDGET) -> list[Line]:
-    """Truth and predictions of a few recordings: the whole of each, downsampled, and its busiest stretch, in full.
+    """Return truth and predictions of a few recordings: each whole, downsampled, and its busiest stretch in full.
 
     All traces together hold about `budget` points, so that the page stays small whatever the run holds.
     """
@@ -144,12 +144,12 @@ def prediction_lines(facts: Facts, budget: int = POINT_BUDGET) -> list[Line]:
 
 
 def _drawn(facts: Facts, recording: str) -> int:
-    """Lines of a recording beside its truth, for each horizon and output."""
+    """Count the lines of a recording next to its truth, for each horizon and output."""
     return len(facts.predictions[recording].keys() - {TRUTH, INPUTS})
 
 
 def _series(facts: Facts, recording: str, horizons: Sequence[int]) -> list[tuple[str, int | None, Array]]:
-    """(model, horizon, (time, target)) of the truth, the baselines and last, so drawn on top, the network."""
+    """Return (model, horizon, (time, target)) of the truth, the baselines and, on top, the network."""
     parts = facts.predictions[recording]
     series: list[tuple[str, int | None, Array]] = [(TRUTH, None, parts[TRUTH])]
     for name in sorted(parts.keys() - NO_MODELS, key=lambda name: name == NETWORK):
@@ -189,7 +189,10 @@ class Histogram:
 
 
 def residual_histograms(facts: Facts, bins: int = 61) -> list[Histogram]:
-    """Prediction minus truth over the recordings kept, in bins that span 99 % of the network's residuals."""
+    """Return histograms of prediction minus truth over the kept recordings.
+
+    Bins span 99 % of the network's residuals.
+    """
     histograms: list[Histogram] = []
     models = {name for parts in facts.predictions.values() for name in parts} - NO_MODELS
     order = sorted(models, key=lambda name: name != NETWORK)
@@ -237,7 +240,7 @@ def speed_bands(facts: Facts, horizon: int) -> dict[str, tuple[SpeedBin, ...]]:
 
 
 def recording_errors(facts: Facts, horizon: int) -> tuple[list[str], dict[str, list[float | None]]]:
-    """Recordings, the network's worst last, and each model's error on them in that order."""
+    """Return recordings sorted by the network's error, worst last, and each model's errors in that order."""
 
     def error(model: ModelScores, recording: str) -> float | None:
         return error_at(model.recordings.get(recording, {}), horizon, MEAN, MEASURE)
@@ -250,7 +253,7 @@ def recording_errors(facts: Facts, horizon: int) -> tuple[list[str], dict[str, l
 
 
 def learning_curves(facts: Facts) -> dict[str, list[float | None]]:
-    """Columns of the training history; `best` holds the epoch whose weights were kept, if the history says."""
+    """Return columns of the training history; `best` holds the epoch of the kept weights, if it is stated."""
     names = ("epoch", "train_loss", "validation_loss", "validation_mae", "learning_rate")
     columns: dict[str, list[float | None]] = {name: [] for name in (*names, "best")}
     for row_number, row in enumerate(facts.history, 1):
@@ -264,7 +267,7 @@ def learning_curves(facts: Facts) -> dict[str, list[float | None]]:
 
 
 def log_ticks(values: Sequence[float | None]) -> list[float]:
-    """Ticks of a logarithmic axis at 1, 2 and 5 per decade, or 1 alone over many; none where a value is <= 0."""
+    """Return ticks of a logarithmic axis: 1, 2 and 5 per decade, or 1 for many decades; none with a value <= 0."""
     present = [value for value in values if value is not None]
     if not present or min(present) <= 0:
         return []

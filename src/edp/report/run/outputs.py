@@ -1,4 +1,4 @@
-"""What a run's scores say output by output, and what its test logs can prove: the sentences around the headline."""
+"""Sentences on a run's scores by output, and on the evidence of its test logs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FEW = 3
 
 
 def losses_line(scores: ScoresFile) -> str:
-    """The outputs on which a baseline has less error at some horizon, worst first; empty where there are none."""
+    """Name the outputs on which a baseline has less error at some horizon, worst first; empty without any."""
     losses = lost_outputs(scores)
     if not losses:
         return ""
@@ -40,7 +40,7 @@ def losses_line(scores: ScoresFile) -> str:
 
 
 def judged_line(scores: ScoresFile, provenance: Provenance | None) -> str:
-    """Which logs were judged, and a warning where they are few or all of one kind; empty where scores name none.
+    """Name the judged logs, with a warning if they are few or of one kind; empty if the scores name none.
 
     Args:
         scores: the content of ``scores.json``.
@@ -62,14 +62,14 @@ def judged_line(scores: ScoresFile, provenance: Provenance | None) -> str:
 
 
 def minutes_of(folder: Path) -> float | None:
-    """That the preset auto was given for a run; None where another training made it."""
+    """Return the minutes that the preset auto was given; None for another training."""
     path = folder / "auto.json"
     minutes = read_object(path).get("minutes") if is_file_at(path) else None
     return float(minutes) if isinstance(minutes, int | float) else None
 
 
 def situation_line(scores: ScoresFile) -> str:
-    """Where the judged recordings are another situation than the training; empty where they are not."""
+    """State how the situation of the judged recordings differs from training; empty without a difference."""
     situation = scores.situation or DataSituation(outside=(), changes=())
     most = sorted(situation.changes, key=lambda row: abs(math.log(row.ratio)))
     changes = {row.target: row for row in most}  # of each target the horizon that differs most
@@ -88,7 +88,7 @@ def situation_line(scores: ScoresFile) -> str:
 
 
 def _changed(row: TargetChange) -> str:
-    """A target that changes otherwise than in training, in words."""
+    """Describe a target whose changes differ from those in training."""
     ahead = f"{row.target} in {count_of(row.horizon, 'tick')}"
     if 1 / NOTED <= row.ratio <= NOTED:
         return f"{percent(row.beyond)} of the changes of {ahead} are larger than any in training"
@@ -96,7 +96,7 @@ def _changed(row: TargetChange) -> str:
 
 
 def by_output(scores: ScoresFile, horizon: int, targets: Sequence[tuple[str, str, str]], ahead: str) -> str:
-    """The headline where outputs have no common unit: each with its own error, and the best baseline's.
+    """Return the headline for outputs without a common unit: the error of each, and the best baseline's.
 
     Args:
         scores: the content of ``scores.json``.

@@ -1,4 +1,4 @@
-"""One offline HTML page from a run folder: figures drawn by scripts of its own, no network, safe names."""
+"""Offline HTML page of a run folder: figures by its own scripts, no network access, safe names."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def build_report(
 
 
 def build_run_page(facts: run.Facts, title: str | None = None) -> Page:
-    """Return the page of a run; its title is the task's name if none is given."""
+    """Return the page of a run; its default title is the task's name."""
     drawn = (signal_chart(facts), *run_charts(facts), correlogram(facts))
     charts = {chart.name: chart for chart in drawn if chart is not None}
     name = full_path(facts.folder).name
@@ -143,7 +143,7 @@ def build_run_page(facts: run.Facts, title: str | None = None) -> Page:
 
 
 def _missing(facts: run.Facts, file: str, otherwise: str) -> Paragraph:
-    """Return why there is nothing to show: a file is missing, which a command makes, or something in the file."""
+    """Return the reason for an empty section: a missing file with the command that makes it, or `otherwise`."""
     if file not in facts.absent:
         return Paragraph(otherwise, "missing")
     text = Markup("This run has no <code>{}</code>, so there is nothing to show here. <code>{}</code> makes it.")
@@ -172,7 +172,7 @@ def _comparisons(facts: run.Facts) -> list[Part | None]:
 
 
 def _choice(facts: run.Facts) -> list[Part | None]:
-    """Return what the preset auto chose; empty for any other run."""
+    """Return the choice of the preset auto; empty for any other run."""
     choice = read_choice(facts.folder)
     if choice is None:
         return []
@@ -251,7 +251,7 @@ def _errors(facts: run.Facts, charts: Mapping[str, Chart]) -> list[Part | None]:
 
 
 def _footprint(facts: run.Facts) -> list[Part | None]:
-    """Return what a prediction costs, and the limits of the budget."""
+    """Return the cost of a prediction and the limits of the budget."""
     budget, rows, checks = run.budget_name(facts.footprint), tables.footprint_rows(facts), tables.budget_table(facts)
     against = (
         Markup("against what {} grants").format(budget)

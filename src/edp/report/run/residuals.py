@@ -1,4 +1,4 @@
-"""What is left in the residuals of the network: fit by output, and whether errors hold what could be predicted."""
+"""Residuals of the network: fit by output, and predictable parts that remain in the errors."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def fit_table(facts: Facts) -> Table | None:
 
 
 def correlations(facts: Facts, horizon: int, output: int) -> tuple[NDArray[np.float64], int]:
-    """Autocorrelation of the network's residuals at lags 1, 2, ... over the recordings kept, and how many residuals.
+    """Return the autocorrelation of the network's residuals at lags 1, 2, ... and the number of residuals.
 
     Stretches with gaps are left out; recordings are not joined, so that no lag reaches from one into another.
     """
@@ -75,7 +75,7 @@ def correlations(facts: Facts, horizon: int, output: int) -> tuple[NDArray[np.fl
 
 
 def correlogram(facts: Facts) -> Chart | None:
-    """Autocorrelation of the residuals, a panel an output, with the bounds of white noise and the horizon."""
+    """Return the autocorrelation of the residuals, one panel per output, with bounds of white noise and the horizon."""
     horizons = headline_first(facts)
     columns = min(len(facts.targets), 3)
     marks: list[list[Mark]] = [[] for _ in facts.targets]

@@ -98,7 +98,7 @@ def _by_output(facts: Facts, horizon: int | None) -> Table | None:
 
 
 def interval_table(facts: Facts) -> Table | None:
-    """What share of the truth the network's intervals hold, and how wide they are; None where it states none."""
+    """Return the coverage and width of the network's intervals; None if it states none."""
     network = facts.models.get(NETWORK)
     rows = [] if network is None else [(k, row) for k in facts.horizons for row in network.intervals.get(str(k), ())]
     if network is None or not rows:
@@ -127,7 +127,7 @@ def interval_table(facts: Facts) -> Table | None:
 
 
 def worst_recordings_table(facts: Facts, most: int = 10) -> Table | None:
-    """The recordings on which the network does worst, worst first."""
+    """Return the recordings with the largest errors of the network, worst first."""
     horizon = main_horizon(facts)
     if horizon is None or NETWORK not in facts.models:
         return None
@@ -166,7 +166,7 @@ def budget_table(facts: Facts) -> Table:
 
 
 def _meter(share: Value) -> Markup:
-    """Return a bar of the share of a limit that is used, and the share in percent."""
+    """Return a bar and the percentage of a limit that is used."""
     text = percent(share if isinstance(share, float) else None)
     if not isinstance(share, float):
         return Markup(text)
@@ -198,7 +198,7 @@ def part_table(facts: Facts) -> Table | None:
 
 
 def footprint_rows(facts: Facts) -> list[tuple[str, str]]:
-    """The network's size and cost, name and worded figure."""
+    """Return the network's size and cost: name and worded figure."""
     names = {
         "parameters": ("Parameters", ""),
         "parameters_folded": ("Parameters after folding", ""),
@@ -218,7 +218,7 @@ def footprint_rows(facts: Facts) -> list[tuple[str, str]]:
 
 
 def key_figures(facts: Facts) -> list[tuple[str, str, str]]:
-    """The tiles under the headline: (figure, unit, what it is)."""
+    """Return the tiles under the headline: (figure, unit, description)."""
     rows = comparison_rows(facts)
     tiles: list[tuple[str, str, str]] = []
     ours = next((row for row in rows if row.is_network), None)
@@ -245,7 +245,7 @@ def key_figures(facts: Facts) -> list[tuple[str, str, str]]:
 
 
 def situation_table(scores: ScoresFile, horizon: int) -> Table | None:
-    """The network's error by situation beside the best baseline's, most of the error first; None without such scores.
+    """Return the errors of network and best baseline by situation, most of the error first; None without such scores.
 
     Args:
         scores: the content of ``scores.json``.
@@ -272,7 +272,7 @@ def situation_table(scores: ScoresFile, horizon: int) -> Table | None:
 
 
 def _best_baseline(models: Mapping[str, ModelScores], horizon: int, targets: list[str]) -> str:
-    """The baseline with the least sum of errors, each in those of the network; empty where there is none."""
+    """Return the baseline with the least sum of errors relative to the network's; empty without baselines."""
     network, sums = models[NETWORK], dict[str, float]()
     for name, model in models.items():
         if name != NETWORK and model.by_situation:

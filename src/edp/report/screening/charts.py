@@ -54,7 +54,7 @@ LARGE = 60
 
 
 def screening_charts(screening: ScreeningResult) -> list[Chart]:
-    """Every figure that the screening has data for."""
+    """Return the figures for which the screening has data."""
     charts = [
         matrix_chart(matrix_views(screening)),
         lag_chart(lag_views(screening), screening.rate_hz),
@@ -66,7 +66,7 @@ def screening_charts(screening: ScreeningResult) -> list[Chart]:
 
 
 def matrix_chart(views: Sequence[MatrixView]) -> Chart | None:
-    """The matrices of dependence, one at a time."""
+    """Return the matrices of dependence, one at a time."""
     if not views or not views[0].names:
         return None
     names = views[0].names
@@ -131,7 +131,7 @@ def lag_chart(views: Sequence[LagView], rate_hz: float) -> Chart | None:
 
 
 def bar_chart(name: str, views: Sequence[BarView]) -> Chart | None:
-    """Bars with intervals, the largest on top; what is proposed is blue."""
+    """Return bars with intervals, the largest on top; proposed channels are blue."""
     if not views:
         return None
     marks: list[Mark] = []
@@ -163,7 +163,7 @@ def bar_chart(name: str, views: Sequence[BarView]) -> Chart | None:
 
 
 def _targets(more: Mapping[str, int]) -> Control:
-    """The choice of a target, by how many channels are not shown for it."""
+    """Return the choice of a target, labelled with its number of hidden channels."""
     names = {**label_by_name(more), **({"all": "mean of all targets"} if "all" in more else {})}
     options = tuple(
         (target, f"{text} (+ {more[target]} more)" if more[target] else text) for target, text in names.items()

@@ -191,7 +191,7 @@ def write_screening_pictures(screening: ScreeningResult, folder: str | Path) -> 
 
 
 def headline(screening: ScreeningResult) -> str:
-    """The proposal in a sentence."""
+    """State the proposal in one sentence."""
     proposed, window = len(screening.proposal.kept), screening.proposal.window
     return (
         f"{proposed} of {count_of(len(screening.channels), 'channel')} are proposed to predict "
@@ -201,7 +201,7 @@ def headline(screening: ScreeningResult) -> str:
 
 
 def verdict(screening: ScreeningResult, quality: DataQuality | None) -> list[str]:
-    """What to know before the proposal is used."""
+    """Return the warnings to read before the proposal is used."""
     # Late: the screening brings a compiler, and every command that may write a page imports this module.
     from edp.data.screening import FlagKind
 
@@ -221,7 +221,7 @@ def verdict(screening: ScreeningResult, quality: DataQuality | None) -> list[str
 
 
 def sentence(text: str) -> str:
-    """With a capital in front and a full stop behind."""
+    """Return text with a capital at the start and a full stop at the end."""
     stripped = text.strip()
     return stripped and stripped[0].upper() + stripped[1:] + ("" if stripped.endswith((".", "!", "?")) else ".")
 

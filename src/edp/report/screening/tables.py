@@ -26,12 +26,12 @@ FLAG_WORDS = {
 
 
 def kept_table(screening: ScreeningResult) -> Table:
-    """The proposed channels by rank."""
+    """Return the proposed channels by rank."""
     return _choices(screening, "Keep", True)
 
 
 def dropped_table(screening: ScreeningResult) -> Table:
-    """The other channels by rank."""
+    """Return the other channels by rank."""
     return _choices(screening, "Drop", False)
 
 
@@ -53,7 +53,7 @@ def _choices(screening: ScreeningResult, caption: str, keep: bool) -> Table:
 
 
 def _lag(screening: ScreeningResult, choice: ChannelVerdict) -> str:
-    """Best lag against the target that it goes best with."""
+    """Return the best lag against the most dependent target."""
     curves = [c for c in screening.lags if c.channel == choice.channel and c.target != choice.channel]
     if not curves:
         return MISSING
@@ -63,7 +63,7 @@ def _lag(screening: ScreeningResult, choice: ChannelVerdict) -> str:
 
 
 def flags_table(screening: ScreeningResult) -> Table:
-    """What is wrong with channels, leaks of the future first."""
+    """Return the faults of channels, leaks of the future first."""
     order = list(FLAG_WORDS)
     ranked = sorted(screening.flags, key=lambda flag: (_place(order, flag), flag.channel))
     rows = tuple(
@@ -173,6 +173,6 @@ def trials_table(trials: Mapping[str, Any]) -> Table:
 
 
 def stages_table(screening: ScreeningResult) -> Table:
-    """Where the time went."""
+    """Return the time of each stage."""
     rows = tuple((stage, duration(seconds)) for stage, seconds in screening.seconds.items())
     return Table("Time of the stages", (Column("Stage"), Column("Time")), rows)

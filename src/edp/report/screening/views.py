@@ -1,4 +1,4 @@
-"""What the figures of a screening show, as plain arrays; `charts` says how they look."""
+"""Data of a screening's figures as plain arrays; `charts` gives their look."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class LagRangeView:
 
 
 def matrix_views(screening: ScreeningResult) -> tuple[MatrixView, ...]:
-    """The four matrices; mutual information without its diagonal, its colours up to the 99.5 % quantile."""
+    """Return the four matrices; mutual information has no diagonal and colours up to its 99.5 % quantile."""
     views = []
     for measure, title in MEASURES.items():
         values = np.array(getattr(screening.matrices, measure), dtype=float)
@@ -133,7 +133,7 @@ def lag_views(screening: ScreeningResult) -> tuple[LagView, ...]:
 
 
 def lag_ranges(screening: ScreeningResult, within: Sequence[str] | None = None) -> tuple[LagRangeView, ...]:
-    """Where the best lags lie, by kind of signal, in Table 4.2's form.
+    """Return the ranges of the best lags by kind of signal, in the form of Table 4.2.
 
     Each channel counts once, against the target that it goes best with, itself left out; and it counts where that lag
     is certain and inside the search.
@@ -163,13 +163,13 @@ def lag_ranges(screening: ScreeningResult, within: Sequence[str] | None = None) 
 
 
 def _strongest(screening: ScreeningResult, channel: str) -> LagCurve | None:
-    """The curve of a channel against the target that it goes best with."""
+    """Return the curve of a channel against its most dependent target."""
     curves = [c for c in screening.lags if c.channel == channel != c.target and math.isfinite(c.value)]
     return max(curves, key=lambda curve: abs(curve.value), default=None)
 
 
 def stability_views(screening: ScreeningResult) -> tuple[BarView, ...]:
-    """For each metric and target the channels with the largest mean over the pieces; bars reach over a deviation."""
+    """Return for each metric and target the channels with the largest mean over pieces; bars span one deviation."""
     views = []
     for metric, title in METRICS.items():
         for target in screening.targets:
@@ -232,7 +232,7 @@ def importance_views(screening: ScreeningResult) -> tuple[BarView, ...]:
 
 
 def value_views(screening: ScreeningResult) -> tuple[BarView, ...]:
-    """What each channel's past adds to the pasts of all others, by target."""
+    """Return the information that each channel's past adds to the pasts of all others, by target."""
     proposed = set(screening.proposal.kept)
     views = []
     for target in screening.targets:
@@ -245,12 +245,12 @@ def value_views(screening: ScreeningResult) -> tuple[BarView, ...]:
 
 
 def joined(members: Sequence[str]) -> str:
-    """A group by its first members."""
+    """Return a group's name from its first members."""
     shown = ", ".join(short_labels(members)[:3])
     return shown if len(members) <= 3 else f"{shown} + {len(members) - 3}"
 
 
 def best_groups(screening: ScreeningResult, count: int = 3) -> tuple[GroupImportance, ...]:
-    """The groups of the largest mean importance."""
+    """Return the groups with the largest mean importance."""
     entries = [entry for entry in screening.importance if entry.target == "all"]
     return tuple(sorted(entries, key=lambda entry: -entry.increase)[:count])

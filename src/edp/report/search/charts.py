@@ -48,7 +48,7 @@ from edp.wording import decimals_for, number
 
 
 def study_charts(study: StudyFile) -> list[Chart]:
-    """Every figure that there are facts for."""
+    """Return the figures for which there are facts."""
     views = forests(study)
     charts = [
         variance_chart(arm_views(study), study.unit),
@@ -87,7 +87,7 @@ def variance_chart(arms: Sequence[ArmView], unit: str) -> Chart | None:
 
 
 def _arm_text(arm: ArmView) -> str:
-    """Lines under an arm: what it is and its standard deviations."""
+    """Return the lines under an arm: description and standard deviations."""
     spread = arm.composite
     places = decimals_for([spread.split, spread.seed], 2)
     lines = [f"{arm.backbone} {arm.features}", f"σ split {number(spread.split, places)}"]
@@ -145,7 +145,7 @@ def pareto_chart(points: Sequence[PointView], unit: str) -> Chart | None:
 
 
 def forest_chart(name: str, views: Sequence[Forest]) -> Chart | None:
-    """Effects of the modules with their intervals, beside them the p-values."""
+    """Return effects of the modules with intervals and p-values."""
     if not views:
         return None
     marks: list[Mark] = []
@@ -183,14 +183,14 @@ def forest_chart(name: str, views: Sequence[Forest]) -> Chart | None:
 
 
 def _tests_of(effect: EffectView) -> str:
-    """The p-values of an effect as text, and what became of the module."""
+    """Return the p-values of an effect as text, and the decision on the module."""
     parts = [f"p {chance(effect.p)}"] if effect.p is not None else []
     parts += [f"adj. {chance(effect.adjusted)}"] if effect.adjusted is not None else []
     return " · ".join([*parts, effect.remark])
 
 
 def history_chart(views: Sequence[PhaseTrack], unit: str) -> Chart | None:
-    """Score of every training in the order of the search; steps are the best of a phase so far."""
+    """Return the score of every training in order of the search; steps are the best of a phase so far."""
     scores = [score for view in views for score in view.scores]
     top = top_of(scores)
     if top is None:
@@ -228,7 +228,7 @@ def history_chart(views: Sequence[PhaseTrack], unit: str) -> Chart | None:
 
 
 def outside(views: Sequence[PhaseTrack], top: float) -> tuple[list[tuple[int, str]], ...]:
-    """Trainings above the scale, those that were pruned, and those that failed: number and what they were."""
+    """Return trainings above the scale, pruned ones, and failed ones: number and description."""
     above, pruned, failed = [], [], []
     for view in views:
         for position, score, label in zip(view.places, view.scores, view.labels):

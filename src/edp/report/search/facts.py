@@ -18,7 +18,7 @@ Absent = TypeVar("Absent")
 def of_phase(
     kind: type[Facts], absent: Absent
 ) -> Callable[[Callable[[StudyFile, Facts], Made]], Callable[[StudyFile], Made | Absent]]:
-    """Make a function of a study and a phase's facts one of the study: `absent` where the phase has not decided yet."""
+    """Make a function of a study from one of a study and a phase's facts; it returns `absent` before the decision."""
 
     def wrap(function: Callable[[StudyFile, Facts], Made]) -> Callable[[StudyFile], Made | Absent]:
         @wraps(function)
@@ -32,7 +32,7 @@ def of_phase(
 
 
 def finite(value: float | None) -> float | None:
-    """Return a number, None if there is none or it is not finite."""
+    """Return a number; None if it is absent or not finite."""
     return None if value is None or not math.isfinite(value) else value
 
 

@@ -31,7 +31,7 @@ def modules_tables(study: StudyFile) -> tuple[Table, ...]:
 
 
 def ordered(names: Sequence[str]) -> list[tuple[str, str]]:
-    """Group and module in the thesis's order, unknown ones behind."""
+    """Return group and module in the thesis's order, followed by unknown ones."""
     present = set(names)
     known_ones = [(group, name) for group, own in GROUPS.items() for name in own if name in present]
     listed = {name for _, name in known_ones}
@@ -79,7 +79,7 @@ def _modules_sound(study: StudyFile, facts: SoundScreening) -> tuple[Table | Non
 
 @of_phase(SoundScreening, None)
 def _effects(study: StudyFile, facts: SoundScreening) -> Table | None:
-    """Main effects of the two-level design."""
+    """Return the main effects of the two-level design."""
     rows = []
     for _, name in ordered(facts.registered):
         effect = facts.modules[name]
@@ -108,7 +108,7 @@ def _verdict(study: StudyFile, entry: ModuleEvidence | None, passed: bool) -> st
 
 @of_phase(SoundConfirmation, None)
 def _tests(study: StudyFile, facts: SoundConfirmation) -> Table | None:
-    """What other tests say of the modules that phase 3 tested."""
+    """Return the results of other tests for the modules that phase 3 tested."""
     rows = []
     for entry in facts.evidence:
         if entry.change is None:

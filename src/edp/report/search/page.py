@@ -214,7 +214,7 @@ def build_study_page(study: StudyFile, tables: Mapping[str, Table]) -> Page:
 
 
 def _figure(charts: Mapping[str, Chart], name: str, text: str, title: str = "") -> Subsection | None:
-    """Return a figure with its explanation; None if there are no data for it."""
+    """Return a figure with its explanation; None without data."""
     return Subsection([text, charts[name]], title) if name in charts else None
 
 
@@ -241,7 +241,7 @@ def _about(study: StudyFile) -> str:
 
 
 def study_text(study: StudyFile, tables: Mapping[str, Table]) -> str:
-    """The report as Markdown: what came out, what was decided and why, what it can show, and the tables."""
+    """Return the report as Markdown: result, decisions with reasons, limits of the evidence, tables."""
     lines = [f"# Model search on {in_markdown(study.title)}", "", f"{in_markdown(_about(study))}.", ""]
     lines += [in_markdown(words.headline(study)), "", in_markdown(" ".join(words.verdict(study))), ""]
     lines += ["## What was decided, and why", ""]

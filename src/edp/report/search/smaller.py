@@ -1,4 +1,4 @@
-"""Phase 6 of a study: its table, in the form of the thesis's Table 4.9, and what it says in short."""
+"""Phase 6 of a study: its table, in the form of the thesis's Table 4.9, and its result in short."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from edp.wording import number, percent
 
 @of_phase(SmallerFacts, None)
 def smaller_table(study: StudyFile, facts: SmallerFacts) -> Table | None:
-    """Every network in every number format: what it takes, its error, and whether it fits; the front is marked."""
+    """Return every network in every number format: cost, error, and whether it fits; the front is marked."""
     rows = tuple(
         (
             row.name,
@@ -51,7 +51,7 @@ def _mean(scores: Scores, name: str) -> float:
 
 @of_phase(SmallerFacts, "")
 def chosen_words(study: StudyFile, facts: SmallerFacts) -> str:
-    """What was chosen for the controller, and what the second sealed test set says of it."""
+    """State the choice for the controller, and its error on the second sealed test set."""
     if not facts.on or facts.budget is None:
         return ""
     if facts.chosen is None:

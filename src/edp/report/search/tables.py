@@ -19,7 +19,7 @@ from edp.wording import count_text, duration, moment, number, percent
 
 
 def study_tables(study: StudyFile) -> dict[str, Table]:
-    """Every table that there are facts for, by name."""
+    """Return the tables for which there are facts, by name."""
     tables = (
         variance_table(study),
         features_table(study),
@@ -51,13 +51,13 @@ def variance_table(study: StudyFile, facts: IsolationFacts) -> Table | None:
 
 
 def _numbers(heads: Sequence[tuple[str, str]], rows: Sequence[Sequence[Value]]) -> tuple[Column, ...]:
-    """Columns of figures, each with a precision of its own."""
+    """Return columns of numbers, each with its own precision."""
     return tuple(Column(*head, figures(values)) for head, values in zip(heads, zip(*rows), strict=True))
 
 
 @of_phase(IsolationFacts, None)
 def features_table(study: StudyFile, facts: IsolationFacts) -> Table | None:
-    """The chosen feature set against the next best, by backbone; the best backbone with it against the others."""
+    """Return the chosen feature set against the next best by backbone, and the best backbone against the others."""
     rows: tuple[tuple[Value, ...], ...] = tuple(
         (
             titled(backbone),
@@ -91,7 +91,7 @@ def features_table(study: StudyFile, facts: IsolationFacts) -> Table | None:
 
 @of_phase(CalibrationFacts, None)
 def calibration_table(study: StudyFile, facts: CalibrationFacts) -> Table | None:
-    """Table 4.4: scores of all questions of each architecture, and what the efficiency rule takes."""
+    """Return Table 4.4: scores of all questions of each architecture, and the choice of the efficiency rule."""
     rows = []
     final = {} if facts.final is None else facts.final.scores
     for backbone, calibration in facts.backbones.items():
@@ -201,7 +201,7 @@ def holdout_table(study: StudyFile, facts: SynthesisFacts) -> Table | None:
 
 
 def _against(value: float, reference: float | None, show: Callable[[float], str]) -> str:
-    """A value, and its change against the reference where it is another."""
+    """Return a value with its change against a different reference."""
     if reference is None or value == reference or reference == 0:
         return show(value)
     return f"{show(value)} ({percent(value / reference - 1, signed=True)})"

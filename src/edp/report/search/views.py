@@ -1,4 +1,4 @@
-"""What the figures of a study show, as plain values; `charts` says how they look."""
+"""Data of a study's figures as plain values; `charts` gives their look."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class ArmView:
 
 @of_phase(IsolationFacts, ())
 def arm_views(study: StudyFile, facts: IsolationFacts) -> tuple[ArmView, ...]:
-    """The arms of phase 0 in their order."""
+    """Return the arms of phase 0 in their order."""
     views = []
     for name, arm in facts.arms.items():
         backbone, _, features = name.partition(" ")
@@ -68,13 +68,13 @@ def arm_views(study: StudyFile, facts: IsolationFacts) -> tuple[ArmView, ...]:
 
 
 def titled(backbone: str) -> str:
-    """A backbone as a reader knows it."""
+    """Return the readable name of a backbone."""
     return BACKBONES.get(backbone, backbone)
 
 
 @dataclass(frozen=True)
 class PointView:
-    """A network that was asked about in phase 1, 4 or 5, all judged on the same folds with the same seeds.
+    """Network of phase 1, 4 or 5; all are judged on the same folds with the same seeds.
 
     Attributes:
         group: phase and, in phase 1, backbone.
@@ -92,7 +92,7 @@ class PointView:
 
 
 def point_views(study: StudyFile) -> tuple[PointView, ...]:
-    """Every network with a score and a cost; of a phase that has not decided yet, what the history holds."""
+    """Return every network with a score and a cost; for an undecided phase, those of the history."""
     points = [*_calibrated(study)]
     for kind, number in ((SynthesisFacts, 4), (ExplorationFacts, 5)):
         facts = study.facts(kind)
@@ -139,7 +139,7 @@ def _above_zero(costs: Mapping[str, float | None]) -> dict[str, float]:
 
 
 def valued(values: Mapping[str, Scalar]) -> str:
-    """Settings as ``units 64, loss huber``."""
+    """Return settings as text: ``units 64, loss huber``."""
     return ", ".join(
         f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}" for name, value in values.items()
     ).replace("_", " ")
@@ -156,7 +156,7 @@ def front(points: Sequence[PointView], cost: str) -> tuple[PointView, ...]:
 
 @dataclass(frozen=True)
 class EffectView:
-    """What a module does.
+    """Effect of a module on the score.
 
     Attributes:
         module: title.
@@ -199,7 +199,7 @@ class Forest:
 
 
 def forests(study: StudyFile) -> tuple[Forest, ...]:
-    """Phase 3 and phase 2, as far as they are decided; in the thesis's mode phase 3 by metric."""
+    """Return the decided effects of phases 3 and 2; in the thesis's mode phase 3 by metric."""
     candidates = (*_confirmed(study), *_screened(study))
     return tuple(forest for forest in candidates if forest.effects)
 
@@ -279,7 +279,7 @@ def _ranked(effects: Iterable[EffectView]) -> tuple[EffectView, ...]:
 
 @dataclass(frozen=True)
 class PhaseTrack:
-    """The trainings of one phase in the order in which they were asked for; those on test sessions stand apart.
+    """Trainings of one phase in order of request; those on test sessions are separate.
 
     Attributes:
         name, heading: of the track.
@@ -300,7 +300,7 @@ class PhaseTrack:
 
 
 def tracks(study: StudyFile) -> tuple[PhaseTrack, ...]:
-    """The search's history by phase."""
+    """Return the history of the search by phase."""
     tested, titles = study.tested(), {phase.name: phase.title for phase in study.phases}
     rows = [(row, index in tested) for index, row in enumerate(study.history) if row.status != "waiting"]
     views = []
@@ -322,7 +322,7 @@ def tracks(study: StudyFile) -> tuple[PhaseTrack, ...]:
 
 
 def top_of(scores: Iterable[float]) -> float | None:
-    """Upper end of a score axis that shows nearly all: what lies far above the rest is drawn at the edge."""
+    """Return the upper end of a score axis; values far above the others are drawn at the edge."""
     values = np.array([score for score in scores if math.isfinite(score)])
     if not values.size:
         return None

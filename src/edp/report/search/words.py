@@ -1,4 +1,4 @@
-"""A study in sentences: what came out, what it took, and what it can and cannot show."""
+"""Sentences on a study: result, effort, and limits of its evidence."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from edp.wording import behind, count_text, duration, listed, number, percent, s
 
 
 def headline(study: StudyFile) -> str:
-    """What came out, or how far it is."""
+    """Return the result of a study in one sentence, or its progress."""
     if "synthesis" in study.decided:
         return _result(study)
     decided = sum(phase.name in study.decided for phase in study.all_phases)
@@ -58,7 +58,7 @@ def _result(study: StudyFile, facts: SynthesisFacts) -> str:
 
 
 def verdict(study: StudyFile) -> list[str]:
-    """What was decided, in short."""
+    """Return the decisions in short sentences."""
     lines = [
         _how_sure(study),
         _features(study),
@@ -146,7 +146,7 @@ def tiles(study: StudyFile) -> list[tuple[str, str, str]]:
 
 
 def caveats(study: StudyFile) -> list[str]:
-    """What such trainings can and cannot show, from the settings of this study."""
+    """Return the limits of the evidence that these trainings give, from the settings of the study."""
     spec, sessions = study.spec, study.sessions
     updates, final = int(spec["updates"]), int(spec["final_updates"])
     horizon = count_of(int(spec["horizon"]), "sample")
@@ -179,7 +179,7 @@ def caveats(study: StudyFile) -> list[str]:
 
 
 def _length(study: StudyFile, updates: int) -> str:
-    """How long a training is, in words."""
+    """Return the length of a training in words."""
     epochs = int(study.spec.get("epochs", 1))
     if epochs == 1:
         return f"{count_text(updates)} updates"
@@ -214,7 +214,7 @@ def _thesis_power(study: StudyFile, facts: ThesisPlanning) -> tuple[str, ...]:
 
 
 def decided(study: StudyFile) -> list[tuple[str, tuple[str, ...]]]:
-    """Each phase with what it decided and why, or how far it is."""
+    """Return each phase with its decision and reason, or its progress."""
     decisions, sentences = [], {decision.phase: decision.sentences for decision in study.decisions}
     for phase in study.all_phases:
         lines = sentences.get(phase.name)
@@ -226,7 +226,7 @@ def decided(study: StudyFile) -> list[tuple[str, tuple[str, ...]]]:
 
 
 def _grouped(lines: Sequence[str]) -> tuple[str, ...]:
-    """Sentences on several names that say the same of each become one; minus signs are true ones."""
+    """Merge sentences that say the same of several names; minus signs become true ones."""
     names: dict[str, list[str]] = {}
     for line in lines:
         name, colon, rest = line.partition(": ")
@@ -236,7 +236,7 @@ def _grouped(lines: Sequence[str]) -> tuple[str, ...]:
 
 
 def missing(study: StudyFile, *names: str) -> str:
-    """That phases are not decided yet; empty where all are."""
+    """State which of the phases are not decided yet; empty if all are."""
     absent = [NUMBERS[name] for name in names if name not in study.decided]
     if not absent:
         return ""
@@ -244,5 +244,5 @@ def missing(study: StudyFile, *names: str) -> str:
 
 
 def settings(study: StudyFile) -> list[tuple[str, str]]:
-    """Settings of the search as text."""
+    """Return the settings of the search as text."""
     return [(key.replace("_", " "), setting_text(value)) for key, value in study.spec.items()]

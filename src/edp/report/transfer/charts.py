@@ -33,7 +33,7 @@ DOMAINS = {TARGET: "On the target's logs", SOURCE: "On the source's recordings"}
 
 
 def picture_charts(facts: Transfer) -> list[Chart]:
-    """The figures of the thesis, one for before and one for after; predictions of the first recording."""
+    """Return the figures of the thesis, before and after; predictions of the first recording."""
     charts = []
     for method in facts.pair:
         label = facts.methods[method].label
@@ -118,7 +118,7 @@ def error_chart(facts: Transfer, methods: Sequence[str]) -> Chart:
 
 
 def method_chart(facts: Transfer) -> Chart:
-    """MAE of every method by target, in each domain that it was judged in."""
+    """Return the MAE of every method by target, in each judged domain."""
     panels = []
     for domain in facts.domains:
         marks: list[Mark] = []

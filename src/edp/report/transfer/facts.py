@@ -1,4 +1,4 @@
-"""What a transfer left on disk, as tables, key figures and sentences."""
+"""Result of a transfer as tables, key figures and sentences."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SIGNIFICANT = 0.05
 
 @dataclass(frozen=True)
 class Transfer:
-    """Content of ``transfer.json`` and of the excerpts beside it.
+    """Content of ``transfer.json`` and of the excerpts in the same folder.
 
     Attributes:
         content: of the file.
@@ -52,7 +52,7 @@ class Transfer:
 
     @property
     def unit(self) -> str:
-        """The unit that all targets share."""
+        """Return the common unit of all targets, or "mixed units"."""
         units = {target.unit for target in self.targets}
         return unit_text(units.pop()) if len(units) == 1 else "mixed units"
 
@@ -63,12 +63,12 @@ class Transfer:
 
     @property
     def pair(self) -> tuple[str, str]:
-        """Names of the methods that stand for before and after."""
+        """Return the names of the methods for before and after."""
         return self.content.before, self.content.method
 
     @property
     def domains(self) -> list[str]:
-        """Where methods were judged: on the target, and on the source where its recordings are at hand."""
+        """Return the judged domains: the target, and the source if its recordings are available."""
         return list(self.methods[self.content.method].domains)
 
     def score(self, method: str, horizon: str, target: str = MEAN, domain: str = TARGET) -> Metrics:
@@ -90,16 +90,16 @@ class Transfer:
         return 1 - after / before
 
     def ahead(self, horizon: str) -> str:
-        """A horizon in words."""
+        """Return a horizon in words."""
         return f"{1e3 * int(horizon) / self.content.task.rate_hz:.0f} ms ahead (k = {horizon})"
 
     def name(self, target: ScoredTarget) -> str:
-        """What a target is called."""
+        """Return the readable name of a target."""
         return target.description or target.name
 
 
 def read_transfer(folder: str | Path) -> Transfer:
-    """What `edp finetune` wrote into a folder.
+    """Read the result of `edp finetune` from a folder.
 
     Raises:
         StorageError: nothing, something of another version, or damaged excerpts.
@@ -116,12 +116,12 @@ def read_transfer(folder: str | Path) -> Transfer:
 
 
 def transfer_tables(facts: Transfer, horizon: str) -> list[Table]:
-    """The two tables of a horizon."""
+    """Return the two tables of a horizon."""
     return [pair_table(facts, horizon), method_table(facts, horizon)]
 
 
 def pair_table(facts: Transfer, horizon: str) -> Table:
-    """A table in the form of Table 4.10: before and after, by target, with bias and skew."""
+    """Return a table in the form of Table 4.10: before and after, by target, with bias and skewness."""
     rows: list[tuple[Value, ...]] = []
     for method in facts.pair:
         for target in facts.targets:
@@ -145,7 +145,7 @@ def pair_table(facts: Transfer, horizon: str) -> Table:
 
 
 def method_table(facts: Transfer, horizon: str) -> Table:
-    """All methods on the same ticks, least error first, in both domains where both were judged."""
+    """Return all methods on the same ticks, sorted by error, in each judged domain."""
     direct = facts.mae(facts.content.before, horizon)
     both = SOURCE in facts.domains
     rows: list[tuple[Value, ...]] = []
@@ -207,7 +207,7 @@ def transfer_verdict(facts: Transfer) -> ErrorVerdict | None:
 
 
 def headline(facts: Transfer) -> str:
-    """One sentence: what was gained."""
+    """State the gain of the transfer in one sentence."""
     judged = transfer_verdict(facts)
     figures = _figures(facts)
     return figures if judged is None else judged.headline(figures)
@@ -246,7 +246,7 @@ def verdict(facts: Transfer) -> list[str]:
 
 
 def caveats(facts: Transfer) -> list[str]:
-    """What the figures can and cannot show."""
+    """Return the limits of the evidence."""
     minutes = facts.content.data.minutes
     return [
         f"Trained on {minutes.train:.1f} min, epochs chosen on {minutes.validation:.1f} min, judged on "

@@ -25,7 +25,7 @@ def read_candidates(folder: str | Path) -> tuple[CandidateRow, ...]:
 
 
 def choice_sentence(rows: Sequence[CandidateRow]) -> str:
-    """What was chosen and why."""
+    """State the chosen formulation and the reason."""
     chosen = next((row for row in rows if row.chosen), None)
     if chosen is None or chosen.error is None:
         return ""
@@ -40,7 +40,7 @@ def choice_sentence(rows: Sequence[CandidateRow]) -> str:
 
 
 def candidate_table(rows: Sequence[CandidateRow]) -> Table:
-    """The candidates as a table, the chosen one marked."""
+    """Return the candidates as a table with the chosen one marked."""
     lines: list[tuple[Value, ...]] = [(row.label, row.error, row.seconds, row.why) for row in rows]
     marked = frozenset(i for i, row in enumerate(rows) if row.chosen)
     heads: tuple[Column, ...] = (

@@ -56,7 +56,7 @@ def _labels(facts: FreeRunFacts) -> dict[str, str]:
 
 
 def runs_chart(facts: FreeRunFacts, part: str) -> Chart:
-    """What was measured and what the twin answered meanwhile, with its interval; a row for each channel of a part."""
+    """Return measured channels and the twin's answers with their intervals; one row per channel of a part."""
     seconds, half = facts.shown["seconds"], facts.shown.get("half_width")
     # Shown runs are thinned out evenly, so a start and a step are all that a line needs.
     time_s = Evenly(round(float(seconds[0]), 6), round(float((seconds[-1] - seconds[0]) / (len(seconds) - 1)), 6))
@@ -117,7 +117,7 @@ def horizon_chart(facts: FreeRunFacts) -> Chart:
 
 
 def steps_chart(steps: StepResponses) -> Chart | None:
-    """Response of each answer to a step of the command that is chosen; None where there is none."""
+    """Return the response of each answer to a step of the chosen command; None without steps."""
     if not steps.steps:
         return None
     seconds, panels = steps.seconds, []

@@ -1,4 +1,4 @@
-"""What the judgement of a twin left on disk, as tables, key figures and sentences; kinds of channels stay apart."""
+"""Judgement of a twin as tables, key figures and sentences; kinds of channels stay apart."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ PLAIN_UNIT = "1"
 
 @dataclass(frozen=True, eq=False)
 class FreeRunFacts:
-    """Content of ``free_run.json`` and of the runs beside it.
+    """Content of ``free_run.json`` and of the runs in the same folder.
 
     Attributes:
         title: of the page.
@@ -66,7 +66,7 @@ class FreeRunFacts:
 
     @property
     def models(self) -> Mapping[str, FreeRunScores]:
-        """The twin, then its floors."""
+        """Return the scores of the twin, followed by those of its floors."""
         return self.content.models
 
     @property
@@ -80,7 +80,7 @@ class FreeRunFacts:
         return channels
 
     def columns(self, part: str) -> range:
-        """Columns of a part in arrays of all answers."""
+        """Return the columns of a part in arrays of all answers."""
         first = sum(len(self.channels(earlier)) for earlier in PARTS[: PARTS.index(part)])
         return range(first, first + len(self.channels(part)))
 
@@ -91,12 +91,12 @@ class FreeRunFacts:
 
 
 def holds_free_runs(folder: str | Path) -> bool:
-    """Whether a folder is the run folder of a twin, or one in it with the judgement of other recordings."""
+    """Test whether a folder is the run of a twin, or a folder in it with the judgement of other recordings."""
     return any(is_file_at(Path(folder) / name) for name in (FreeRunFile.NAME, "twin/twin.json"))
 
 
 def read_free_runs(folder: str | Path) -> FreeRunFacts:
-    """What `edp twin` or `edp evaluate` wrote into a run folder, or into a folder in it.
+    """Read the result of `edp twin` or `edp evaluate` from a run folder, or from a folder in it.
 
     Raises:
         StorageError: nothing, something of another version, or damaged content.
@@ -139,7 +139,7 @@ def read_steps(folder: Path) -> StepResponses | None:
 
 
 def headline(facts: FreeRunFacts) -> str:
-    """The error of the strokes at the end of the runs in one sentence; of the answers where they are plain numbers."""
+    """State the error of the strokes at the end of the runs; of the answers if they have no unit."""
     judged = twin_verdict(facts.models)
     figures = _figures(facts)
     return figures if judged is None else judged.headline(figures)
@@ -158,14 +158,14 @@ def _figures(facts: FreeRunFacts) -> str:
 
 
 def _plain_answers(facts: FreeRunFacts) -> str:
-    """Names of the answers where they are numbers without a unit, whose integral is no stroke; else empty."""
+    """Return the names of answers without a unit, whose integral is no stroke; empty if answers have units."""
     if facts.twin.velocity_mae.unit != PLAIN_UNIT or facts.twin.velocity_mae.mean is None:
         return ""
     return listed(short_labels(channel.name for channel in facts.channels("velocities")))
 
 
 def verdict(facts: FreeRunFacts) -> list[str]:
-    """What the runs are, and how far the floors are off."""
+    """Describe the runs and the errors of the floors."""
     twin = facts.twin
     lines = [
         f"{count_of(twin.runs, 'free run')} of {figure(twin.seconds)} s in "
@@ -187,7 +187,7 @@ def verdict(facts: FreeRunFacts) -> list[str]:
 
 
 def ground_line(provenance: Provenance) -> str:
-    """The law of the ground and what it explains, in a sentence; empty where the twin knows free air alone.
+    """State the law of the ground and the error that it explains; empty for a twin of free air.
 
     Args:
         provenance: of the run; what is not as `edp twin` wrote it is passed over.
@@ -204,7 +204,7 @@ def ground_line(provenance: Provenance) -> str:
 
 
 def tiles(facts: FreeRunFacts) -> list[tuple[str, str, str]]:
-    """Key figures: value, unit, what it is."""
+    """Return key figures: value, unit, description."""
     twin = facts.twin
     velocity = twin.velocity_mae
     if mixed_units(twin):
@@ -227,7 +227,7 @@ def tiles(facts: FreeRunFacts) -> list[tuple[str, str, str]]:
 
 
 def free_run_tables(facts: FreeRunFacts) -> dict[str, Table]:
-    """Every table by name; those of which nothing is known are left out."""
+    """Return all tables with content, by name."""
     twin = facts.twin
     tables = [
         *([actuator_table(facts.models)] if mixed_units(twin) else []),
@@ -244,7 +244,7 @@ def free_run_tables(facts: FreeRunFacts) -> dict[str, Table]:
 
 
 def _worst(summaries: Mapping[str, RunSummary]) -> dict[str, RunSummary]:
-    """The recordings with the largest errors first, by the strokes at the end, or else by the velocities."""
+    """Return the recordings sorted by error, largest first: strokes at the end, or else velocities."""
 
     def size(summary: RunSummary) -> float:
         last: ChannelErrors = summary.stroke_error[-1] if summary.stroke_error else summary.velocity_mae
@@ -263,7 +263,7 @@ def _summary_table(
     summaries: Mapping[str, RunSummary | FreeRunScores],
     marked: frozenset[int] = frozenset(),
 ) -> Table:
-    """A row of errors for each of several sets of runs."""
+    """Return one row of errors for each of several sets of runs."""
     rows: list[tuple[Value, ...]] = []
     heads: list[tuple[str, str]] = []
     for label, entry in summaries.items():
@@ -349,7 +349,7 @@ def mixed_units(scores: FreeRunScores) -> bool:
 
 
 def actuator_table(models: Mapping[str, FreeRunScores]) -> Table:
-    """A row for each actuator and model: errors of its velocity, and of its stroke by time, with their units."""
+    """Return one row for each actuator and model: errors of velocity, and of stroke by time, with units."""
     columns = {
         name: [
             ("Velocity MAE", one.velocity_mae),
@@ -361,7 +361,7 @@ def actuator_table(models: Mapping[str, FreeRunScores]) -> Table:
 
 
 def ahead_by_actuator(models: Mapping[str, FreeRunScores], caption: str) -> Table:
-    """The same a few ticks ahead of measured ports."""
+    """Return the errors a few ticks ahead of measured ports, one row for each actuator and model."""
     columns = {
         name: [("Velocity MAE", one.ahead.velocity_mae), ("Stroke error", one.ahead.stroke_error)]
         for name, one in models.items()
@@ -388,7 +388,7 @@ def _by_actuator(name: str, caption: str, columns: Mapping[str, Sequence[tuple[s
 
 
 def actuator_tiles(twin: FreeRunScores) -> list[tuple[str, str, str]]:
-    """Key figures of each actuator: value, unit, what it is."""
+    """Return key figures of each actuator: value, unit, description."""
     row: ChannelErrors = twin.stroke_error[-1] if twin.stroke_error else twin.velocity_mae
     at_s = row.at_s if isinstance(row, StrokeErrors) else None
     what = "mean absolute error of {}" if at_s is None else f"error of {{}} after {figure(at_s)} s"
