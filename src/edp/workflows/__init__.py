@@ -1,3 +1,3 @@
-"""What users run, end to end: trainings, searches, compression, transfer, pre-training, adaptation, parity."""
+"""Jobs of users from start to end: training, search, compression, transfer, pre-training, adaptation, parity."""
 
 from edp.registry import load_plugins as load_plugins

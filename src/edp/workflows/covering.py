@@ -1,4 +1,4 @@
-"""What the recordings of a source cover; without the libraries of a training, which take most of a command's start."""
+"""Coverage of a source's recordings; free of training libraries, whose import takes most of a command's start."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from edp.logs.source import DataSource
 
 
 def coverage(source: DataSource, inputs: Sequence[str] = (), split: str = "") -> Coverage:
-    """What a data set covers: see `edp.data.coverage`.
+    """Return the coverage of a data set, see `edp.data.coverage`.
 
     Args:
         source: where the recordings are.

@@ -1,4 +1,4 @@
-"""What a trained network costs, and its exported forms."""
+"""Cost of a trained network, and its export."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from edp.training.twin_bundle import holds_twin, load_twin, plant_bundle
 
 
 def footprint_of(path: str | Path, budget: Budget | None = None) -> tuple[Footprint, str]:
-    """Footprint of a bundle, a run folder, or a settings file, and what it is called.
+    """Return the footprint of a bundle, a run folder or a settings file, and its name.
 
     Raises:
         EdpError: neither a bundle nor valid settings, a budget that no network of these inputs and targets meets, or a
@@ -72,7 +72,7 @@ def _predictor_of(path: str | Path) -> tuple[Predictor, str, Adaptation | None]:
 
 
 def forms() -> dict[str, str]:
-    """The first line of what is said about each form, by name."""
+    """Return the first line of each form's description by name."""
     return {name: (target.__doc__ or "").strip().partition("\n")[0] for name, target in TARGETS.items()}
 
 
@@ -102,7 +102,7 @@ def export_bundle(
 
 
 def in_integers(bundle: Bundle, calibration: DataSource) -> Bundle:
-    """A twin whose cell computes in W8A16; formats and weights are chosen on recordings in which all is measured.
+    """Return a twin whose cell computes in W8A16; complete recordings determine formats and weights.
 
     Raises:
         ConfigError: not a twin.
@@ -119,7 +119,7 @@ def in_integers(bundle: Bundle, calibration: DataSource) -> Bundle:
 
 
 def load_exported(path: str | Path) -> Bundle:
-    """The bundle of a predictor, or a twin as a bundle of a plant.
+    """Load the bundle of a predictor, or a twin as a bundle of a plant.
 
     Raises:
         BundleError: neither, or damaged.

@@ -1,4 +1,4 @@
-"""All forms that a run leaves in: those of networks, and those of controllers, followers and monitors."""
+"""All export forms of a run: networks, controllers, observers and monitors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NETWORK, MONITOR = "predictor", "monitor"
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOrder:
-    """What is to be written.
+    """Request of an export.
 
     Attributes:
         run: bundle, run folder, or a monitor.
@@ -40,7 +40,7 @@ class ExportOrder:
 
 @dataclass(frozen=True)
 class RunForm:
-    """A form of a run that is no network alone.
+    """Form of a run that is more than a network.
 
     Attributes:
         summary: what it is, in a line.
@@ -57,7 +57,7 @@ class RunForm:
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written.
+    """Result of an export.
 
     Attributes:
         files: the one to read first in front.
@@ -102,7 +102,7 @@ RUN_FORMS: Mapping[str, RunForm] = {
 
 
 def all_forms() -> dict[str, str]:
-    """Every form by name, with what it is in a line."""
+    """Return every form by name with a description in one line."""
     return {**forms(), **{name: form.summary for name, form in RUN_FORMS.items()}}
 
 

@@ -1,4 +1,4 @@
-"""What is judged of a run: its held-out recordings or other ones, all of them or evenly spread stretches."""
+"""Judged data of a run: held-out recordings or other ones, whole or evenly spread stretches."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from edp.training.bundle import Bundle
 def judged_data(
     bundle: Bundle, data: Prepared, others: Sequence[Recording] | None, at_most_h: float | None
 ) -> tuple[Prepared, Drawn | None]:
-    """The data of a run with what is judged as its test part, and how much of it was drawn; None where all is judged.
+    """Return a run's data with the judged ones as test part, and the drawn amount; None if all are judged.
 
     Args:
         bundle: of the run.

@@ -69,10 +69,10 @@ NETWORK = "network"
 
 
 class RecordingSource(Protocol):
-    """What gives recordings."""
+    """Source of recordings."""
 
     def read(self) -> list[Recording]:
-        """All of them."""
+        """Read all recordings."""
         ...
 
 
@@ -101,7 +101,7 @@ def prepare_data(source: RecordingSource, experiment: Experiment, frozen: Mappin
 
 @dataclass(frozen=True)
 class StrategyFactory:
-    """What a training has besides data and settings.
+    """Factory of the strategy of a training: its parts apart from data and settings.
 
     Attributes:
         facts: plain values that decide what is taught; they are part of the run's key and provenance.
@@ -123,7 +123,7 @@ def train(
     strategy_factory: StrategyFactory | None = None,
     data: Prepared | None = None,
 ) -> Bundle:
-    """Train on a data set and write a run folder with its bundle; an interrupted run goes on where it stopped.
+    """Train on a data set and write a run folder with its bundle; an interrupted run continues.
 
     Args:
         source: where the recordings are.
@@ -187,7 +187,7 @@ def keep_fitted(
 
 
 def _keep(run: Run, fitted: Fitted, provenance: Provenance, data: Prepared) -> Bundle:
-    """Write what a training leaves: provenance, footprint and the bundle."""
+    """Write the results of a training: provenance, footprint and the bundle."""
     write_json(run.file(PROVENANCE), provenance.to_table())
     write_json(run.file("footprint.json"), footprint(fitted.predictor).to_json())
     bundle = make_bundle(fitted.predictor, data, provenance)
@@ -196,7 +196,7 @@ def _keep(run: Run, fitted: Fitted, provenance: Provenance, data: Prepared) -> B
 
 
 def _refuse_diverged(run: Run) -> None:
-    """A run that diverged would do so again, to the same bits."""
+    """Refuse a diverged run, which would diverge again with the same bits."""
     # Every training is deterministic: trying again would take as long and end alike.
     status = run.status()
     if status.get("status") == "diverged":
@@ -228,7 +228,7 @@ def evaluate(
     workers: Workers = IN_PROCESS,
     at_most_h: float | None = None,
 ) -> Path:
-    """Judge a run on its held-out recordings, or on other ones, beside baselines trained on its training data.
+    """Judge a run on its held-out recordings, or on others, with baselines trained on its training data.
 
     Scores of the same weights, recordings and settings are kept, not computed again.
 
@@ -284,7 +284,7 @@ def evaluate(
 
 @dataclass(frozen=True)
 class EvaluatedRun:
-    """Where a process finds what it evaluates: run folder, other recordings as JSON, and most hours of them."""
+    """Location of evaluated data for a process: run folder, other recordings as JSON, and most hours of them."""
 
     run: str
     source: str
@@ -351,7 +351,7 @@ def _open_bench(evaluated_run: EvaluatedRun, digest: str, spec: JudgeSpec) -> Mo
 
 
 def other_recordings(source: DataSource | None, provenance: Provenance) -> list[Recording] | None:
-    """Other recordings, those without a map read with that of the run; None for the held-out ones."""
+    """Return other recordings, read with the run's map if they have none; None for the held-out ones."""
     return None if source is None else read_as_before(source, provenance.origin.reader).read()
 
 
@@ -362,7 +362,7 @@ def _check_run_writable(folder: Path) -> None:
 
 
 def trained_run(folder: Path) -> tuple[Bundle, Experiment, Provenance, Prepared]:
-    """Bundle, settings, provenance and data of a run, the data checked to be what it was trained on.
+    """Return bundle, settings, provenance and data of a run, after a check that the data are those of its training.
 
     Raises:
         EdpError: not a run folder of EDP, or its recordings changed since.
@@ -387,7 +387,7 @@ def channel_importance(
     progress: Progress = SILENT,
     at_most_h: float | None = None,
 ) -> tuple[ChannelImportances, Path]:
-    """Importance of each input channel to the network of a run, on its held-out recordings or on other ones.
+    """Return the importance of each input channel to a run's network, on its held-out recordings or on others.
 
     Args:
         run: run folder.
@@ -415,7 +415,7 @@ def channel_importance(
 
 
 def _floor_scores(folder: Path, data: Prepared, scores: ScoresFile) -> ModelScores | None:
-    """Scores, on the same ticks, of what the preset auto tells its skill against; None where the run has none."""
+    """Return scores on the same ticks of the reference of the preset auto's skill; None if the run has none."""
     if not is_folder_at(folder / FLOOR):
         return None
     floor = load_bundle(folder / FLOOR).predictor
@@ -428,7 +428,7 @@ def judge_bundle(bundle: Bundle, data: Prepared, spec: JudgeSpec | None = None) 
 
 
 def __getattr__(name: str) -> Any:
-    """The simulator's functions: with it comes a compiler, which every process that trains would load."""
+    """Return the simulator's functions late: they import a compiler, which no training process needs."""
     if name in ("SimulationOrder", "simulate_data_set"):
         from edp.sim import data_set
 

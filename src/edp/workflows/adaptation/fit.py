@@ -104,7 +104,7 @@ def fit_adaptation(predictor: Predictor, data: Prepared, spec: AdaptationSpec) -
 
 
 def _widths(rows: Rows) -> Rows:
-    """Standard deviations; 1 where nothing moves."""
+    """Return standard deviations; 1 for constant columns."""
     deviations = rows.std(axis=0)
     # A relative threshold: rounding gives a constant column of pressures a spread above zero.
     return np.where(deviations > 1e-9 * (1.0 + np.abs(rows).max(axis=0)), deviations, 1.0)

@@ -24,7 +24,7 @@ Rows = NDArray[np.float32]
 
 
 def tuned_spec(bundle: TwinBundle) -> TunedSpec:
-    """How the numbers of a twin follow: the temperature of the oil in its logs is known where they held it.
+    """Return which numbers of a twin adapt; oil temperature is known if the logs hold it.
 
     Raises:
         BundleError: its provenance holds another thing than a temperature there.
@@ -38,7 +38,7 @@ def tuned_spec(bundle: TwinBundle) -> TunedSpec:
 
 
 def correction_of(twin: Twin, adaptation: Adaptation, task: Task, spec: TunedSpec | None = None) -> TunedCorrection:
-    """What moves a network's predictions towards the forecasts of a grey box that follows the machine.
+    """Return the correction of a network's predictions by forecasts of a grey box that adapts to the machine.
 
     Args:
         twin: a grey box of the machine as it was.

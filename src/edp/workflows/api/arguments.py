@@ -85,7 +85,7 @@ def check_width(tables: Sequence[NDArray[Any]], names: Sequence[str]) -> Sequenc
 
 
 def names_of(names: Sequence[str] | None, usual: list[str], what: str, counted: str) -> list[str]:
-    """Return the user's names after a check, or the default names; `what` is the argument and `counted` what it names.
+    """Return the user's names after a check, or the default names; `what` is the argument, `counted` the kind of name.
 
     Raises:
         DataError: another number of them, one that is empty or stands twice, or no texts.

@@ -128,17 +128,17 @@ class Foundation:
 
     @property
     def facts(self) -> Table:
-        """What identifies it."""
+        """Return its identity."""
         return {"weights": weights_digest(self.source.predictor)}
 
     @property
     def weights(self) -> int:
-        """Parameters, which a tick of training passes through."""
+        """Count the parameters that a tick of training uses."""
         return sum(parameter.numel() for parameter in self.source.predictor.parameters())
 
     @property
     def ticks(self) -> int:
-        """Of an update, all lanes together."""
+        """Return the ticks of an update, all lanes together."""
         chunks = self._training(0, 1).chunks
         return chunks.length * chunks.batch
 
@@ -151,7 +151,7 @@ class Foundation:
         check_channels(recordings, self.source.bundle.task)
 
     def check_task(self, data: Prepared) -> None:
-        """Refuse a task other than the network's, and recordings that it cannot be trained on with.
+        """Refuse a task other than the network's, and recordings on which it cannot be trained further.
 
         Raises:
             ConfigError: every part of the task that differs.
@@ -177,7 +177,7 @@ class Foundation:
         check_signs(data, None)
 
     def tables(self, rows: int, affordable: float, seed: int, threads: int) -> Table:
-        """The tables ``model`` and ``training`` of the candidate.
+        """Return the tables ``model`` and ``training`` of the candidate.
 
         Args:
             rows: ticks to train on.
@@ -192,17 +192,17 @@ class Foundation:
         return {part: plain_tree(experiment)[part] for part in ("model", "training")}
 
     def _training(self, updates: int, threads: int) -> TrainingSpec:
-        """As `edp finetune --method full` trains, so many updates an epoch."""
+        """Return the training of `edp finetune --method full` with this number of updates per epoch."""
         own = tuned(self.source.experiment.training, FinetuneSpec())
         return replace(own, updates=updates, threads=threads, bagging=None)
 
     def strategy(self) -> TrainingStrategy:
-        """Weights to begin with; the mean error over the training part is taken out at the end."""
+        """Return the strategy: initial weights, and removal of the mean training error at the end."""
         return Centred(WarmStart(self.source.predictor))
 
 
 def read_foundation(path: str) -> Foundation | None:
-    """The network that the settings name; None where they name none.
+    """Read the network that the settings name; None if they name none.
 
     Raises:
         ConfigError: a committee, whose parts do not learn by gradient.
@@ -220,7 +220,7 @@ def read_foundation(path: str) -> Foundation | None:
 
 
 class RecurrentTrial(Enum):
-    """Whether the recurrent network is worth its share of the budget, which a short training of it tells.
+    """Decision on the recurrent network by a short training: whether it is worth its part of the budget.
 
     On simulated machines it is far ahead of a committee, on each measured set that was tried far behind: there its time
     is worth more to the trees (39 min of a full-size excavator; decision 99).
@@ -234,7 +234,7 @@ class RecurrentTrial(Enum):
 
 @dataclass(frozen=True)
 class Amount:
-    """What there is to learn from, and how long it may take.
+    """Amount of training data and time budget.
 
     Attributes:
         rows: ticks of the training and validation parts.
@@ -312,7 +312,7 @@ CANDIDATES: Registry[Candidate] = Registry("candidate")
 
 @dataclass(frozen=True)
 class Spans:
-    """What a bank gives of each channel beside its present value.
+    """Time spans of a feature bank for each channel, apart from its present value.
 
     Attributes:
         lags: ticks over which a channel changes.
@@ -323,7 +323,7 @@ class Spans:
     smoothed: list[int]
 
     def columns(self, features: int) -> int:
-        """Of a bank of so many features."""
+        """Return the number of columns of a bank with `features` features."""
         return features * (1 + len(self.lags) + len(self.smoothed))
 
 
@@ -342,7 +342,7 @@ def _columns(amount: Amount) -> int:
 
 
 def _steps(amount: Amount, groups: int) -> int:
-    """Updates of each perceptron that the budget allows and the rows are worth."""
+    """Return the updates of each perceptron within the budget and the useful number for these rows."""
     weights = MEMBERS * groups * (_columns(amount) * UNITS + UNITS * UNITS + UNITS * amount.outputs)
     affordable = amount.seconds("perceptrons") * OPERATIONS_PER_S / (PASSES * BATCH * weights)
     useful = max(USUAL_STEPS, ROW_PASSES * amount.rows // BATCH)
@@ -351,7 +351,7 @@ def _steps(amount: Amount, groups: int) -> int:
 
 
 def _fixed_seconds(amount: Amount) -> float:
-    """Processor time of what no budget shortens: linear models and radial basis functions."""
+    """Return the processor time of parts that no budget shortens: linear models and radial basis functions."""
     rows, columns = min(amount.rows, BaggingSpec().rows), _columns(amount)
     linear = LINEAR_MODELS * (2 * rows * columns**2 / LINEAR_PRODUCTS_PER_S + FOLDS * columns**3 / EIGEN_CUBES_PER_S)
     kernels = len(LENGTHS) * min(rows, JUDGED_ROWS) + (rows if rows > JUDGED_ROWS else 0)
@@ -367,7 +367,7 @@ def _near(amount: Amount) -> list[int]:
 
 @dataclass(frozen=True)
 class TreePlan:
-    """What the budget allows of trees.
+    """Sizes of the tree ensembles within the budget.
 
     Attributes:
         rounds: trees of each model; 0 where there is no time for enough of them.
@@ -393,7 +393,7 @@ class TreePlan:
 
 
 def tree_plan(amount: Amount) -> TreePlan:
-    """The most rows, then the most models, then the most left-out parts, that leave time for the trees.
+    """Return the tree ensembles within the time: most rows first, then most models, then most left-out parts.
 
     Where rows are drawn from many, few parts leave left-out trees as many rows as those of the network have; else the
     fewest that do take fewer rounds. Parts too few for it come last: such trees are better than none.
@@ -458,7 +458,7 @@ CANDIDATES.register("committee")(Candidate("the committee", _committee))
 
 
 def _recurrent(amount: Amount) -> Table | None:
-    """The network of the preset ``quick``, as many updates as the budget holds."""
+    """Return the network of the preset ``quick`` with as many updates as the budget holds."""
     # Its trainer refuses validation stretches that end within burn-in and horizon.
     shortest = max(RECURRENT_CHUNK, RECURRENT_BURN_IN + amount.horizon + 1)
     if amount.rows < RECURRENT_ROWS or amount.shortest < shortest:
@@ -500,7 +500,7 @@ CANDIDATES.register("recurrent")(Candidate("the recurrent network", _recurrent))
 
 
 def _foundation(amount: Amount) -> Table | None:
-    """A pretrained network, all of it trained on."""
+    """Return a pretrained network whose weights are all trained."""
     start = amount.foundation
     if start is None:
         return None

@@ -44,21 +44,21 @@ class Promise:
     reference: DoubleArray | None = None
 
     def error(self) -> DoubleArray:
-        """Root-mean-square error of each output, ``(output,)``: standardised, or over that of the reference."""
+        """Return the RMS error of each output ``(output,)``: standardised, or relative to the reference."""
         return np.asarray(self._error(np.arange(len(self.rows))[None])[0])
 
     def last(self, count: int) -> Promise:
-        """That of the last `count` blocks alone."""
+        """Return the promise on the last `count` blocks."""
         reference = None if self.reference is None else self.reference[-count:]
         return Promise(self.squared[-count:], self.rows[-count:], reference)
 
     def relative_to(self, other: Promise) -> Promise:
-        """This one with the errors of another one as its reference, on the blocks that both left out."""
+        """Return this promise relative to the errors of another one, on the blocks that both left out."""
         count = min(len(self.rows), len(other.rows))
         return replace(self.last(count), reference=other.last(count).squared)
 
     def interval(self, rows: int) -> dict[str, DoubleArray]:
-        """Where the error of a test of so many rows lies with `COVERAGE`, ``low`` and ``high``, ``(output,)`` each.
+        """Return the interval of the error on `rows` test rows: ``low`` and ``high``, ``(output,)`` each.
 
         Left-out rows and test are drawn from the same groups of neighbouring blocks (block bootstrap: Kuensch, 1989);
         so both are uncertain, a short test more than a long one. A test that is another situation is not foreseen.
@@ -77,7 +77,7 @@ class Promise:
         return {"low": self.error() * low, "high": self.error() * high}
 
     def _error(self, chosen: NDArray[np.int64]) -> DoubleArray:
-        """Errors over drawn blocks ``(draw, block)``, ``(draw, output)``."""
+        """Return errors over drawn blocks ``(draw, block)``, ``(draw, output)``."""
         shares = self.rows[chosen] / self.rows[chosen].sum(axis=1, keepdims=True)
 
         def mean(squared: DoubleArray) -> DoubleArray:
@@ -87,7 +87,7 @@ class Promise:
         return np.asarray(np.sqrt(mean(self.squared) / below))
 
     def _grouped(self, groups: Sequence[NDArray[np.int64]]) -> Promise:
-        """That of groups of blocks as one block each."""
+        """Return the promise with groups of blocks as one block each."""
         rows = np.array([self.rows[group].sum() for group in groups])
 
         def mean(squared: DoubleArray) -> DoubleArray:
@@ -98,7 +98,7 @@ class Promise:
 
 @dataclass(frozen=True)
 class PortfolioChoice:
-    """Which candidate is kept, and why.
+    """Choice of a candidate with its reason.
 
     Attributes:
         name: the one that is kept.
@@ -114,7 +114,7 @@ class PortfolioChoice:
 
 
 def blocks_of(data: Prepared, skip: int) -> tuple[list[Block], int]:
-    """Blocks of nearly equal size of the training stretches, then of the validation stretches; how many the latter are.
+    """Return blocks of nearly equal size, training stretches before validation stretches, and the number of the latter.
 
     Raises:
         DataError: fewer than two blocks of the validation part are longer than the largest horizon.
@@ -142,13 +142,13 @@ def blocks_of(data: Prepared, skip: int) -> tuple[list[Block], int]:
 
 
 def promise_of(predicted: Sequence[DoubleArray], truth: Sequence[DoubleArray], blocks: Sequence[Block]) -> Promise:
-    """Errors of predictions of stretches, both standardised ``(tick, output)`` and of equal length."""
+    """Return the errors of predictions of stretches, both standardised ``(tick, output)`` and of equal length."""
     squared = [np.square(predicted[n][a:b] - truth[n][a:b]).mean(axis=0) for n, a, b in blocks]
     return Promise(np.stack(squared), np.array([b - a for _, a, b in blocks], dtype=np.float64))
 
 
 def standard_truth(predictor: Predictor, data: Prepared) -> list[DoubleArray]:
-    """Change or value to be predicted at each tick of the training stretches, then of the validation stretches.
+    """Return the true change or value at each tick of the training stretches, followed by the validation stretches.
 
     Standardised by the predictor's scaling, ``(tick, output)`` each.
     """
@@ -156,7 +156,7 @@ def standard_truth(predictor: Predictor, data: Prepared) -> list[DoubleArray]:
 
 
 def promise_of_validation(predictor: Predictor, data: Prepared, blocks: Sequence[Block], judged: int) -> Promise:
-    """Errors of a network that trained on the training part alone: on the last `judged` of the blocks.
+    """Return the errors of a network trained on the training part, on the last `judged` blocks.
 
     Standardised by the data, as every candidate's: a pretrained network has a scaling of its own.
     """
@@ -171,7 +171,7 @@ def promise_of_validation(predictor: Predictor, data: Prepared, blocks: Sequence
 
 
 def choose(promises: Mapping[str, Promise]) -> PortfolioChoice:
-    """The simplest candidate whose error is within one standard error of the least (Breiman et al., 1984).
+    """Choose the simplest candidate whose error is within one standard error of the least (Breiman et al., 1984).
 
     Compared is the logarithm of the root-mean-square error of each block that every candidate left out, as the mean
     over outputs and over blocks, these weighted by their error: blocks in which the machine rests hardly count, and one

@@ -224,14 +224,14 @@ def still_inputs(data: Prepared) -> list[str]:
 
 
 def _moving(parts: Sequence[FloatArray], kinds: Sequence[Kind]) -> list[bool]:
-    """Whether each channel moves in stretches ``(time, channel)``, by its own size: units differ by factors of 1e12."""
+    """Test whether each channel moves in stretches ``(time, channel)``, relative to its own size."""
     values = np.concatenate(parts).astype(np.float64)
     spreads, sizes = values.std(axis=0), np.abs(values).max(axis=0)
     return [spread > least_spread(kind, size) for spread, size, kind in zip(spreads, sizes, kinds, strict=True)]
 
 
 def check_size(data: Prepared) -> None:
-    """Refuse data of which not all ticks can be judged in memory: every candidate is compared on every tick.
+    """Refuse data that do not fit into memory: every candidate is compared on every tick.
 
     Raises:
         ConfigError: says what it would take, what is free, and what to do.

@@ -57,7 +57,7 @@ class Portfolio:
 
 @dataclass(frozen=True, kw_only=True)
 class AutoSettings:
-    """What settles an automatic training and its judgement."""
+    """Settings of an automatic training and its judgement."""
 
     task: TaskSettings = field(default_factory=TaskSettings)
     split: SplitSpec = field(default_factory=ByRecording)
@@ -65,13 +65,13 @@ class AutoSettings:
     judge: JudgeSpec = field(default_factory=JudgeSpec)
 
     def experiment(self, model_and_training: Table) -> Experiment:
-        """The experiment of a candidate, from its tables ``model`` and ``training``."""
+        """Return the experiment of a candidate from its tables ``model`` and ``training``."""
         plain = {part: values for part, values in plain_tree(self).items() if part != "auto"}
         return build(Experiment, merged(plain, model_and_training), "of a candidate of the automatic preset")
 
 
 def usual_preset(path: str | Path | None = None, overrides: Sequence[str] = ()) -> str:
-    """The preset where none is named: ``auto``, or ``standard`` under settings of the network or its training.
+    """Return the default preset: ``auto``, or ``standard`` with settings of the network or its training.
 
     Raises:
         ConfigError: a file or an override that cannot be read.
@@ -81,7 +81,7 @@ def usual_preset(path: str | Path | None = None, overrides: Sequence[str] = ()) 
 
 
 def load_auto(path: str | Path | None = None, overrides: Sequence[str] = ()) -> AutoSettings:
-    """Settings from the preset ``auto``, changed by a TOML file, changed by ``key.path=value`` overrides.
+    """Load settings from the preset ``auto``, changed by a TOML file and by ``key.path=value`` overrides.
 
     Raises:
         ConfigError: names every unknown key, wrong type and impossible value at once; settings of the network or of
@@ -97,7 +97,7 @@ def load_auto(path: str | Path | None = None, overrides: Sequence[str] = ()) -> 
 
 
 def auto_settings(table: Table, where: str) -> AutoSettings:
-    """Settings from a table.
+    """Return the settings of a table.
 
     Raises:
         ConfigError: as `load_auto`.

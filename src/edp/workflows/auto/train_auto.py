@@ -1,4 +1,4 @@
-"""Train the portfolio, choose by left-out data, and write the winner as a run of its own."""
+"""Training of all candidates, choice by left-out data, and the winner as its own run."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ from edp.workflows.train_evaluate import keep_fitted
 
 @dataclass(frozen=True, eq=False)
 class AutoResult:
-    """What an automatic training gives.
+    """Result of an automatic training.
 
     Attributes:
         bundle: the winner's.
@@ -66,7 +66,7 @@ class AutoResult:
 
     @property
     def sentence(self) -> str:
-        """What was chosen and why."""
+        """State the choice and its reason."""
         return self.choice.sentence
 
 
@@ -149,7 +149,7 @@ def _write_choice(
 
 
 def _finished(folder: Path, key: str) -> AutoResult | None:
-    """Return the result of a finished run with this key; None if there is none."""
+    """Return the result of a finished run with this key; None without one."""
     # The key stands in the choice, too: earlier versions wrote the winner's key into the identity of the run.
     choice = read_choice(folder)
     if choice is None or choice.key != key or state_of(folder) != FINISHED:

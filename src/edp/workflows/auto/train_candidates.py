@@ -1,4 +1,4 @@
-"""Training the portfolio: candidates one by one or in parallel, after a short trial of the longest training."""
+"""Training of the candidates, one by one or in parallel, after a short trial of the longest training."""
 
 from __future__ import annotations
 
@@ -73,18 +73,18 @@ class CandidateTraining:
 
     @property
     def label(self) -> str:
-        """How sentences call it."""
+        """Return its name in sentences."""
         return CANDIDATES[self.name].label + (", a short trial" if self.trial else "")
 
     @property
     def on_folds(self) -> bool:
-        """Whether it is trained on folds; the others are networks that learn by gradient, chunk by chunk."""
+        """Test whether it is trained on folds; networks trained by gradient descent on chunks are not."""
         return self.experiment.training.bagging is not None
 
 
 @dataclass(frozen=True, eq=False)
 class TrainedCandidate:
-    """What a training gives.
+    """Result of a candidate's training.
 
     Attributes:
         experiment: the settings.
@@ -216,7 +216,7 @@ def train_unit(identity: TrainingIdentity, where: Table) -> WithState | dict[str
 
 
 def _read_trained(job: CandidateTraining, result: UnitResult) -> TrainedCandidate | str:
-    """Return a candidate that was trained on folds, or the message of a training that diverged."""
+    """Return a candidate trained on folds, or the message of a diverged training."""
     if DIVERGED in result.values:
         return str(result.values[DIVERGED])
     stored = unpack(result.content or b"", _FoldResult)
@@ -241,7 +241,7 @@ class _Display:
         self.last: TrainingProgress | None = None
 
     def look(self) -> None:
-        """Read the notes, and pass on what is new."""
+        """Read the notes, and report new ones."""
         noted = [(job, event) for job in self.jobs if (event := _noted(job)) is not None]
         if not noted:
             return
@@ -335,7 +335,7 @@ def train_portfolio(
 
 
 def _over_linear(outcomes: Mapping[str, TrainedCandidate | str]) -> float | None:
-    """Error of the trial over that of the linear model, as candidates are compared; None where one diverged."""
+    """Return the error of the trial relative to the linear model's, on the comparison data; None if one diverged."""
     promises = {name: one.promise for name, one in outcomes.items() if isinstance(one, TrainedCandidate)}
     if len(promises) < len(outcomes):
         return None
@@ -365,7 +365,7 @@ def _experiments(settings: AutoSettings, amount: Amount) -> dict[str, Experiment
 def _jobs(
     experiments: Mapping[str, Experiment], data: Prepared, amount: Amount, folder: Path
 ) -> list[CandidateTraining]:
-    """The trainings of the candidates, judged on the same blocks."""
+    """Return the trainings of the candidates, which are judged on the same blocks."""
     blocks, judged = blocks_of(data, amount.window)
     begun = {"foundation": amount.foundation}
     return [

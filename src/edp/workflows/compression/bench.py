@@ -47,11 +47,11 @@ class CompressionRequest:
 
     @property
     def begins_pruned(self) -> bool:
-        """Whether the network, or the one that it goes on from, begins with what pruning leaves of the teacher."""
+        """Test whether the network, or its start network, begins with the pruned teacher."""
         return self.pruned if self.of is None else self.of.begins_pruned
 
     def model(self, teacher: ModelSpec) -> ModelSpec:
-        """The network's settings."""
+        """Return the network's settings."""
         if self.of is not None:
             return self.of.model(teacher)
         # Rounding alone needs no narrower network.
@@ -63,14 +63,14 @@ class CompressionRequest:
         return student(teacher, self.units, every if self.pruned else self.levels)
 
     def training(self, spec: TrainingSpec) -> TrainingSpec:
-        """How it is trained, where a network is trained with `spec`."""
+        """Return the training of this network, given the general training `spec`."""
         spec = by_gradient(spec)  # a student is taught; there are no folds of truth
         return spec if self.rounding is None else tuning(spec)
 
     def strategy(
         self, teachers: Sequence[Predictor], data: Prepared, start: Predictor | None, further: Sequence[Series] = ()
     ) -> TrainingStrategy | DirectFit:
-        """What the training has besides its data; `start` is the network of `of`.
+        """Return the strategy of the training; `start` is the network of `of`.
 
         Raises:
             ConfigError: teachers that contradict one another, or a network that cannot be pruned.
@@ -92,7 +92,7 @@ class CompressionRequest:
 
 
 def tuning(spec: TrainingSpec) -> TrainingSpec:
-    """A third of the epochs, and a fifth of the learning rate where the optimiser has one."""
+    """Return a third of the epochs, and a fifth of the learning rate if the optimiser has one."""
     optimizer: Any = spec.optimizer
     if any(entry.name == "learning_rate" for entry in fields(optimizer)):
         optimizer = replace(optimizer, learning_rate=TUNING_RATE * optimizer.learning_rate)
@@ -100,7 +100,7 @@ def tuning(spec: TrainingSpec) -> TrainingSpec:
 
 
 class Bench:
-    """A teacher, data and how to train; what is ordered twice is trained once.
+    """Teacher, data and training settings; equal requests are trained once.
 
     Args:
         teacher: the trained network.
@@ -113,7 +113,7 @@ class Bench:
         self._made: dict[CompressionRequest, Predictor] = {}
 
     def network(self, order: CompressionRequest) -> Predictor:
-        """The network of an order, trained now or before."""
+        """Return the network of a request, trained now or earlier."""
         # Orders are plain values, so equal orders are one training.
         if order not in self._made:
             start = None if order.of is None else self.network(order.of)
@@ -121,10 +121,10 @@ class Bench:
         return self._made[order]
 
     def train(self, order: CompressionRequest, start: Predictor | None) -> Predictor:
-        """Carry out an order; `start` is the network that it goes on from."""
+        """Train the network of a request; `start` is its start network."""
         strategy = order.strategy([self.teacher], self.data, start)
         return fit(self.data, order.model(self.teacher.spec), self.training_of(order), strategy=strategy).predictor
 
     def training_of(self, order: CompressionRequest) -> TrainingSpec:
-        """How the network of an order is trained."""
+        """Return the training of a request's network."""
         return order.training(self.training)

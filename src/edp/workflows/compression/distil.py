@@ -38,7 +38,7 @@ DISTIL_SETTINGS = SettingsTree({"soft": LOSSES})
 
 @dataclass(frozen=True, kw_only=True)
 class DistilSpec:
-    """The table ``[distil]``: a student, and how it is taught.
+    """Table ``[distil]``: a student and its training.
 
     Attributes:
         units: width of the student.
@@ -63,7 +63,7 @@ class DistilSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class DistilRequest:
-    """What is made of a run.
+    """Request to distil a run.
 
     Attributes:
         spec: the student, and how it is taught.
@@ -85,7 +85,7 @@ def distil(
     source: DataSource | None = None,
     progress: Progress = SILENT,
 ) -> Bundle:
-    """Train a student of a run and write a run folder; an interrupted one goes on where it stopped.
+    """Train a student of a run and write a run folder; an interrupted training continues.
 
     Args:
         run: run folder of the teacher.
@@ -140,7 +140,7 @@ def _refuse_settings_of_chunks(asked: TrainingSpec, before: TrainingSpec) -> Non
 
 
 def read_run(run: str | Path, changes: Sequence[Change] = ()) -> tuple[Predictor, Experiment, DataSource]:
-    """Network, settings and recordings of a run, or of the run that a bundle lies in.
+    """Return network, settings and recordings of a run, or of the run that holds a bundle.
 
     Raises:
         EdpError: not a run folder.
@@ -166,12 +166,12 @@ def read_run(run: str | Path, changes: Sequence[Change] = ()) -> tuple[Predictor
 
 
 def frozen_sessions(run: str | Path, experiment: Experiment) -> dict[str, str]:
-    """Names by digest of the sessions that stay frozen for what comes of a run: of its split and of runs before it."""
+    """Return names by digest of frozen sessions for descendants of a run, from its split and earlier runs."""
     return {**read_provenance(_run_folder(run)).origin.frozen} | frozen_of(experiment.split)
 
 
 def _run_folder(run: str | Path) -> Path:
-    """The folder of a run, or of the run that a bundle lies in."""
+    """Return the folder of a run, or of the run that holds a bundle."""
     folder = Path(run)
     # Both a run folder and the bundle inside it are accepted.
     inside = is_file_at(folder.parent / "config.toml") and not is_file_at(folder / "config.toml")
@@ -179,7 +179,7 @@ def _run_folder(run: str | Path) -> Path:
 
 
 def order_facts(order: CompressionRequest) -> Table:
-    """Plain values that decide what an order teaches."""
+    """Return the plain values that determine what a request trains."""
     spec = order.distillation
     plain = None if spec is None else asdict(spec) | {"soft": _loss(spec)}
     rounding: RoundingSpec | None = order.rounding
@@ -193,7 +193,7 @@ def order_facts(order: CompressionRequest) -> Table:
 
 
 def _loss(spec: DistillationSpec) -> Any:
-    """The soft loss with its name; a loss that is not registered, such as the softmax form, by its class."""
+    """Return the soft loss with its name; an unregistered loss, such as the softmax form, by its class."""
     # Losses of a distillation need not be registered: the class name stands for them in the key.
     name = next((key for key, kind in LOSSES.items() if kind is type(spec.soft)), type(spec.soft).__name__)
     return {"kind": name} | {key: plain_tree(value) for key, value in vars(spec.soft).items()}

@@ -1,4 +1,4 @@
-"""Number formats in which a smaller network can run, and what a network takes of a controller in one."""
+"""Number formats of a smaller network, and its memory and time on a controller."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Format(Protocol):
         ...
 
     def predictions(self, predictor: Predictor, training_series: Sequence[Series]) -> Predict:
-        """How the network predicts in this format; `training_series` are training series, to find ranges on."""
+        """Return the network's prediction function in this format; `training_series` give the ranges."""
         ...
 
 
@@ -50,7 +50,7 @@ FORMATS: Registry[type[Format]] = Registry("number format")
 
 @FORMATS.register("dynamic_int8")
 class DynamicInt8:
-    """8-bit weights in linear layers, whose inputs are rounded anew at every tick; the rest in single precision.
+    """Linear layers with 8-bit weights and inputs rounded at every tick; all other parts are float32.
 
     Most multiply-accumulates stay in float, so the cycles are taken to be those of single precision.
     """
@@ -65,7 +65,7 @@ class DynamicInt8:
         return dynamic_int8(predictor).weight_bytes
 
     def predictions(self, predictor: Predictor, training_series: Sequence[Series]) -> Predict:
-        """A copy that computes with the rounded numbers."""
+        """Return a copy that computes with the rounded numbers."""
         return partial(stream_predictions, dynamic_int8(predictor).predictor)
 
 
@@ -82,13 +82,13 @@ class Float32:
         return estimate.parameter_bytes
 
     def predictions(self, predictor: Predictor, training_series: Sequence[Series]) -> Predict:
-        """The network as it is."""
+        """Return the unchanged network."""
         return partial(stream_predictions, predictor)
 
 
 @FORMATS.register("w8a16")
 class W8A16:
-    """Static quantisation of the whole network, judged in integer arithmetic (`edp.ir.w8a16`).
+    """Static quantisation of the whole network, evaluated in integer arithmetic (`edp.ir.w8a16`).
 
     A network that has no integer form is refused by name.
     """
@@ -109,7 +109,7 @@ class W8A16:
 def resource_usage(
     predictor: Predictor, name: str, budget: Budget, parameter_bytes: int | None = None
 ) -> ResourceUsage:
-    """What a network takes in the format `name` on the core of a budget.
+    """Return memory and cycles of a network in the format `name` on the core of a budget.
 
     Args:
         predictor: the network; its weights need not be trained.
@@ -157,7 +157,7 @@ def deploy(
     budget: Budget,
     parameter_bytes: int | None = None,
 ) -> Deployed:
-    """A network in the format `name`.
+    """Return a network in the format `name`.
 
     Args:
         predictor: the network, in float32.

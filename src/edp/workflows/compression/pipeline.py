@@ -28,7 +28,7 @@ TEACHER = "teacher"
 
 @dataclass(frozen=True, eq=False)
 class FormatResult:
-    """Scores of a network in one number format, what it takes of a controller, and which limits it exceeds."""
+    """Scores of a network in one number format, its memory and time on a controller, and the exceeded limits."""
 
     scores: Scores
     resource_usage: ResourceUsage
@@ -172,7 +172,7 @@ def _recipe_text(order: CompressionRequest) -> str:
 
 
 def choose(rows: Sequence[CompressedRow]) -> tuple[list[int], int | None]:
-    """Return the front of error, cycles and bytes, and the row that fits with the smallest error, None if none fits."""
+    """Return the front of error, cycles and bytes, and the fitting row with the least error; None if none fits."""
     fitting = [index for index, row in enumerate(rows) if row.fits]
     # Ties of error go to fewer cycles, then fewer bytes, by the order of the tuple.
     return pareto([row.costs for row in rows]), min(fitting, key=lambda index: rows[index].costs, default=None)

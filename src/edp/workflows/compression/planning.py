@@ -1,4 +1,4 @@
-"""Which smaller networks a search makes, and a budget that no network of this kind meets."""
+"""Plan of the smaller networks of a search; refusal of a budget that no network of this kind meets."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SHARES = (1.0, 0.5, 0.25)  # of the widest that fits: the front below it
 
 @dataclass(frozen=True)
 class CompressionPlan:
-    """What is to be made.
+    """Requests of a compression.
 
     Attributes:
         orders: the recipes for each width, widest first.
@@ -41,7 +41,7 @@ class CompressionPlan:
 
     @property
     def rounds(self) -> bool:
-        """Whether training with rounded numbers is of use."""
+        """Test whether quantisation-aware training is useful."""
         return any(FORMATS[name].rounded for name in self.formats)
 
     @property
@@ -112,7 +112,7 @@ def make_plan(
 
 
 def _orders(teacher: Predictor, width: int, recipes: Sequence[str], notes: list[str]) -> tuple[CompressionRequest, ...]:
-    """The recipes for a network of this width; why there are no others is noted."""
+    """Return the recipes for a network of this width; notes state why others are impossible."""
     both = {
         "distilled": CompressionRequest(name=f"u{width}", units=width),
         "pruned": CompressionRequest(name=f"p{width}", units=width, pruned=True),
@@ -142,7 +142,7 @@ def _why_not(teacher: Predictor, model: ModelSpec) -> str:
 
 
 def _supported(teacher: Predictor, least: int, formats: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The formats that have a form for every part of the network, and why the others have none."""
+    """Return the formats that support every part of the network, and the reasons against the others."""
     net = _untrained(_narrow(teacher.spec, least), teacher.task)
     # Two windows of random inputs suffice to find whether a format has a form for every part.
     drawn = np.random.default_rng(0).normal(size=(2 * net.spec.window, len(net.task.inputs))).astype(np.float32)
@@ -161,7 +161,7 @@ def _supported(teacher: Predictor, least: int, formats: Sequence[str]) -> tuple[
 
 
 def _narrow(model: ModelSpec, units: int) -> ModelSpec:
-    """A student with all levels of the teacher."""
+    """Return a student with all levels of the teacher."""
     channels = getattr(model.backbone, "channels", None)
     return student(model, units, None if channels is None else len(channels))
 
@@ -176,7 +176,7 @@ def _usage_at(teacher: Predictor, units: int, name: str, budget: Budget) -> Reso
 
 
 def _widest(teacher: Predictor, name: str, budget: Budget, widths: Sequence[int]) -> int:
-    """The widest network that fits; 0 for none."""
+    """Return the width of the widest network that fits; 0 if none does."""
     low, high = 0, len(widths)  # those before `low` fit, those from `high` on do not
     # Cost rises with the width, so bisection finds the widest that fits in a few builds.
     while low < high:
@@ -189,7 +189,7 @@ def _widest(teacher: Predictor, name: str, budget: Budget, widths: Sequence[int]
 
 
 def _refusal(teacher: Predictor, budget: Budget, formats: Sequence[str], least_width: int) -> str:
-    """What the nearest network takes, and what the limits would have to be."""
+    """State the needs of the nearest network and the necessary limits."""
     least = {name: _usage_at(teacher, least_width, name, budget) for name in formats}
 
     def worst(name: str) -> float:

@@ -1,4 +1,4 @@
-"""An integer (W8A16) run, as a run of its own."""
+"""Conversion of a run to an integer (W8A16) run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from edp.workflows.train_evaluate import trained_run
 
 
 def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str, float]:
-    """Write a run in W8A16: it is judged, reported and exported in integer arithmetic.
+    """Write a run in W8A16; its judgement, report and export use integer arithmetic.
 
     Formats and weights are chosen on the inputs of the training part; the errors are of the validation part.
 

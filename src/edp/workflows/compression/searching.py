@@ -1,4 +1,4 @@
-"""The best network that a controller can run: width, pruning, number formats and training with rounded numbers."""
+"""Search of the best network for a controller: width, pruning, number formats, quantisation-aware training."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ THESIS_VARIANTS = {"A_u32": 32, "A_u64": 64, "B_LPTQ": 64, "C_QAT": 0, "C_u64_QA
 
 @dataclass(frozen=True, kw_only=True)
 class CompressionSearchSpec:
-    """The table ``[compress]``: what is searched.
+    """Table ``[compress]``: the alternatives of the search.
 
     Attributes:
         budget: what the controller grants.
@@ -81,7 +81,7 @@ class CompressionSearchSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class CompressionSearchRequest:
-    """What is made of a run.
+    """Request to compress a run.
 
     Attributes:
         spec: what is searched.
@@ -95,7 +95,7 @@ class CompressionSearchRequest:
 
 
 class DiskBench(Bench):
-    """A bench whose trainings are runs in a folder; finished ones are read, unfinished ones go on.
+    """Bench with run folders: finished trainings are read, unfinished ones continue.
 
     Args:
         teacher: the trained network.
@@ -156,7 +156,7 @@ def search(
     source: DataSource | None = None,
     progress: Progress = SILENT,
 ) -> CompressionResult:
-    """Make smaller networks of a run, judge them in their formats, and choose the best that fits a budget.
+    """Train smaller networks of a run, evaluate them in their formats, and choose the best within a budget.
 
     Choices rest on the validation part. The test part is opened once, for the chosen network and the teacher; that is
     recorded in the folder. For a run of a model search it is the second test set of the search, and the opening is
@@ -298,7 +298,7 @@ class _Comparison:
     def _add(
         self, order: CompressionRequest | None, result: NetworkResult, network: Predictor, variant: str = ""
     ) -> None:
-        """Add the rows of a network; those of a variant of the thesis have its name."""
+        """Add the rows of a network; those of a thesis variant have its name."""
         run = self.run if order is None else self.bench.folder / order.name
         for row in rows_of(order, result, self.teacher.scores, str(run)):
             self.rows.append(replace(row, name=variant or row.name))

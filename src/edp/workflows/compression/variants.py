@@ -18,7 +18,7 @@ THESIS = RoundingSpec(activation_bits=8, recurrent=False)
 
 @dataclass(frozen=True, eq=False)
 class CompressedCandidate:
-    """A smaller network and the numbers it is to run with.
+    """Smaller network with its number format.
 
     Attributes:
         name: of the variant.
@@ -52,19 +52,19 @@ class MadeByOrder:
     number_format: str = "float32"
 
     def __call__(self, bench: Bench) -> CompressedCandidate:
-        """Make the candidate; what was ordered before is not trained again."""
+        """Make the candidate; earlier trainings are reused."""
         return CompressedCandidate(self.name, self.order, bench.network(self.order), self.number_format)
 
 
 @dataclass(frozen=True)
 class RoundedLikeThesis:
-    """A variant trained on with rounded convolutions and linear layers: the network of an order, or the teacher."""
+    """Variant trained further with rounded convolutions and linear layers: a request's network, or the teacher."""
 
     name: str
     order: CompressionRequest | None
 
     def __call__(self, bench: Bench) -> CompressedCandidate:
-        """Make the candidate; what was ordered before is not trained again."""
+        """Make the candidate; earlier trainings are reused."""
         units = width_of(bench.teacher.spec) if self.order is None else self.order.units
         begun = "teacher" if self.order is None else self.order.name
         order = CompressionRequest(name=f"{begun}_thesis_qat", units=units, rounding=THESIS, of=self.order)

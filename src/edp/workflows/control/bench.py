@@ -33,7 +33,7 @@ from edp.wording import setting_text, typed
 
 @dataclass(frozen=True)
 class ControlSources:
-    """Run folders that closed loops read; None for none.
+    """Run folders that closed loops read; None if unused.
 
     Attributes:
         plant: of a twin, or an FMU, that takes the place of the simulator.
@@ -112,7 +112,7 @@ class ControlBench:
         guard: LoopGuard | None = None,
         divided: DividedLoops | None = None,
     ) -> list[LoopResult]:
-        """Run every loop with a controller; that of the experiment by default.
+        """Run every loop with a controller, by default that of the experiment.
 
         Args:
             spec: of the controller.
@@ -253,7 +253,7 @@ def _check_used(experiment: ControlExperiment, sources: ControlSources) -> None:
 
 
 def _bundle_of(run: Path) -> Path:
-    """The bundle of a run folder, or the folder itself where it is one.
+    """Return the bundle of a run folder, or the folder itself if it is a bundle.
 
     Raises:
         ConfigError: there is no such folder.

@@ -68,7 +68,7 @@ def parts_of(
     twin: TwinBundle | None,
     most: Mapping[str, int] = MOST,
 ) -> ControllerParts:
-    """The numbers of a controller, without a self-test.
+    """Return the numbers of a controller, without a self-test.
 
     Args:
         experiment: its settings.
@@ -174,7 +174,7 @@ def _lever_shape(machine: Machine) -> tuple[float, float, float]:
 
 
 def _pilots(machine: Machine, names: tuple[str, ...]) -> tuple[PilotCommand, ...]:
-    """How each command of a twin follows from the levers: two of a spool, primary spools before those of conflux."""
+    """Return how each command of a twin follows from the levers: two per spool, primary before conflux spools."""
     axes, _ = pack(machine)
     pilots = []
     for name in names:
@@ -186,7 +186,7 @@ def _pilots(machine: Machine, names: tuple[str, ...]) -> tuple[PilotCommand, ...
 
 
 def _check_pilots(plan: PlanParts, plant: PlantInterface) -> None:
-    """Refuse a plant whose levers become other pressures than those of its machine.
+    """Refuse a plant whose pilot pressures differ from those of its machine.
 
     Raises:
         ExportError: it is one.
@@ -209,7 +209,7 @@ def _check_pilots(plan: PlanParts, plant: PlantInterface) -> None:
 
 
 def golden_loop(parts: ControllerParts, stored: KeptController) -> GoldenLoop | None:
-    """The kept stretch up to the first tick at which an input was missing; None where that is the first."""
+    """Return the kept stretch before the first tick with a missing input; None if the first tick has one."""
     columns = stored.plant.columns(tuple(channel.name for channel in parts.inputs))
     measured = stored.observed[:, columns]
     good: NDArray[np.bool_] = np.asarray(np.isfinite(measured).all(axis=1))
@@ -224,7 +224,7 @@ def golden_loop(parts: ControllerParts, stored: KeptController) -> GoldenLoop | 
 
 
 def _replayed(stored: KeptController, ticks: int) -> tuple[Array, Array]:
-    """Memory before each tick and levers of the controller, told the observations that were kept."""
+    """Return memory before each tick and levers of the controller under the kept observations."""
     experiment = stored.experiment
     controller = experiment.controller.build(stored.plant, experiment.task.limits, stored.models)
     if not isinstance(controller, PiController | NmpcController):

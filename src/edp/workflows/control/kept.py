@@ -1,4 +1,4 @@
-"""What a run of closed loops keeps of its controller, so that the run alone is enough to export it.
+"""Content of a closed-loop run on its controller; the run alone is enough for an export.
 
 The folder ``controller`` of a run holds the settings' machine as a file, the valve map, the twin, what the plant
 measures, and a stretch of the first loop with which exported code is compared.
@@ -119,7 +119,7 @@ def keep_controller(
 
 
 def load_kept(run: str | Path) -> KeptController:
-    """The controller of a run folder.
+    """Load the controller of a run folder.
 
     Raises:
         StorageError: not a run of edp control, or one of an earlier version that kept no controller.
@@ -163,7 +163,7 @@ def _channel(entry: Table) -> Channel:
 
 
 def _checked(arrays: Mapping[str, Array], channels: int) -> ValveMap | None:
-    """The valve map, where there is one; shapes and values of all arrays are checked."""
+    """Return the valve map if present, after a check of shapes and values of all arrays."""
     ticks, rows = len(arrays["observed"]), len(arrays["strokes"])
     shapes = {"observed": (ticks, channels), "levers": (ticks, AXES), "strokes": (rows, AXES), "tip": (rows, AXES)}
     for name, shape in shapes.items():

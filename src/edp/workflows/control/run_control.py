@@ -35,7 +35,7 @@ RESULTS, PAGE, LOOPS = "results.json", "control.html", "loops"
 
 @dataclass(frozen=True, eq=False)
 class ControlRun:
-    """What `control_loops` leaves.
+    """Result of `control_loops`.
 
     Attributes:
         content: of ``results.json``.
@@ -136,7 +136,7 @@ def _content(
 
 
 def sentence(content: Table, controller: str) -> str:
-    """The score in one sentence."""
+    """State the score in one sentence."""
     summary, count = content["summary"], len(content["loops"])
     loops = f"{count} loops" if count > 1 else "one loop"
     worst = f", {summary['position_worst_mm']:.1f} mm in the worst" if count > 1 else ""

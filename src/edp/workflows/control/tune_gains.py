@@ -1,4 +1,4 @@
-"""Gains tuned on one plant, such as a twin, and judged on another: by a sampler, along references of their own."""
+"""Gains tuned on one plant, such as a twin, and judged on another, along other references."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ TUNED, RESULTS = "tuned.toml", "tuning.json"
 
 @dataclass(frozen=True)
 class TuningSpec:
-    """How gains are tuned.
+    """Settings of a tuning of gains.
 
     Attributes:
         trials: settings tried, the present ones first.
@@ -51,7 +51,7 @@ class TuningSpec:
 
 @dataclass(frozen=True, eq=False)
 class Tuning:
-    """What `tune_gains` leaves.
+    """Result of `tune_gains`.
 
     Attributes:
         best: the controller with the least cost where it was tuned.
@@ -148,7 +148,7 @@ def tune_gains(
 
 
 def with_gains(spec: ControllerSpec, gains: Mapping[str, Any]) -> ControllerSpec:
-    """A controller with some of its options changed."""
+    """Return a controller with some of its options changed."""
     values = {name: float(np.round(value, 6)) for name, value in gains.items()}
     return cast(ControllerSpec, replace(cast(Any, spec), **values))
 

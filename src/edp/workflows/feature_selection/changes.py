@@ -14,7 +14,7 @@ from edp.recording import Recording
 def with_changes(
     settings: FeatureSettings, screening: ScreeningResult, recording: Recording, name: str
 ) -> FeatureSettings:
-    """The set with a change of each channel over the span that the screening gives for it.
+    """Return the set with a change of each channel over the span that the screening gives for it.
 
     A channel that leads a target clearly changes over its lead: what it did since then has yet to arrive. A target
     changes over the horizon, which is how far its past must be continued. Other channels get none.
@@ -37,7 +37,7 @@ def with_changes(
 
 
 def _lead(screening: ScreeningResult, channel: str) -> int:
-    """Ticks by which a channel leads that target with which it goes best; 0 where it leads none clearly."""
+    """Return the lead in ticks of a channel before its most dependent target; 0 without a clear lead."""
     leads = [
         curve
         for curve in screening.lags

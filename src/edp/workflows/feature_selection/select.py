@@ -34,7 +34,7 @@ _MOST_DROPPED = 200
 
 @dataclass(frozen=True, kw_only=True)
 class SelectionOrder:
-    """What is asked of a selection.
+    """Options of a feature selection.
 
     Attributes:
         spec: options of the screening.
@@ -72,7 +72,7 @@ class Listeners:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """What a selection found and wrote.
+    """Findings and files of a feature selection.
 
     Attributes:
         screening: the screening.
@@ -104,7 +104,7 @@ def select_features(
     listeners: Listeners | None = None,
     workers: Workers = IN_PROCESS,
 ) -> Selection:
-    """Screen a data set and write what it proposes.
+    """Screen a data set and write the proposed features.
 
     Args:
         source: where the recordings are. Without a signal map every column of numbers is read.
@@ -144,7 +144,7 @@ def select_features(
 
 
 def _sampled(recordings: Sequence[Recording], screening: ScreeningResult) -> list[str]:
-    """That a large data set was screened on a part of its rows."""
+    """Note that a large data set was screened on a part of its rows."""
     total = sum(recording.samples for recording in recordings)
     if total <= MOST_ROWS:
         return []
@@ -153,7 +153,7 @@ def _sampled(recordings: Sequence[Recording], screening: ScreeningResult) -> lis
 
 
 def _lists_maps(source: DataSource) -> bool:
-    """Whether a data-set file says itself how its logs are read."""
+    """Test whether a data-set file names its own maps."""
     return source.path.suffix == ".toml" and any(log.signal_map is not None for log in source.logs())
 
 
@@ -162,7 +162,7 @@ def _taken_whole(source: DataSource) -> DataSource:
 
 
 def _read(source: DataSource, quality: DataQuality) -> tuple[list[Recording], list[str]]:
-    """The recordings with the channels that all of them hold; missing values of candidates are kept as such."""
+    """Return the recordings with their common channels; missing values of candidates stay missing."""
     repair = source.repair or Repair()
     # Missing values of one candidate must not refuse the whole log; the candidate is left out instead.
     lenient = replace(source, repair=replace(repair, nan="keep") if repair.nan == "refuse" else repair)
@@ -184,7 +184,7 @@ def _read(source: DataSource, quality: DataQuality) -> tuple[list[Recording], li
 
 
 def _candidates(first: Recording, order: SelectionOrder) -> tuple[ScreeningSpec, list[str]]:
-    """The spec with its candidates named, and notes on what is no candidate."""
+    """Return the spec with its candidates named, and notes on excluded channels."""
     spec = order.spec
     for name in order.exclude:
         if name not in first.channel_names:
@@ -204,7 +204,10 @@ def _candidates(first: Recording, order: SelectionOrder) -> tuple[ScreeningSpec,
 
 
 def _sets(screening: ScreeningResult, first: Recording) -> dict[str, FeatureSettings]:
-    """The proposed set with the targets in it, as the delta mode needs them; with pressure changes; the usual sets."""
+    """Return the proposed set including targets, as the delta mode requires; the same with pressure changes.
+
+    Standard sets.
+    """
     names = screening.proposal.kept
     # Targets come first: delta mode reads their present values.
     channels = (*(target for target in screening.targets if target not in names), *names)
@@ -247,7 +250,7 @@ def _plain(features: FeatureSettings) -> FeatureSet:
 
 
 def _proposal_text(screening: ScreeningResult, features: FeatureSettings) -> str:
-    """The proposed set with the reason beside each channel, and below what was dropped and why."""
+    """Return the proposed set with a reason for each channel, followed by the dropped channels with reasons."""
     reasons = {choice.channel: choice.reason for choice in screening.proposal.choices}
     for target in screening.targets:
         if target not in screening.proposal.kept:
@@ -265,7 +268,7 @@ def _proposal_text(screening: ScreeningResult, features: FeatureSettings) -> str
 
 
 def _settings_text(screening: ScreeningResult, name: str) -> str:
-    """Settings of a training on a set, to lay over a preset."""
+    """Return the settings of a training on a set, for use with a preset."""
     table = {
         "task": {
             "features": f"sets/{_file_name(name)}.toml",
@@ -279,7 +282,7 @@ def _settings_text(screening: ScreeningResult, name: str) -> str:
 
 
 def _needed_map(source: DataSource, screening: ScreeningResult, first: Recording) -> str | None:
-    """A signal map of the proposed channels, where a training without one would not read them."""
+    """Return a signal map of the proposed channels if a training requires it."""
     if source.signal_map is not None or _lists_maps(source):
         return None
     names = tuple(dict.fromkeys((*screening.targets, *screening.proposal.kept)))
@@ -322,7 +325,7 @@ def _tried(
 
 
 def trial_task(task: TaskSettings, screening: ScreeningResult) -> TaskSettings:
-    """The task of the trials: the screening's targets and horizon."""
+    """Return the task of the trials: the screening's targets and horizon."""
     return replace(task, targets=screening.targets, horizons=(screening.horizon,))
 
 

@@ -1,4 +1,4 @@
-"""Trials of feature sets: one network trained on each set with equal settings and judged on the same recordings.
+"""Trials of feature sets: networks trained with equal settings on each set and judged on the same recordings.
 
 What a feature set is for is the error of the model that reads it, so a proposal is held to that: beside all channels,
 the usual sets, and sets of the same size drawn at random.
@@ -47,7 +47,7 @@ _DRAWS = 20
 
 @dataclass(frozen=True, kw_only=True)
 class TrialSpec:
-    """Which trainings are made beside those of the given sets.
+    """Trainings in addition to those of the given sets.
 
     Attributes:
         random: sets drawn at random from the channels, of the size of the first given set.
@@ -70,7 +70,7 @@ class TrialSpec:
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """How much larger an error is than that of the first set, in the report unit, with its 95 % interval."""
+    """Difference of an error from that of the first set, report unit, with its 95 % interval."""
 
     mean: float
     low: float
@@ -79,7 +79,7 @@ class PairedDifference:
 
 @dataclass(frozen=True)
 class FeatureSetTrial:
-    """One feature set, judged.
+    """Judged feature set.
 
     Attributes:
         name: of the set.
@@ -105,7 +105,7 @@ class FeatureSetTrial:
 
 @dataclass(frozen=True)
 class Trials:
-    """All of them, in the order given.
+    """All trials in the given order.
 
     Attributes:
         trials: the first one is what the others are compared with.
@@ -135,7 +135,7 @@ def try_feature_sets(
     on_trial: OnTrial | None = None,
     workers: Workers = IN_PROCESS,
 ) -> Trials:
-    """Train the experiment's network on every set with its budget, and judge all on the held-out recordings.
+    """Train the experiment's network on every set within its budget, and judge all on the held-out recordings.
 
     Trainings that are in the folder already are kept; one that was interrupted goes on.
 
@@ -203,7 +203,7 @@ class _PlannedTrial:
 def _train_trial(
     source: DataSource, trial: _PlannedTrial, on_event: Callable[[TrainingProgress], None] | None = None
 ) -> Bundle:
-    """Train the network of a trial and evaluate it, or read what is there."""
+    """Train and evaluate the network of a trial, or read the existing one."""
     bundle = train(source, trial.settings, trial.run, on_event)
     # Persistence alone: the sets are compared with each other, other baselines cost minutes each.
     evaluate(trial.run, baselines=["persistence"])
@@ -226,7 +226,7 @@ def train_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str
 
 
 def with_differences(settings: FeatureSettings, recording: Recording, name: str) -> FeatureSettings:
-    """The set with the change of each of its cylinder pressures since the tick before, as FG2 has them (eq. 3.1)."""
+    """Return the set with tick-to-tick changes of its cylinder pressures, as in FG2 (eq. 3.1)."""
     derived_sources = {entry.source for entry in settings.derived}
     candidates = [c for c in settings.channels if c not in derived_sources]
     pressures = [c for c in candidates if recording.channels[recording.index(c)].kind is Kind.PRESSURE]
@@ -235,7 +235,7 @@ def with_differences(settings: FeatureSettings, recording: Recording, name: str)
 
 
 def _usable(sets: Sets, experiment: Experiment, first: Recording) -> tuple[dict[str, str | FeatureSettings], list[str]]:
-    """Sets whose channels are all there, with the targets in them where the mode needs them, and notes on the rest."""
+    """Return the sets whose channels are all present, with targets if required, and notes on the others."""
     notes: list[str] = []
     chosen: dict[str, str | FeatureSettings] = {}
     for name, features in sets.items():
@@ -271,7 +271,7 @@ def _with_targets(features: FeatureSettings, targets: Sequence[str]) -> tuple[Fe
 def _drawn(
     chosen: Mapping[str, str | FeatureSettings], experiment: Experiment, first: Recording, spec: TrialSpec
 ) -> dict[str, str | FeatureSettings]:
-    """Sets of random channels, as many as the first set has, none like it or another drawn one.
+    """Return random sets with the number of channels of the first set, all different.
 
     In delta mode the targets are always among them.
     """
@@ -296,13 +296,13 @@ def _drawn(
 
 
 def _slug(name: str) -> str:
-    """A name that any file system takes."""
+    """Return a name that is valid on any file system."""
     return "".join(c if c.isalnum() else "_" for c in name)
 
 
 @dataclass(frozen=True)
 class _Finished:
-    """What a finished run says of itself."""
+    """Facts of a finished run."""
 
     channels: tuple[str, ...]
     features: int
@@ -322,7 +322,7 @@ class _Finished:
 
 
 def _compared(finished: Mapping[str, Sequence[_Finished]], notes: Sequence[str], horizons: Sequence[int]) -> Trials:
-    """The table from the kept scores."""
+    """Return the table of the kept scores."""
     ahead = [str(horizon) for horizon in horizons]
     names = list(finished)
     by_recording = {name: _recordings(finished[name], ahead) for name in names}

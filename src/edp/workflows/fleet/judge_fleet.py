@@ -1,4 +1,4 @@
-"""`edp fleet report`: every machine of a store under one network, or under its own delta; a unit a machine."""
+"""`edp fleet report`: judgement of every machine of a store under one network, or its own delta."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ LEAST_BLOCKS = 8
 
 @dataclass(frozen=True, kw_only=True)
 class FleetQuestion:
-    """What a fleet is judged by.
+    """Judgement of a fleet: network, monitor and machines.
 
     Attributes:
         network: run folder or bundle.
@@ -202,7 +202,7 @@ def _errors_of(bundle: Bundle, source: MachineSource, where: Mapping[str, str | 
 
 
 def drift_of(error: NDArray[np.floating], rate_hz: float) -> ErrorDrift | None:
-    """How the error of the second half of the time stands to that of the first, by blocks.
+    """Return the ratio of the errors of the two halves of the time, by blocks.
 
     Args:
         error: absolute error a tick, in the order of time.
@@ -230,7 +230,7 @@ def _inputs(recordings: list[Recording], names: list[str]) -> dict[str, InputSpr
 
 
 def _alarms(monitor: Path, source: DataSource) -> MachineAlarms:
-    """How many changes a monitor told of, and the first of them; or why it could not watch."""
+    """Return the number of changes that a monitor reported with the first one, or why it could not run."""
     try:
         watched = run_monitor(monitor, source)
     except EdpError as error:

@@ -52,12 +52,12 @@ class StoredMachine:
 
 
 def machine_of(meta: Mapping[str, Any]) -> str:
-    """Name of the machine that was recorded; empty where it is not said."""
+    """Return the name of the recorded machine; empty if it is not stated."""
     return str(meta.get(MACHINE, "")).strip()
 
 
 def machines_of(store: str | Path) -> list[StoredMachine]:
-    """The machines of a store, in the order in which they come first.
+    """Return the machines of a store in order of first appearance.
 
     Raises:
         ConfigError: it is no store.

@@ -1,4 +1,4 @@
-"""`edp finetune --fleet`: one network, and for each machine of a store a delta of kilobytes; a unit a machine."""
+"""`edp finetune --fleet`: one network, and a delta of kilobytes for each machine of a store."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ SCHEMA = 1
 
 @dataclass(frozen=True, kw_only=True)
 class PersonalOrder:
-    """How each machine gets its network.
+    """Settings of the fine-tuning for each machine.
 
     Attributes:
         method: of the fine-tuning; one that trains and needs no recordings of the source.
@@ -166,7 +166,7 @@ def file_of(machine: str) -> str:
 
 
 def read_fleet(folder: str | Path) -> dict[str, Any]:
-    """The content of ``fleet.json``.
+    """Return the content of ``fleet.json``.
 
     Raises:
         StorageError: it is missing or damaged.
@@ -203,7 +203,7 @@ def _unit(machine: StoredMachine, digest: str, source: str | Path, store: str | 
 
 
 def tune_machine(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState | dict[str, Any]:
-    """Fine-tune for one machine; the run itself is not kept, its change is."""
+    """Fine-tune for one machine; only the change of the weights is kept."""
     config = identity.config
     base = _source(where["source"], config["base"])
     logs = MachineSource(Path(where["store"]), machine=config["machine"])
@@ -243,7 +243,7 @@ def _errors(network: Predictor, data: Prepared) -> float:
 
 @lru_cache(maxsize=1)
 def _source(path: str, digest: str) -> SourceModel:
-    """The fleet's network, once for all machines that a process tunes; `digest` tells it from another one."""
+    """Return the fleet's network, read once for all machines of a process; `digest` identifies it."""
     source = read_source(path, recordings=False)
     if weights_digest(source.predictor) != digest:
         raise ConfigError(f"'{path}' holds another network on this node; all nodes must see the same file there")

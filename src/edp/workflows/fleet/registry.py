@@ -1,4 +1,4 @@
-"""A registry of networks on disk: bundles and fleets of deltas, each with its lineage: which data, base and judge.
+"""Registry of networks on disk: bundles and fleets of deltas with their lineage: data, base, judgement.
 
 A folder with ``entries/ID.json`` and ``files/ID``; an identifier is the content address of what it is of. Nothing in it
 is ever overwritten: the same network enters once, and another one has another identifier.
@@ -165,7 +165,7 @@ def _add_fleet(top: Path, folder: Path, name: str) -> RegistryEntry:
 
 
 def _plain_name(file: str) -> str:
-    """A file of a fleet's folder, which must not lead out of it."""
+    """Return the name of a file in a fleet's folder, after a check that it stays in the folder."""
     if not re.fullmatch(r"deltas/[0-9a-f]{24}\.delta", file):
         raise StorageError(f"fleet.json names '{file}' for a delta, which no fine-tuning writes; it is damaged")
     return file
@@ -176,13 +176,13 @@ def _is_there(top: Path, digest: str) -> bool:
 
 
 def _entered(top: Path, entry: RegistryEntry) -> RegistryEntry:
-    """Write an entry, last of all: its files are there when it is."""
+    """Write an entry after all its files."""
     write_json(make_folder(top / ENTRIES) / f"{entry.id}.json", {"schema": SCHEMA, **asdict(entry)})
     return entry
 
 
 def _base_of(provenance: Provenance) -> str:
-    """Content address of the weights that a training began with."""
+    """Return the content address of the initial weights of a training."""
     strategy = provenance.more.get("strategy")
     if not isinstance(strategy, Mapping):
         return ""
@@ -205,13 +205,13 @@ def _data_of(provenance: Provenance) -> Table:
 
 
 def _recordings(parts: Sequence[DataPart]) -> int:
-    """How many recordings are divided into these parts; one that is cut by time is in all of them."""
+    """Count the recordings in these parts; one that is cut by time is in several parts."""
     names = {PART.sub("", name) for part in parts for name in part.names}
     return len(names) or sum(part.recordings for part in parts)
 
 
 def _judge_of(folder: Path, bundle: Bundle) -> dict[str, Any]:
-    """Errors of the run's own test part beside the best baseline, as ``scores.json`` has them."""
+    """Return the errors of the run's own test part and the best baseline's, from ``scores.json``."""
     file = folder / SCORES
     if not is_file_at(file):
         return {}
@@ -239,7 +239,7 @@ def _judge_of(folder: Path, bundle: Bundle) -> dict[str, Any]:
 
 
 def list_registry(registry: str | Path) -> tuple[list[RegistryEntry], list[str]]:
-    """Entries, the oldest first, and what is wrong with those that are damaged.
+    """Return the entries, oldest first, and the faults of damaged ones.
 
     Raises:
         ConfigError: no registry.
@@ -257,7 +257,7 @@ def list_registry(registry: str | Path) -> tuple[list[RegistryEntry], list[str]]
 
 
 def read_entry(registry: str | Path, digest: str) -> RegistryEntry:
-    """An entry by its identifier.
+    """Return an entry by its identifier.
 
     Raises:
         StorageError: missing or damaged.
@@ -281,7 +281,7 @@ def read_entry(registry: str | Path, digest: str) -> RegistryEntry:
 
 
 def find_entry(registry: str | Path, asked: str) -> RegistryEntry:
-    """An entry by its name, of several the latest, or by the beginning of its identifier.
+    """Find an entry by its name, the latest of several, or by the start of its identifier.
 
     Raises:
         ConfigError: none, or an identifier that begins several.
@@ -299,7 +299,7 @@ def find_entry(registry: str | Path, asked: str) -> RegistryEntry:
 
 
 def lineage(registry: str | Path, entry: RegistryEntry) -> list[RegistryEntry | str]:
-    """Where an entry comes from: its base, the base of that, and so on; an identifier where one is not entered."""
+    """Return the ancestors of an entry: its base, the base of that, and so on; an identifier for an unknown one."""
     steps: list[RegistryEntry | str] = []
     seen = {entry.id}
     while entry.base:

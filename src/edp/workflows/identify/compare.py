@@ -1,4 +1,4 @@
-"""A machine of the simulator driven by the commands of recordings, against what was measured there."""
+"""Simulator under the commands of recordings, compared with the measured values."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class MeasuredRuns:
 
     @staticmethod
     def of(twin: Twin, series: Sequence[Series], seconds: float, starts: int) -> MeasuredRuns:
-        """Evenly spread stretches; `seconds` are cut to what the longest recording has.
+        """Return evenly spread stretches; `seconds` are at most those of the longest recording.
 
         Raises:
             DataError: all starts lie beyond an end stop.
@@ -55,7 +55,7 @@ class MeasuredRuns:
         return MeasuredRuns(tuple(part.name for part, _ in runs), commands, truth, prefix)
 
     def answered(self, twin: Twin, answers: NDArray[np.float32]) -> FreeRuns:
-        """Free runs with these answers ``(run, tick, answer)``."""
+        """Return free runs with these answers ``(run, tick, answer)``."""
         truth = self.truth[:, self.prefix :]
         return FreeRuns(
             twin.channels, self.names, answers, truth[:, 1:], truth[:, 0], twin.scales.low, twin.scales.high
@@ -76,7 +76,7 @@ class MeasuredRuns:
 
 @dataclass(frozen=True, eq=False)
 class FrontChannels:
-    """Which channel of a twin is what of a front.
+    """Channels of a twin by their role in an excavator front.
 
     Attributes:
         sides: columns of the commands that extend and retract each spool ``(6, 2)``; -1: none.
@@ -94,7 +94,7 @@ class FrontChannels:
 
     @staticmethod
     def of(twin: GreyTwin, elements: Elements, valves: Sequence[int], full: Sequence[float]) -> FrontChannels:
-        """The channels of a grey box.
+        """Return the channels of a grey box.
 
         Args:
             twin: the grey box.
@@ -109,7 +109,7 @@ class FrontChannels:
         return FrontChannels(sides, whole, np.array(twin.wiring.columns), lines, twin.channels.rate_hz)
 
     def demands(self, commands: NDArray[np.float32]) -> Doubles:
-        """Signed demands of the spools ``(tick, 6)``, as shares of full."""
+        """Return signed demands of the spools ``(tick, 6)``, relative to full stroke."""
         result = np.zeros((len(commands), len(self.sides)))
         for j, (extend, retract) in enumerate(self.sides):
             if extend >= 0:
@@ -127,7 +127,7 @@ class FrontChannels:
 def _driven(
     machine: Machine, front: FrontChannels, commands: NDArray[np.float32], truth: NDArray[np.float32], prefix: int
 ) -> NDArray[np.float32]:
-    """Answers ``(tick, answer)`` behind the prefix."""
+    """Return answers ``(tick, answer)`` after the prefix."""
     demands, (speeds, strokes) = front.demands(commands), front.columns[:, :2].T
     plant = Plant(machine, truth[0, strokes] / np.array(machine.cylinders.stroke), front.rate_hz)
     plant.rest_at(demands[0])

@@ -1,4 +1,4 @@
-"""From logs to a machine file of the simulator: a grey box is fitted, and its numbers are written back."""
+"""Machine file of the simulator from logs: a grey box is fitted, and its numbers are written back."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ ROUNDS_THAT_INFORM = 3
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """What `identify` leaves.
+    """Result of `identify`.
 
     Attributes:
         machine: identified, as its file has it.
@@ -90,7 +90,7 @@ class Identified:
 
 @dataclass(frozen=True, eq=False)
 class _Fitted:
-    """A grey box of an excavator front, and what its numbers are worth."""
+    """Grey box of an excavator front, with the information on its numbers."""
 
     twin: GreyTwin
     elements: Elements
@@ -117,7 +117,7 @@ def identify(
     run: str | Path | None = None,
     progress: Progress = SILENT,
 ) -> Identified:
-    """Find the machine of the simulator whose numbers are those of the logs, and write its file.
+    """Find a simulator machine with the numbers of the logs, and write its file.
 
     Next to it a file of the same name that ends in ``.json`` has every number and the scores, and a run folder that
     ends in ``.run`` the stages of the fit: the same call continues after a stop.
@@ -234,7 +234,7 @@ def _read_stage(run: Run, name: str, shapes: Mapping[str, tuple[int, ...]]) -> d
 
 
 def _new_file(out: str | Path) -> Path:
-    """Where the machine is written, before a fit of minutes: a file that is not there yet, nor the one beside it.
+    """Check the path of the machine file before a fit of minutes: it must not exist, nor the file next to it.
 
     Raises:
         ConfigError: another ending.
@@ -252,7 +252,7 @@ def _new_file(out: str | Path) -> Path:
 
 
 def _whole_grey_box(spec: TwinSpec | AutoTwin) -> GreyBox:
-    """The spec itself.
+    """Return the spec, after a check that it is a grey box.
 
     Raises:
         ConfigError: another kind, a network on top, which takes part of what the numbers are to explain, or parts that
@@ -287,7 +287,7 @@ def _of_run(run: str | Path) -> tuple[GreyTwin, TwinExperiment]:
 def _fitted(
     run: Run, base: Machine, machine: str, spec: GreyBox, logs: tuple[TwinChannels, Prepared, int], progress: Progress
 ) -> _Fitted:
-    """A grey box with the elements of an excavator front, fitted to the logs; `logs` ends with the seed.
+    """Return a grey box with the elements of an excavator front, fitted to the logs; `logs` ends with the seed.
 
     `machine` is the name or file of `base`.
     """
@@ -313,7 +313,7 @@ def _fitted(
 
 
 def _informed(twin: GreyTwin, data: Prepared, seed: int) -> _Fitted:
-    """A grey box that was fitted before, with the information of free runs of its last stage."""
+    """Return an earlier grey box with the information of free runs of its last stage."""
     problem, spec = GreyProblem(twin, data.train), twin.spec.fit
     rng, total = np.random.default_rng(seed), np.zeros((len(twin.numbers),) * 2)
     ticks = max(1, round(spec.lengths_s[-1] * twin.channels.rate_hz))
@@ -331,7 +331,7 @@ def _refined(
     logs: tuple[Prepared, TwinExperiment],
     progress: Progress,
 ) -> _Tied:
-    """The machine fitted to free runs through its grey box."""
+    """Return the machine fitted to free runs through its grey box."""
     data, settings = logs
     tie = MachineTie.of(base, parts, fitted.twin.numbers[parts.load])
     tie = replace(tie, begin=nearest(tie, fitted.twin.numbers, fitted.information))
@@ -355,7 +355,7 @@ def _refined(
 
 
 def _machine(fit: _Tied, spread: Doubles, data: Prepared) -> tuple[Machine, list[IdentifiedNumber], list[str]]:
-    """The machine of the coordinates, those that the logs do not tell set back to the guess; a row of each, and notes.
+    """Return the machine of the coordinates, with undetermined ones reset to the guess; one row per number, and notes.
 
     Where no rigid bodies have the fitted load, as after short logs, the guess's bodies stay: valves and pumps are worth
     having without them.
@@ -402,7 +402,7 @@ def _check_strokes(channels: TwinChannels, data: Prepared, base: Machine) -> Non
 
 
 def _celsius(recordings: Sequence[Recording], base: Machine) -> tuple[float, list[str]]:
-    """Temperature of the oil in the logs, and a note of it."""
+    """Return the oil temperature of the logs, and a note on it."""
     logged = [
         r.column(OIL)
         for r in recordings
@@ -450,7 +450,7 @@ def _scores(
 
 
 def _name(out: Path) -> str:
-    """A name that a machine file may have, from that of the file."""
+    """Return a valid machine name from the name of the file."""
     name = "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "-" for c in out.stem).strip("-_")
     return name or "identified"
 

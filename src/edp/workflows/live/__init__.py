@@ -1,4 +1,4 @@
-"""A machine live: sources, models beside them, and a page in the browser."""
+"""Live view of a machine: sources, models, and a page in the browser."""
 
 from edp.workflows.live.run_live import LiveOrder, LiveResult, LiveRun
 from edp.workflows.live.serve_live import run_live

@@ -23,7 +23,7 @@ MOST_BYTES = 1 << 30
 
 
 def forecast_lines(run: str | Path, recording: Recording, horizon: int | None = None) -> list[ForecastLine]:
-    """What the network or twin of a run says along a recording, tick by tick, as on the machine.
+    """Return the predictions of a run's network or twin along a recording, tick by tick, as on the machine.
 
     Args:
         run: run folder.

@@ -1,4 +1,4 @@
-"""A twin beside the source: measured for a prefix, on the commands alone from there on, and measured again."""
+"""Twin in a live session: measured for a prefix, free on the commands, and measured again."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class LiveTwin(LivePart):
         self._ticks = 0
 
     def step(self, row: Row, missed: int) -> Row:
-        """See `LivePart`: what the twin says of the next tick, then lower and upper bounds."""
+        """Return the twin's answer for the next tick, lower bounds, upper bounds; see `LivePart`."""
         commands = row[self._commands]
         possible = bool(((commands >= self._low) & (commands <= self._high)).all())
         if missed or not possible:
@@ -96,7 +96,7 @@ class LiveTwin(LivePart):
         return entries
 
     def _begin(self) -> None:
-        """A new run from the last measured ticks, where they are all there."""
+        """Start a new run from the last measured ticks, if they are complete."""
         self._state, self._ticks = None, 0
         rows = np.array(self._prefix)
         if len(rows) < self._twin.prefix_ticks or not np.isfinite(rows[:, self._answers]).all():

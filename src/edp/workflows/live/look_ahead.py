@@ -1,4 +1,4 @@
-"""Predictions of a trained network, a tick at a time: the numbers of `edp evaluate`."""
+"""Predictions of a trained network tick by tick, equal to those of `edp evaluate`."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class LiveNetwork(LivePart):
         return self._shown(tick)
 
     def at_once(self, rows: Row) -> Row | None:
-        """See `LivePart`; what is rejected or held is told tick by tick."""
+        """Return predictions, see `LivePart`; rejected and held values are reported tick by tick."""
         inputs = rows[:, self._columns]
         if self._held or not self._stream.accepts(inputs):
             return None
@@ -94,7 +94,7 @@ class LiveNetwork(LivePart):
         return entries
 
     def _tell(self, status: StreamStatus) -> None:
-        """Say when values are rejected, and when they are right again; not at every tick of it."""
+        """Report the start and the end of rejected values, not every tick."""
         rejected = status in (StreamStatus.HELD, StreamStatus.RESTARTED)
         if rejected != self._held:
             self._held = rejected
@@ -107,7 +107,7 @@ class LiveNetwork(LivePart):
 
 
 def spread(count: int, most: int = MOST_HORIZONS) -> list[int]:
-    """At most `most` of the numbers below `count`, the first and the last among them."""
+    """Return at most `most` evenly spread numbers below `count`, including the first and the last."""
     if count <= most:
         return list(range(count))
     return sorted({round(i * (count - 1) / (most - 1)) for i in range(most)})

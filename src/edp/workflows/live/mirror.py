@@ -1,4 +1,4 @@
-"""``--rerun``: the session in the viewer Rerun beside the own page, for who knows that viewer and has its package.
+"""``--rerun``: the session in the viewer Rerun in addition to EDP's page; needs Rerun's package.
 
 Rerun is started by its command line, which unlike its Python interface can be told to listen on loopback only; its
 telemetry is off in a settings folder of its own, so that those of the user stay as they are. Rows go in pieces from a
@@ -40,7 +40,7 @@ TIMELINE = "session"
 
 
 class RerunMirror:
-    """Rerun's server as a process of its own, and a thread that gives it what a session takes.
+    """Rerun server in its own process, with a thread that sends a session's rows.
 
     Args:
         session: what is shown.
@@ -83,7 +83,7 @@ class RerunMirror:
         self._thread.start()
 
     def close(self) -> None:
-        """Give what is left, and end the server."""
+        """Send the remaining rows, and stop the server."""
         self._over.set()
         self._thread.join(END_S)
         with contextlib.suppress(Exception):  # a server that has gone takes nothing any more, which is no news
@@ -151,7 +151,7 @@ def entities(layout: LiveLayout, escaped: Any = str) -> Mapping[str, tuple[int, 
 
 
 def quiet_environment(folder: Path) -> dict[str, str]:
-    """Variables for Rerun whose settings lie in a folder of the session, where its telemetry is off."""
+    """Return environment variables that keep Rerun's settings in a folder of the session and its telemetry off."""
     places = dict.fromkeys(("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME", "APPDATA", "LOCALAPPDATA"))
     return {**os.environ, **dict.fromkeys(places, str(folder))}
 

@@ -1,4 +1,4 @@
-"""What a live session is given besides its source: the models of a run folder, and what they read."""
+"""Models of a run folder for a live session, and the channels that they read."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LEVER = "Lever_"
 
 @dataclass(frozen=True)
 class LiveModels:
-    """What a run folder holds."""
+    """Models of a run folder."""
 
     bundle: Bundle | None = None
     twin: TwinBundle | None = None
@@ -28,7 +28,7 @@ class LiveModels:
 
 
 def models_of(run: Path | None) -> LiveModels:
-    """The network or twin of a run folder.
+    """Return the network or twin of a run folder.
 
     Raises:
         EdpError: it holds none.
@@ -49,7 +49,7 @@ def models_of(run: Path | None) -> LiveModels:
 
 
 def needs_of(models: LiveModels, monitor_folder: Path | None) -> Needs:
-    """What models and monitor read of a source."""
+    """Return the channels and the rate that models and monitor require of a source."""
     channels = list(models.channels)
     rate = models.rate_hz
     if monitor_folder is not None:
@@ -60,7 +60,7 @@ def needs_of(models: LiveModels, monitor_folder: Path | None) -> Needs:
 
 
 def check_rate(source: LiveSource, models: LiveModels) -> None:
-    """Refuse a source of another rate than that of the models.
+    """Refuse a source whose rate differs from the models'.
 
     Raises:
         ConfigError: the rates differ.
@@ -76,7 +76,7 @@ def check_rate(source: LiveSource, models: LiveModels) -> None:
 
 
 def levers_of(channels: tuple[Channel, ...], twin: TwinBundle | None) -> list[int]:
-    """Columns of what is commanded: levers, else the twin's commands, else pilot pressures but for conflux ones."""
+    """Return the columns of commands: levers, else the twin's commands, else pilot pressures without conflux ones."""
     commanded = {c.name for c in twin.twin.channels.commands} if twin is not None else set()
     pilots = [c.name for c in channels if c.kind is Kind.PILOT_PRESSURE and not c.name.endswith("Conf")]
     levers = [c.name for c in channels if c.name.startswith(LEVER)]

@@ -1,4 +1,4 @@
-"""What a live session computes from a row: a part adds columns and says what they mean."""
+"""Computed columns of a live session: each part adds columns and describes them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class LivePart(ABC):
 
     @abstractmethod
     def step(self, row: Row, missed: int) -> Row:
-        """Columns of a tick, shape (width,), SI units, NaN where there is nothing.
+        """Return the columns of a tick, shape (width,), SI units, NaN without a value.
 
         Args:
             row: of the source's channels.
@@ -39,7 +39,7 @@ class LivePart(ABC):
         """
 
     def at_once(self, rows: Row) -> Row | None:
-        """What `step` would give for rows that follow each other, shape (ticks, width), by one call of a model.
+        """Return the results of `step` for consecutive rows, shape (ticks, width), by one call of a model.
 
         None where it would not be the same, or is not known: the rows are then taken one by one.
 
@@ -53,12 +53,12 @@ class LivePart(ABC):
         """Forget all rows."""
 
     def forecasts(self, first: int) -> Sequence[Forecast]:
-        """What of the columns are predictions; `first` is the session's column of the first one."""
+        """Return which columns are predictions; `first` is the session's column of the first one."""
         return ()
 
 
 def columns_of(names: Sequence[str], channels: Sequence[Channel], reader: str) -> NDArray[np.int64]:
-    """Where channels lie in a row of the source.
+    """Return the positions of channels in a row of the source.
 
     Raises:
         ConfigError: the source lacks one; the closest is offered.
@@ -95,7 +95,7 @@ class LiveFront(LivePart):
 
     @staticmethod
     def possible(channels: Sequence[Channel]) -> bool:
-        """Whether a source has what the side view needs."""
+        """Test whether a source has the channels of the side view."""
         names = {channel.name for channel in channels}
         return any({f"{kind}_{i}" for i in (1, 2, 3)} <= names for kind in ("JointAngle", "CylStroke"))
 

@@ -65,7 +65,7 @@ class McapRecorder:
         self._facts.log(json.dumps(self._about()).encode(), log_time=0)
 
     def row(self, tick: int, row: NDArray[np.float32]) -> None:
-        """A row of the session, at its place in time."""
+        """Write a row of the session at its time."""
         at_ns = round(tick * 1e9 / self._layout.rate_hz)
         values = row.tolist()
         named = {channel.name: _plain(values[n]) for n, channel in enumerate(self._channels)}
@@ -75,7 +75,7 @@ class McapRecorder:
             self._predicted.log(json.dumps(predicted).encode(), log_time=at_ns)
 
     def event(self, tick: int, kind: str, text: str) -> None:
-        """An event."""
+        """Write an event."""
         at_ns = round(tick * 1e9 / self._layout.rate_hz)
         self._events.log(json.dumps({"kind": kind, "text": text}).encode(), log_time=at_ns)
 
@@ -84,7 +84,7 @@ class McapRecorder:
         self._writer.close()
 
     def _about(self) -> dict[str, object]:
-        """As `edp.logs.formats.edp_metadata.facts_text` says it, without a digest: nobody knows it before the end."""
+        """Return the facts of `edp.logs.formats.edp_metadata.facts_text` without a digest, unknown until the end."""
         channels = [
             {"name": c.name, "unit": c.unit, "kind": str(c.kind), "description": c.description} for c in self._channels
         ]

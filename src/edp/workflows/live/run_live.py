@@ -34,7 +34,7 @@ MAX_FREE_S = 86_400.0
 
 @dataclass(frozen=True)
 class LiveOrder:
-    """What to show.
+    """Options of a live session.
 
     Attributes:
         source: name of a registered source.
@@ -74,7 +74,7 @@ class LiveOrder:
 
 @dataclass
 class LiveResult:
-    """What came of a session.
+    """Result of a live session.
 
     Attributes:
         ticks: streamed.
@@ -204,7 +204,7 @@ class LiveRun:
         return answers
 
     def begin_anew(self) -> None:
-        """What follows does not continue what came."""
+        """Start anew: the next row does not continue the last one."""
         self.show()
         for part in self._parts:
             part.reset()
@@ -260,7 +260,7 @@ class LiveRun:
         self.session.end(sentence(text))
 
     def close(self) -> LiveResult:
-        """End the session, and write what is to be written.
+        """End the session, and write its files.
 
         Raises:
             StorageError: a file cannot be written.
@@ -276,7 +276,7 @@ class LiveRun:
         return result
 
     def _assembled(self, models: LiveModels) -> tuple[list[LivePart], LiveLayout]:
-        """The parts of a row behind the source's own, and the columns of all."""
+        """Return the parts of a row after the source's own, and all columns."""
         source, order = self.source, self.order
         parts: list[LivePart] = []
         forecasts: list[Forecast] = []

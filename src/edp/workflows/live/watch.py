@@ -1,4 +1,4 @@
-"""A monitor beside the source: its statistics as columns, its alarms as events."""
+"""Monitor in a live session: its statistics as columns, its alarms as events."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ ticks of one as for a single tick; of longer blocks a part is enough."""
 
 
 class _Chunks(MonitorStream):
-    """A monitor some ticks at a time: the same verdicts, since ticks and chunks give the same numbers."""
+    """Monitor over chunks of ticks; its results equal those of single ticks."""
 
     @property
     def statistics(self) -> tuple[float, ...]:
-        """Of each watch at the last block's end, over its scale."""
+        """Return the statistic of each watch at the end of the last block, relative to its scale."""
         return self._statistics
 
     def chunk(self, rows: NDArray[np.float32]) -> list[MonitorAlarm]:
@@ -42,7 +42,7 @@ class _Chunks(MonitorStream):
 
 
 class LiveMonitor(LivePart):
-    """The only one who raises alarms: a value outside of its interval is none.
+    """Only source of alarms: a value outside its interval raises none.
 
     Args:
         monitor: at work.
@@ -110,7 +110,7 @@ class LiveMonitor(LivePart):
 
 
 def group_of(alarm: MonitorAlarm) -> str:
-    """Alarms of one group say the same, as `edp.monitor.alarms.episodes` puts them together."""
+    """Return the group of an alarm, as `edp.monitor.alarms.episodes` merges alarms."""
     cause = alarm.causes[0] if alarm.causes else None
     if cause is not None and cause.kind != NONE_OF_THESE:
         return f"alarm of {cause.component}"

@@ -50,7 +50,7 @@ FURTHER = (
 
 
 def machine_of(spec: DictionarySpec, recordings: Sequence[Recording]) -> str:
-    """The machine to simulate: that of the settings, or the one that all logs name; empty for none."""
+    """Return the machine to simulate, from the settings or from all logs; empty without one."""
     if spec.machine == NO_MACHINE:
         return ""
     if spec.machine != AUTOMATIC:
@@ -122,7 +122,7 @@ def build_dictionary(
     progress: Progress = SILENT,
     side_by_side: SideBySide = ONE_BY_ONE,
 ) -> Dictionary:
-    """Simulate every fault at every site and size on a machine and learn what the monitor sees of it.
+    """Simulate every fault at every site and size on a machine, and learn its effect on the monitor.
 
     The same seed gives the same dictionary, unless the time allows fewer draws; it says how many there were.
 
@@ -171,7 +171,7 @@ def build_dictionary(
 
 @dataclass(frozen=True)
 class _Plan:
-    """What all draws share: machine, seconds before and after the onset, seed, noise by channel."""
+    """Common values of all draws: machine, seconds before and after the onset, seed, noise by channel."""
 
     machine: str
     seconds: tuple[float, float]
@@ -238,7 +238,7 @@ def _draw(
 
 
 def _mirrored(change: Array) -> Array:
-    """The change by a fault of the other sign: means change their sign, sizes do not."""
+    """Return the change by a fault of the other sign: means change sign, sizes do not."""
     means, sizes = np.split(change, 2, axis=1)
     return np.concatenate([-means, sizes], axis=1)
 
@@ -253,7 +253,7 @@ def _after(monitor: Monitor, recording: Recording, onset_s: float) -> Array:
 
 
 def _shown(session: FaultSession, names: Sequence[str], onset_s: float) -> dict[str, Array]:
-    """What further channels show after an onset: level, width and how fast they change."""
+    """Return level, width and rate of change of further channels after an onset."""
     shown = {}
     first = round(onset_s * session.recording.rate_hz)
     for name in names:
@@ -265,7 +265,7 @@ def _shown(session: FaultSession, names: Sequence[str], onset_s: float) -> dict[
 def _standardised(
     faults: Sequence[SimulatedFault], sound: dict[int, tuple[Array, dict[str, Array]]]
 ) -> list[SimulatedFault]:
-    """Changes of further channels over how widely they scatter between sound sessions."""
+    """Return changes of further channels relative to their scatter between sound sessions."""
     names = sorted(next(iter(sound.values()))[1])
     width = {name: np.std([sensors[name] for _, sensors in sound.values()], axis=0) for name in names}
     return [

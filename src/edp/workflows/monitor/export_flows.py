@@ -13,7 +13,7 @@ from edp.monitor.residuals.flow_curves import BACK, CAVITY, EMPTY, KNOTS, RELIEF
 
 
 def flow_part(source: FlowBalances, columns: Mapping[str, int]) -> FlowPart:
-    """Balances of flow as numbers; `columns` has the place of each input in the monitor."""
+    """Return flow balances as numbers; `columns` holds the position of each input in the monitor."""
     spools, chambers = source.spools, []
     for chamber in source.chambers:
         spots = asdict(chamber.spots)

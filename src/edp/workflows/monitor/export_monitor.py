@@ -95,7 +95,7 @@ def export_monitor(
 
 
 def monitor_footprint_of(monitor: str | Path) -> MonitorFootprint:
-    """What a fitted monitor takes on a controller.
+    """Return the memory and time of a fitted monitor on a controller.
 
     Raises:
         EdpError: not a monitor, or a part without a form in C.
@@ -104,7 +104,7 @@ def monitor_footprint_of(monitor: str | Path) -> MonitorFootprint:
 
 
 def monitor_parts(monitor: Monitor, golden: bool = True) -> MonitorParts:
-    """The numbers of a monitor, and what its self-test expects.
+    """Return the numbers of a monitor, and the expected values of its self-test.
 
     Args:
         monitor: fitted.
@@ -148,7 +148,7 @@ def digest_of(chain: ChainPart) -> str:
 
 
 def source_parts(source: ResidualSource, columns: Mapping[str, int]) -> list[SourcePart]:
-    """A source as parts whose residuals stand in its order.
+    """Return a source as parts with residuals in its order.
 
     Raises:
         ExportError: it has no form in C.
@@ -230,7 +230,7 @@ def _balances(source: Balances, columns: Mapping[str, int]) -> BalancePart:
 
 
 def chain_part(chain: MonitorChain) -> ChainPart:
-    """A chain as numbers.
+    """Return a chain as numbers.
 
     Raises:
         ExportError: a detector without a form in C.
@@ -278,7 +278,7 @@ def _watch(watch: Watch) -> WatchPart:
 
 
 def golden_chain(chain: MonitorChain, part: ChainPart) -> GoldenChain:
-    """What the chain makes of drawn rows."""
+    """Return the results of the chain for drawn rows."""
     inputs, residuals = drawn_rows(part)
     verdicts, _ = chain.run(residuals, inputs, chain.initial_state())
     last = [verdict.evidence for verdict in verdicts if verdict.alarm is not None]
@@ -291,7 +291,7 @@ def golden_chain(chain: MonitorChain, part: ChainPart) -> GoldenChain:
 
 
 def golden_residuals(monitor: Monitor) -> GoldenResiduals:
-    """Smooth inputs in the usual range, some of them missing, and the residuals of them."""
+    """Return smooth inputs in the normal range, some of them missing, and their residuals."""
     summaries = monitor.chain.summaries
     rng = np.random.default_rng(0)
     value, rows = rng.normal(size=len(monitor.inputs)), []
@@ -317,7 +317,7 @@ def _places(monitor: Monitor) -> dict[str, int]:
 
 
 def _filled(rows: Rows, start: NDArray[np.float64]) -> Rows:
-    """Rows in which the last value stands in for a missing one."""
+    """Return rows with missing values replaced by the last value."""
     filled, last = rows.copy(), start.astype(np.float32)
     for row in filled:
         row[:] = last = np.where(np.isfinite(row), row, last)
@@ -325,7 +325,7 @@ def _filled(rows: Rows, start: NDArray[np.float64]) -> Rows:
 
 
 def _allowed(part: SourcePart, rows: Rows) -> NDArray[np.float64]:
-    """How far residuals in C may be off: as far as the network's numbers may be; nothing for sums and integers."""
+    """Return the tolerance of residuals in C: that of the network's numbers; zero for sums and integers."""
     if isinstance(part, BalancePart):
         return np.zeros(len(part.levels))
     if isinstance(part, FlowPart):
@@ -352,7 +352,7 @@ def _allowed(part: SourcePart, rows: Rows) -> NDArray[np.float64]:
 
 
 def _allowed_of_twin(part: TwinPart, rows: Rows) -> NDArray[np.float64]:
-    """What errors of single precision grow to while ports are free, group by group."""
+    """Return the growth of single-precision errors while ports are free, group by group."""
     plant, fed = part.bundle.predictor, rows[:, part.reads]
     if not isinstance(plant, TwinPlant):
         raise ExportError("residuals with free ports need a twin; fit the monitor again")

@@ -63,7 +63,7 @@ def fault_classes(kinds: Sequence[str] | None = None) -> tuple[FaultClass, ...]:
 
 
 def cases_of(classes: Sequence[FaultClass]) -> list[tuple[int, float]]:
-    """Class and size of each session of a draw: the two largest sizes, between which and nothing all others lie.
+    """Return class and size of each session of a draw: the two largest sizes; all others are interpolated.
 
     Negative sizes mirror positive ones (`mirrors`), and have no sessions.
     """
@@ -76,7 +76,7 @@ def cases_of(classes: Sequence[FaultClass]) -> list[tuple[int, float]]:
 
 
 def mirrors(classes: Sequence[FaultClass]) -> dict[int, int]:
-    """Place of the class of negative sizes by that of positive ones."""
+    """Return the positions of classes of negative sizes by those of positive sizes."""
     numbers = {(fault.kind, fault.site): n for n, fault in enumerate(classes) if not _is_negative(fault)}
     return {numbers[fault.kind, fault.site]: n for n, fault in enumerate(classes) if _is_negative(fault)}
 
@@ -88,7 +88,7 @@ def _is_negative(fault: FaultClass) -> bool:
 def simulated(
     classes: Sequence[FaultClass], machine: str, seconds: tuple[float, float], seed: tuple[int, int], rate_hz: float
 ) -> Iterator[FaultSession]:
-    """The sessions of one draw: sound ones first, then one for each class and size.
+    """Yield the sessions of one draw: sound ones, followed by one for each class and size.
 
     Args:
         classes: of `fault_classes`.
@@ -118,7 +118,7 @@ def _scenario(machine: str, base: int, seconds: float, seed: tuple[int, int], ra
 
 
 def _session(scenario: Scenario, base: int, seed: tuple[int, int]) -> Recording:
-    """A session in which one way of driving follows another."""
+    """Return a session with two ways of driving in sequence."""
     chance = np.random.default_rng([*seed, _OPERATORS, base])
     simulation = Simulation(scenario)
     shares = np.array(list(DEFAULT_MIX.values()))
@@ -146,7 +146,7 @@ def noise_of(recording: Recording, names: Sequence[str]) -> Mapping[str, float]:
 
 
 def with_noise(recording: Recording, sizes: Mapping[str, float], seed: Sequence[int]) -> Recording:
-    """A recording with further white noise on channels, which the simulator shows without."""
+    """Return a recording with white noise added to channels that the simulator gives without noise."""
     values = recording.values.copy()
     for n, name in enumerate(sorted(sizes)):
         if sizes[name] > 0.0:

@@ -52,7 +52,7 @@ ROOM = 0.8
 
 @dataclass(frozen=True, eq=False)
 class FittedMonitor:
-    """A monitor and what is to be said of its fit.
+    """Fitted monitor with notes on its fit.
 
     Attributes:
         monitor: ready to run.
@@ -223,7 +223,7 @@ def _assembled(
     sessions: Sequence[Recording],
     rest: Sequence[Recording],
 ) -> Monitor:
-    """The monitor without a dictionary; `rest` are the sessions that trained no residual."""
+    """Return the monitor without a dictionary; `rest` are the sessions that trained no residual."""
     doubtful = fitted.doubtful
     provenance: dict[str, object] = {
         "sessions": len(sessions),
@@ -248,7 +248,7 @@ def _with_dictionary(
     progress: Progress,
     side_by_side: SideBySide,
 ) -> Monitor:
-    """The monitor with a dictionary of faults, where there is a machine to simulate them on."""
+    """Return the monitor with a dictionary of faults, if there is a machine to simulate."""
     machine = machine_of(experiment.dictionary, healthy)
     if not machine:
         return monitor
@@ -260,7 +260,7 @@ def _with_dictionary(
 
 
 def watched_channels(recordings: Sequence[Recording], experiment: MonitorExperiment) -> tuple[Channel, ...]:
-    """Channels that all recordings have and sensors can give, or those of the settings.
+    """Return the channels that all recordings hold and sensors can measure, or those of the settings.
 
     Raises:
         DataError: a named channel is missing, rates differ, or fewer than two channels are left.
@@ -301,7 +301,7 @@ def _check_values(recordings: Sequence[Recording], channels: Sequence[Channel]) 
 
 
 def _enough_sessions(recordings: Sequence[Recording]) -> list[Recording]:
-    """The recordings, or where there are few pieces of them."""
+    """Return the recordings, cut into pieces if they are few."""
     if len(recordings) >= LEAST_SESSIONS:
         return list(recordings)
     pieces = []
@@ -340,7 +340,7 @@ def fit_source(job: _Fit) -> ResidualSource | Bundle | None:
 def _sources(
     experiment: MonitorExperiment, material: FitMaterial, side_by_side: SideBySide = ONE_BY_ONE
 ) -> tuple[ResidualSource, ...]:
-    """The settings' residuals that find something to judge.
+    """Return the residuals of the settings that have channels to judge.
 
     Raises:
         DataError: none does.
@@ -372,7 +372,7 @@ def _sources(
 
 
 def _check_hours(sessions: Sequence[Recording], rest: Sequence[Recording], experiment: MonitorExperiment) -> None:
-    """Refuse a promise that the hours cannot support before networks are trained for it.
+    """Refuse a promise that the hours cannot support, before any network is trained.
 
     Args:
         sessions: all of them.
@@ -394,7 +394,7 @@ def _check_hours(sessions: Sequence[Recording], rest: Sequence[Recording], exper
 
 @dataclass(frozen=True, eq=False)
 class _HealthySessions:
-    """Healthy sessions: those that train residuals, that choose among fits, and the rest, which sets the limit."""
+    """Healthy sessions: for training of residuals, for choice among fits, and for the limit."""
 
     channels: tuple[Channel, ...]
     sessions: list[Recording]
@@ -404,7 +404,7 @@ class _HealthySessions:
 
 
 def _healthy_sessions(recordings: Sequence[Recording], experiment: MonitorExperiment) -> _HealthySessions:
-    """Divide healthy logs into sessions drawn at random, and check that a monitor can be fitted to them.
+    """Divide healthy logs into randomly drawn sessions, and check that they suffice for a monitor.
 
     Raises:
         DataError: channels, values or hours that a monitor cannot be fitted to.

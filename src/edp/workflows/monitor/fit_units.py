@@ -80,7 +80,7 @@ class UnitMap:
 
 @one_blas_thread()
 def do_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState | dict[str, Any]:
-    """Do a job of a fit; the function is one of this package."""
+    """Run a unit of a fit, a function of this package."""
     module, _, function = where["function"].partition(":")
     return _encode(getattr(importlib.import_module(module), function)(where["job"]), Path(where["run"]))
 

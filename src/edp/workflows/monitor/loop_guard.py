@@ -1,4 +1,4 @@
-"""A monitor beside a closed loop: channels that it suspects are trusted no more, and controllers fall back."""
+"""Monitor of a closed loop: suspected channels lose trust, and controllers fall back."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class MonitorGuard:
         return self._verdict
 
     def verdict_of(self, alarm: MonitorAlarm) -> GuardVerdict:
-        """What an alarm means for a loop."""
+        """Return the consequence of an alarm for a loop."""
         cause = alarm.causes[0] if alarm.causes else None
         sure = cause is not None and cause.probability >= SURE
         if cause is not None and sure and cause.at_fault == "sensor":
@@ -103,7 +103,7 @@ class MonitorGuard:
 
 
 def judged_by(monitor: Monitor) -> dict[str, tuple[str, ...]]:
-    """Channels that each residual judges, by its name."""
+    """Return the judged channels of each residual by its name."""
     return {
         name: judged for source in monitor.sources for name, judged in zip(source.names, source.judged, strict=True)
     }
@@ -135,7 +135,7 @@ def suspected(alarm: MonitorAlarm, judged: Mapping[str, tuple[str, ...]]) -> tup
 
 
 def monitor_guard(folder: str | Path) -> MonitorGuard:
-    """The guard that the monitor of a folder is.
+    """Return the guard from the monitor of a folder.
 
     Raises:
         BundleError: not a monitor, or damaged.

@@ -51,7 +51,7 @@ def report_monitor(
 
 
 def read_run(folder: Path, title: str | None = None) -> MonitorFacts:
-    """What a folder holds.
+    """Read the monitor run of a folder.
 
     Raises:
         StorageError: it is no run of a monitor, or is damaged.
@@ -89,7 +89,7 @@ def _provenance(folder: Path, content: Mapping[str, object]) -> Provenance:
 
 
 def _remarks(content: Mapping[str, object], where: str) -> dict[str, list[str]]:
-    """What is to be said of recordings, with their names; runs of earlier versions have less of it.
+    """Return remarks by recording; runs of earlier versions have fewer of them.
 
     Raises:
         StorageError: it is damaged.

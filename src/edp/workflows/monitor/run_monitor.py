@@ -47,7 +47,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class MonitorRun:
-    """What came of a monitor along logs.
+    """Result of a monitor along logs.
 
     Attributes:
         monitor: that ran.
@@ -80,7 +80,7 @@ class MonitorRun:
 
     @property
     def changes(self) -> list[list[MonitorAlarm]]:
-        """Alarms that say the same, together; see `episodes`."""
+        """Return alarms merged by `episodes`."""
         return episodes(self.alarms)
 
     def to_json(self) -> dict[str, object]:
@@ -100,7 +100,7 @@ class MonitorRun:
 
 @dataclass(frozen=True, eq=False)
 class WatchedRecording:
-    """What a monitor found in one recording.
+    """Findings of a monitor in one recording.
 
     Attributes:
         alarms: in the order of time.
@@ -233,7 +233,7 @@ def _detectors(monitor: Monitor) -> list[str]:
 
 
 def groups_of(monitor: Monitor) -> dict[str, list[int]]:
-    """Groups of residuals, by source and kind of the channels that they judge, with the places of their summaries."""
+    """Return groups of residuals by source and kind of judged channels, with the positions of their summaries."""
     kinds = {channel.name: str(channel.kind).replace("_", " ") for channel in monitor.channels}
     groups: dict[str, list[int]] = {}
     for column, name in enumerate(monitor.summary_names):
@@ -247,7 +247,7 @@ def groups_of(monitor: Monitor) -> dict[str, list[int]]:
 def trace_of(
     monitor: Monitor, recording: Recording, watched: Watched, groups: Mapping[str, list[int]], start: str
 ) -> RecordingTrace:
-    """What the page shows of a recording."""
+    """Return the trace of a recording for the page."""
     rows = watched.rows.astype(np.float64)
     levels = np.full((len(rows), len(groups)), np.nan)
     for column, places in enumerate(groups.values()):
@@ -262,7 +262,7 @@ def trace_of(
 
 
 def _write(run: MonitorRun, folder: Path, monitor: str) -> None:
-    """Alarms, traces, and where they come from."""
+    """Write alarms, traces and their provenance."""
     dictionary = run.monitor.diagnosis
     write_alarms(run.alarms, folder / ALARM_LOG)
     write_traces(folder, run.traces)
@@ -282,7 +282,7 @@ def _write(run: MonitorRun, folder: Path, monitor: str) -> None:
 
 
 def write_alarms(alarms: tuple[MonitorAlarm, ...], out: str | Path) -> tuple[Path, Path]:
-    """Write alarms as JSON lines, and as CSV beside them; each file is whole or not there.
+    """Write alarms as JSON lines and as CSV; a file is whole or absent.
 
     Raises:
         StorageError: a file cannot be written.
@@ -305,7 +305,7 @@ def write_alarms(alarms: tuple[MonitorAlarm, ...], out: str | Path) -> tuple[Pat
 
 
 def _cell(value: Any) -> Any:
-    """A cell that no spreadsheet takes for a formula."""
+    """Return a cell that no spreadsheet evaluates as a formula."""
     if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r"):
         return "'" + value
     return "" if value is None else value

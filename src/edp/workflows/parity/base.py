@@ -1,4 +1,4 @@
-"""Forms of a network that can be run here: the registry, and what a form does."""
+"""Forms of a network that run on this computer: the registry and its interface."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ ROUNDS = 3
 
 
 class Missing(Exception):
-    """A form that cannot be run on this computer; the text says what it needs."""
+    """Error of a form that this computer cannot run; the text names the requirement."""
 
 
 class Broken(Exception):
-    """A form that did not build, or ended badly; the text says how."""
+    """Error of a form that did not build, or failed; the text gives the reason."""
 
 
 @dataclass(frozen=True, eq=False)
 class ParityCase:
-    """What every form is given.
+    """Input of every form.
 
     Attributes:
         bundle: the trained network.
@@ -54,7 +54,7 @@ class ParityCase:
         return self.bundle.predictor.window
 
     def last_windows(self, count: int) -> tuple[list[Rows], Rows, Rows]:
-        """Windows at the end of the recording, what PyTorch predicts from each alone, and what is allowed.
+        """Return windows at the end of the recording, PyTorch's prediction for each one alone, and the tolerance.
 
         Returns:
             Inputs ``(tick, input)`` of each; ``(window, number)`` twice.
@@ -70,7 +70,7 @@ class ParityCase:
 
 @dataclass(frozen=True, eq=False)
 class Ran:
-    """What a form made of the golden recording.
+    """Result of a form on the golden recording.
 
     Attributes:
         numbers: its numbers ``(row, number)``, SI units.
@@ -175,7 +175,7 @@ def need(program: str, package: str) -> str:
 
 
 def called(command: Sequence[object], folder: Path, feed: bytes = b"") -> bytes:
-    """Standard output of a program.
+    """Return the standard output of a program.
 
     Raises:
         Broken: it failed; the text ends with what it said last.
@@ -192,7 +192,7 @@ def called(command: Sequence[object], folder: Path, feed: bytes = b"") -> bytes:
 
 
 def timed(run: Callable[[], Rows]) -> tuple[Rows, float]:
-    """What a run gives, and the least seconds of some rounds."""
+    """Return the result of a run, and the least seconds of several rounds."""
     spent = []
     for _ in range(ROUNDS):
         began = time.perf_counter()

@@ -63,7 +63,7 @@ def recorded_case(bundle: Bundle, source: DataSource, ticks: int | None = None) 
 
 
 def _free_rows(plant: TwinPlant, recordings: Sequence[Recording], part: int) -> Rows:
-    """Return the inputs of a plant along parts of recordings: measured for its prefix, free from there on."""
+    """Return the inputs of a plant along parts of recordings: measured for its prefix, free afterwards."""
     channels = plant.twin.channels
     series = [channels.task().series(matched(channels, recording), stop=part) for recording in recordings]
     inputs, targets = (np.concatenate([getattr(one, name) for one in series]) for name in ("inputs", "targets"))

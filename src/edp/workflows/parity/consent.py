@@ -1,4 +1,4 @@
-"""Whose bundle is compiled and run: one of a run folder of this computer's owner, or one from elsewhere."""
+"""Consent to compile and run a bundle: given for run folders of this computer's owner, required for others."""
 
 from __future__ import annotations
 

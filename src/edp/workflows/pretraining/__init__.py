@@ -1,4 +1,4 @@
-"""One network over many machines: joint training and meta-learning, judged on machines that were never seen."""
+"""One network for many machines: joint training and meta-learning, judged on unseen machines."""
 
 from edp.training.pretraining.methods import PRETRAININGS, Pretraining
 from edp.training.pretraining.spec import MetaSpec

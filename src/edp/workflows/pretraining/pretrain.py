@@ -1,4 +1,4 @@
-"""One network over many machines: trained on some, chosen on others, judged on machines that it never saw."""
+"""One network for many machines: trained on some, selected on others, judged on unseen ones."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ CARRIED_S = 60.0
 
 @dataclass(frozen=True, kw_only=True)
 class Pretrain:
-    """How one network is trained over many machines.
+    """Training of one network for many machines.
 
     Attributes:
         method: name of a registered method.
@@ -65,7 +65,7 @@ def pretrain(
     progress: Progress = SILENT,
     workers: Workers = IN_PROCESS,
 ) -> Table:
-    """Train one network over many machines and judge it on others; the same call goes on after a stop.
+    """Train one network for many machines and judge it on others; a stopped training continues.
 
     What comes out is a run like any other, with ``foundation.json`` beside it.
 
@@ -137,7 +137,7 @@ def _pretrain_on_node(source: DataSource, experiment: Experiment, order: Pretrai
 
 
 def pretrain_unit(identity: TrainingIdentity, where: Table) -> dict[str, str]:
-    """Train one network over many machines, or continue with it; a diverged run says so in its folder."""
+    """Train one network for many machines, or continue; the folder records a diverged run."""
     try:
         pretrain(where["source"], where["experiment"], where["order"], where["out"])
     except Diverged as end:
@@ -146,7 +146,7 @@ def pretrain_unit(identity: TrainingIdentity, where: Table) -> dict[str, str]:
 
 
 def _start(path: str | Path) -> tuple[Predictor, dict[str, str]]:
-    """A network to begin with, and names by digest of sessions that stay frozen for what comes of it.
+    """Return a start network, and the names by digest of its frozen sessions.
 
     Raises:
         BundleError: not a bundle, or one of an integer network (W8A16).

@@ -1,4 +1,4 @@
-"""What a model of proposed columns predicts, how its logs are divided, and whether a plant model can be trained."""
+"""Targets of a model for proposed columns, division of its logs, and whether a plant model is possible."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _LISTED = 3
 
 
 def choose_targets(proposal: MapProposal) -> tuple[tuple[str, ...], list[str]]:
-    """What to predict, and what to say of it.
+    """Choose the targets, with notes.
 
     Raises:
         DataError: nothing moves.
@@ -77,12 +77,12 @@ def choose_targets(proposal: MapProposal) -> tuple[tuple[str, ...], list[str]]:
 
 
 def _stem(name: str) -> str:
-    """A name without the number of an axis; of names that end with none the name itself."""
+    """Return a name without the number of an axis; other names are returned unchanged."""
     return name.rstrip("0123456789") or name
 
 
 def _beside_changes(changes: Sequence[ColumnGuess], proposal: MapProposal) -> set[str]:
-    """Columns named as a change is, where one is named as what changes: v_boom beside s_boom, as v_arm of s_arm."""
+    """Return columns named like known changes: v_boom for s_boom, if v_arm is the change of s_arm."""
     columns = [guess.column for guess in proposal.columns]
     named = set[str]()
     for change in changes:
@@ -102,7 +102,7 @@ def _without_shared_end(one: str, other: str) -> tuple[str, str]:
 
 
 def choose_split(group: LogGroup, proposal: MapProposal, targets: Sequence[str]) -> tuple[dict[str, object], list[str]]:
-    """Whole logs where there are many, else time; blocks where ends are unlike the rest; and why, for notes."""
+    """Choose the split: whole logs if there are many, else time, blocks if ends differ; with the reason."""
     idle = _rests_in_most(group, proposal, targets) if len(group.paths) >= _LEAST_RECORDINGS else ""
     if len(group.paths) >= _LEAST_RECORDINGS and not idle:
         return {"kind": "names"}, []
@@ -128,7 +128,7 @@ def choose_split(group: LogGroup, proposal: MapProposal, targets: Sequence[str])
 
 
 def _rests_in_most(group: LogGroup, proposal: MapProposal, targets: Sequence[str]) -> str:
-    """Why whole logs would not test an output or a command, since it moves in few of them; empty where they would."""
+    """State why whole logs would not test an output or a command that moves in few logs; empty if they would."""
     tests = max(1, round(ByName.test_share * len(group.paths)))
     for guess in proposal.columns:
         if guess.channel not in targets and not (guess.channel and guess.role == "command"):
@@ -152,7 +152,7 @@ def _size(look: LogLook, name: str) -> float:
 
 
 def _targets_of(look: LogLook, names: Sequence[str], step: int, rate: float) -> Recording:
-    """Columns of what was looked at of a log; where pieces of it meet, a missing value keeps their changes apart."""
+    """Return target columns of a looked-at log; missing values separate its pieces."""
     columns = {column.name: column for column in look.columns}
     apart = np.full(1, np.nan)
     values = [np.concatenate([x for piece in columns[name].pieces for x in (piece[::step], apart)]) for name in names]
@@ -162,7 +162,7 @@ def _targets_of(look: LogLook, names: Sequence[str], step: int, rate: float) -> 
 
 @dataclass(frozen=True)
 class PlantProposal:
-    """What of the logs a plant model would read and answer with.
+    """Inputs and answers of a plant model for these logs.
 
     Attributes:
         parts: channels to name to `edp twin`, by part; a part that it finds by itself is not among them.
@@ -174,7 +174,7 @@ class PlantProposal:
 
 
 def propose_plant(proposal: MapProposal, targets: Sequence[str], inputs: Sequence[str]) -> PlantProposal:
-    """What a plant model of these columns needs.
+    """Propose a plant model for these columns.
 
     Args:
         proposal: the columns.
@@ -206,7 +206,7 @@ def propose_plant(proposal: MapProposal, targets: Sequence[str], inputs: Sequenc
 def _of_positions(
     proposal: MapProposal, kinds: dict[str, Kind], commands: Sequence[str], assignments: dict[str, tuple[str, ...]]
 ) -> PlantProposal:
-    """Of logs without a measured velocity: `edp twin` takes the changes of the positions."""
+    """Propose a plant model without measured velocities: `edp twin` differentiates the positions."""
     asked = [name for name, kind in kinds.items() if kind in INTEGRAL]
     if asked:  # one that is no answer, or the answers to predict would be velocities
         return PlantProposal(

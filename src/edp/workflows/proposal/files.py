@@ -31,7 +31,7 @@ def horizons_for(rate_hz: float | None) -> tuple[int, int]:
 
 
 def map_table(signal_map: SignalMap) -> dict[str, object]:
-    """A signal map as a file has it, without what is as usual."""
+    """Return a signal map as in a file, without default values."""
     table: dict[str, object] = {}
     for key in ("time", "sample_time_s", "rate_hz"):
         value = getattr(signal_map, key)
@@ -56,7 +56,7 @@ def _usual_kind(name: str) -> Kind | None:
 
 
 def remarks_of(paths: Sequence[Path], proposal: MapProposal) -> list[str]:
-    """Comments on top of a map: where it comes from and what is to be checked."""
+    """Return the comments at the top of a map: its source and points to check."""
     lines = [f"Proposed by edp init for {', '.join(path.name for path in paths)}. To be checked:"]
     checked = [guess for guess in proposal.columns if guess.check and guess.channel]
     lines += [f"  {guess.channel}: {guess.role}, {guess.sureness}; {guess.check}" for guess in checked]
@@ -76,7 +76,7 @@ def toml_text(table: Table, remarks: Iterable[str] = ()) -> str:
 def settings_text(
     proposal: MapProposal, channels: Sequence[str], targets: Sequence[str], split: dict[str, object]
 ) -> str:
-    """Settings as a file has them: task, features and split."""
+    """Return settings as in a file: task, features and split."""
     clock = proposal.clock
     rate = clock.wanted_hz or clock.rate_hz
     table = {
@@ -94,14 +94,14 @@ def settings_text(
 
 
 def named_paths(paths: Sequence[Path]) -> list[tuple[Path, str]]:
-    """Return the paths that a data-set file can list, each with a name of its own."""
+    """Return the paths that a data-set file can list, each with a unique name."""
     # A data-set file expands environment variables in paths.
     usable = [path for path in paths if "$" not in str(full_path(path)) and str(path).isprintable()]
     return list(zip(usable, unique_names([path.stem for path in usable], usable)))
 
 
 def data_set_text(recordings: list[Table], map_file: str | None = None, repair: dict[str, str] | None = None) -> str:
-    """A data set as a file has it.
+    """Return a data set as in a file.
 
     Raises:
         DataError: there is no recording that a file can list.

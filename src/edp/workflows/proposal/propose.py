@@ -46,7 +46,7 @@ _TRAINS = ("est", "train", "id", "training", "identification")
 
 @dataclass(frozen=True)
 class LogsProposal:
-    """What `propose` found.
+    """Findings of `propose`.
 
     Attributes:
         source: the logs and folders that were asked about.
@@ -75,7 +75,7 @@ class LogsProposal:
     recordings: int
 
     def commands(self, folder: Path) -> list[str]:
-        """The commands that come next, in order."""
+        """Return the next commands in order."""
         data, mapped, repair = self._logs(folder)
         run = _quoted(folder / "runs" / "first")
         inputs = f" --inputs {shlex.quote(','.join(self.inputs))}" if self.inputs else ""
@@ -87,7 +87,10 @@ class LogsProposal:
         ]
 
     def plant_command(self, folder: Path) -> str:
-        """The command that trains a plant model, which runs on commands alone; empty where `no_plant` says why."""
+        """Return the command that trains a plant model on commands alone.
+
+        Empty if `no_plant` gives a reason against it.
+        """
         plant = propose_plant(self.proposal, self.targets, self.inputs)
         if plant.why_not:
             return ""
@@ -106,7 +109,7 @@ class LogsProposal:
         return propose_plant(self.proposal, self.targets, self.inputs).why_not
 
     def _logs(self, folder: Path) -> tuple[str, str, str]:
-        """Logs, map and repairs as arguments of a command."""
+        """Return logs, map and repairs as arguments of a command."""
         repair = "".join(f" --repair {one}" for one in self.repairs)
         if DATA in self.files:
             return _quoted(folder / DATA), "", repair
@@ -114,7 +117,7 @@ class LogsProposal:
 
 
 def _untold_inputs(proposal: MapProposal) -> tuple[str, ...]:
-    """Channels that command, where all are generic; none where a name has the comma that stands between names."""
+    """Return command channels if all are generic; none if a name contains the comma that separates names."""
     commands = proposal.of_role("command")
     names = tuple(guess.channel for guess in commands)
     plain = all(guess.kind.kind is Kind.GENERIC for guess in commands) and not any("," in name for name in names)
@@ -126,7 +129,7 @@ def _quoted(path: Path) -> str:
 
 
 def propose(path: str | Path | Sequence[str | Path], progress: Progress = SILENT) -> LogsProposal:
-    """Look at logs and propose a map and settings; nothing is written.
+    """Examine logs and propose a map and settings; nothing is written.
 
     Args:
         path: a log or a folder of logs, or several of them.
@@ -197,7 +200,7 @@ def propose(path: str | Path | Sequence[str | Path], progress: Progress = SILENT
 def _recordings(
     group: LogGroup, proposal: MapProposal, experiments: Experiments | None
 ) -> list[tuple[Path, dict[str, object]]]:
-    """The logs of a group as entries of a data set; an experiment has a map that names its variable."""
+    """Return the logs of a group as entries of a data set; an experiment has a map that names its variable."""
     if experiments is None:
         return [(path, {"path": str(full_path(path)), "name": name}) for path, name in named_paths(group.paths)]
     columns = map_table(proposal.signal_map)
@@ -209,7 +212,7 @@ def _recordings(
 
 
 def _of_experiments(experiments: Experiments, tests: Sequence[str]) -> list[str]:
-    """What to say of experiments that stand beside each other."""
+    """Return notes on parallel experiments."""
     parted = f", of which {len(tests)} test by their name" if tests else ""
     other = f"other columns: {', '.join(experiments.others[:3])}; give such logs on their own"
     return [
@@ -241,7 +244,7 @@ def _without_copies(paths: Sequence[Path]) -> tuple[list[Path], list[tuple[Path,
 
 
 def _timed(group: LogGroup, proposal: MapProposal) -> tuple[MapProposal, Timing]:
-    """A proposal with one rate where its logs have several, and the repairs that they need."""
+    """Return a proposal with one rate for logs with several rates, and the required repairs."""
     mapped = [guess.column for guess in proposal.columns if guess.channel]
     timing = timing_of(group.looks, proposal.clock, mapped)
     if timing.rate_hz is None:
@@ -304,7 +307,7 @@ def _notes(group: LogGroup, others: Sequence[LogGroup], broken: dict[Path, str],
 
 
 def _side_by_side(proposal: MapProposal) -> dict[str, dict[str, ColumnGuess]]:
-    """Columns of two experiments beside each other, ``uEst`` and ``uVal``: by ending and stem; empty elsewhere."""
+    """Return columns of two parallel experiments, ``uEst`` and ``uVal``, by ending and stem; empty without any."""
     sets: dict[str, dict[str, ColumnGuess]] = {}
     for guess in proposal.columns:
         if not guess.channel:

@@ -1,1 +1,1 @@
-"""The phased model search: what may be changed, what was trained, and what follows from it."""
+"""Phased model search: variable settings, trainings, and decisions."""

@@ -1,4 +1,4 @@
-"""What the phases of a search stand on: sessions set apart, folds, orders and what came of them."""
+"""Common ground of a search's phases: sealed sessions, folds, requests and outcomes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ F = TypeVar("F")
 
 @dataclass(frozen=True)
 class SearchContext:
-    """What all phases share; nothing in it changes while a search runs but what was decided.
+    """Common data of all phases; only decisions are added while a search runs.
 
     Attributes:
         spec: the settings of the search.
@@ -63,7 +63,10 @@ class SearchContext:
     @property
     # Sessions of the first run: choices of later phases rest on the same ones.
     def validation(self) -> tuple[str, ...]:
-        """Development sessions that judge where the others train: those of the first run; two at least are left."""
+        """Return the development sessions that judge while the others train: those of the first run.
+
+        Two or more train.
+        """
         chosen = [name for name, judges in zip(self.development, self.folds(1)[0], strict=True) if judges]
         # Two sessions at least must be left to train.
         return tuple(chosen[: max(1, len(self.development) - 2)])
@@ -74,7 +77,7 @@ class SearchContext:
         return tuple(name for name in self.development if name not in self.validation)
 
     def folds(self, runs: int) -> NDArray[np.bool_]:
-        """Which development sessions each run is judged on, ``(run, session)``; more runs have the same first ones.
+        """Return the judging development sessions of each run ``(run, session)``; more runs keep the same first ones.
 
         Repeated folds; in the thesis's mode independent draws of as many sessions as a fold has.
         """
@@ -85,15 +88,15 @@ class SearchContext:
         return repeated_folds(sessions, folds, -(-runs // folds), self.spec.seed)[:runs]
 
     def shaped(self, settings: Table) -> Table:
-        """Settings with the widths that this search gives its networks."""
+        """Return settings with this search's widths of networks."""
         return WIDTHS[self.spec.widths](settings)
 
     def network(self, settings: Table, names: Sequence[str] = (), options: Candidate | None = None) -> Table:
-        """Settings with modules and toggles added, and the widths of this search."""
+        """Return settings with modules and toggles added, and this search's widths."""
         return with_modules(settings, names, self.channels, options, self.shaped)
 
     def orders(self, settings: Table, runs: Sequence[int], seed: int = 0) -> list[TrainingRequest]:
-        """An order for each run: the same folds and, for common random numbers, the same seeds for every arm.
+        """Return one request per run: the same folds and seeds for every arm (common random numbers).
 
         Trainings of several epochs are validated by the sessions that judge them, as in the thesis.
 
@@ -122,7 +125,7 @@ class SearchContext:
         updates: int,
         validation: tuple[str, ...],
     ) -> TrainingRequest:
-        """Order a training; sessions of `validation` choose the best of several epochs, and nothing of one."""
+        """Request a training; sessions of `validation` select the best of several epochs, and nothing for one epoch."""
         sessions = (settings, self.source, train, judged)
         if self.spec.epochs == 1:
             return TrainingRequest(*sessions, seed, updates)
@@ -130,13 +133,16 @@ class SearchContext:
         return TrainingRequest(*sessions, seed, updates, epochs=epochs, patience=patience, validation=validation)
 
     def seed(self, *parts: object) -> int:
-        """A seed of its own for each purpose, from the root."""
+        """Return a seed for each purpose, derived from the root."""
         text = " ".join(map(str, (self.spec.seed, *parts)))
         # 31 bits: libraries take seeds as signed 32-bit numbers.
         return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest(), "big") >> 1
 
     def table(self, outcomes: Sequence[Outcome], name: str = "composite") -> Array:
-        """Scores ``(run, session)`` of runs 0, 1, ...; NaN where a run is not judged on a session, or failed."""
+        """Return scores ``(run, session)`` of runs 0, 1, ....
+
+        NaN for a session that a run does not judge, or a failure.
+        """
         columns = {session: column for column, session in enumerate(self.development)}
         scores = np.full((len(outcomes), len(columns)), np.nan)
         for row, outcome in enumerate(outcomes):
@@ -162,7 +168,7 @@ def _fills_folds(development: int, spec: SearchSpec) -> bool:
 def set_apart(
     sessions: Sequence[str], families: Mapping[str, str], spec: SearchSpec
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """Development sessions, test sessions, and those of the second test set: of each family its share, drawn once.
+    """Return development sessions, test sessions, and the second test set, drawn once in proportion from each family.
 
     Args:
         sessions: names in order.

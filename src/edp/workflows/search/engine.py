@@ -1,4 +1,4 @@
-"""Engine of a search: runs the phases, and has the trainings done that they ask for.
+"""Engine of a search: runs the phases, and orders the trainings that they request.
 
 `TrainingRequest` is what a phase asks for; `edp.workflows.search.jobs.job_of` makes a `Job` of it, whose key covers all
 that decides the result; whoever does the job answers with a `Record`, which the ledger keeps under that key; an
@@ -33,7 +33,7 @@ def run_phases(
     phases: Sequence[str] | None = None,
     on_phase: Callable[[str, SearchContext], None] | None = None,
 ) -> SearchContext:
-    """Run the phases in order, each on what the ones before decided.
+    """Run the phases in order; each builds on earlier decisions.
 
     Nothing is remembered between calls but what `do` remembers: phases are pure, so a search that was stopped comes
     to the same decisions again, with the same orders.
@@ -81,7 +81,7 @@ def _run(name: str, context: SearchContext, do: Do) -> Decision:
 
 
 def _sound(outcomes: list[Outcome]) -> list[Outcome]:
-    """The outcomes of a batch, unless they tell of a fault that a decision must not rest on.
+    """Return the outcomes of a batch, or raise if they show a fault that forbids a decision.
 
     Raises:
         LostError: a training was lost.
@@ -105,7 +105,7 @@ def _sound(outcomes: list[Outcome]) -> list[Outcome]:
 
 @dataclass(frozen=True)
 class Dispatcher:
-    """Has the trainings done that a phase asks for.
+    """Executor of the trainings that a phase requests.
 
     Attributes:
         ledger: of the study.
@@ -156,7 +156,7 @@ class Dispatcher:
         return job_of(request, self.data, self.threads, self.seconds, self.memory_mb)
 
     def _begun(self, request: TrainingRequest) -> Job:
-        """The job of a request, with the state from which it goes on, where there is one."""
+        """Return the job of a request with its start state, if it has one."""
         job = self._job(request)
         if self.ledger.finished(job.key):
             return job

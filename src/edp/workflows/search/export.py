@@ -1,4 +1,4 @@
-"""A copy of a study's questions and answers for optuna-dashboard; the ledger stays the only truth."""
+"""Copy of a study's questions and answers for optuna-dashboard; the ledger remains the source."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def export_study(folder: str | Path, path: str | Path | None = None) -> tuple[Pa
 
 
 def ended_studies(study: StudyFile) -> list[FinishedStudy]:
-    """The studies of phases 1, 4 and 5 that have ended."""
+    """Return the finished studies of phases 1, 4 and 5."""
     space, cost = space_of(study.spec["space"]), study.spec["cost"]
     score = f"composite, {study.unit}"
     objectives = (score,) if cost == "none" else (score, cost)

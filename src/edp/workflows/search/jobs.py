@@ -1,4 +1,4 @@
-"""Orders of a search as jobs for an executor: what decides a result is in the identity, the rest is beside it."""
+"""Requests of a search as jobs for an executor; the identity holds all that determines a result."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from edp.workflows.search.trainings import TrainingRequest, experiment_of, train
 def job_of(
     order: TrainingRequest, data: str, threads: int = 1, seconds: float | None = None, memory_mb: float | None = None
 ) -> Job:
-    """The job that does an order.
+    """Return the job of a request.
 
     Args:
         order: what to train.

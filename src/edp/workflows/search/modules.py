@@ -39,7 +39,7 @@ class Module:
 
 
 class _Modules(Mapping[str, Module]):
-    """The thesis's modules in its order, then every registered block that is none of them and may be searched.
+    """Modules of the thesis in its order, followed by all other searchable blocks.
 
     Blocks are looked up when asked for, so that a block that is registered later is searched, too.
     """
@@ -112,14 +112,14 @@ _change("stanh", "STanh Activation", "activation", {"kind": "stanh"})
 
 
 def _correlation(settings: Table) -> None:
-    """The term with its own weight, unless the training has one."""
+    """Add the correlation term with its weight, unless the training has one."""
     terms = settings["training"].get("terms", [])
     if all(term["kind"] != "correlation" for term in terms):
         settings["training"]["terms"] = [*terms, *plain_tree((Correlation(),), "terms")]
 
 
 def _focal(settings: Table) -> None:
-    """The loss, weighted by the size of the error; below the quadratic one no threshold of the Huber loss comes."""
+    """Weight the loss by the size of the error; a squared loss gets a threshold that no error reaches."""
     loss = settings["training"]["loss"]
     if loss["kind"] != "focal":
         settings["training"]["loss"] = {"kind": "focal", "gamma": 2.0, "delta": loss.get("delta", NO_THRESHOLD)}
@@ -134,7 +134,7 @@ TOGGLES.register("focal_loss")(Module("Focal Loss", alter=_focal))
 
 
 def part_of(name: str) -> Module:
-    """A module, or a toggle.
+    """Return a module or a toggle.
 
     Raises:
         ConfigError: there is none of this name.
@@ -143,7 +143,7 @@ def part_of(name: str) -> Module:
 
 
 def title_of(name: str) -> str:
-    """What the thesis calls a module or a toggle."""
+    """Return the thesis's name of a module or a toggle."""
     return part_of(name).title
 
 
@@ -154,7 +154,7 @@ def with_modules(
     options: Mapping[str, Value] | None = None,
     shape: Shape | None = None,
 ) -> Table:
-    """Settings with these modules added, in the order of the registry, so that equal sets give equal settings.
+    """Return settings with these modules added in the order of the registry, so that equal sets give equal settings.
 
     Args:
         settings: a whole experiment as plain tables (`edp.config.experiment.plain_tree`).
@@ -186,7 +186,7 @@ def with_modules(
 
 
 def options_of(settings: Table, name: str, shape: Shape | None = None) -> dict[str, Choice]:
-    """What may be varied of a module where it is on, as dimensions ``module.option``.
+    """Return the options of an active module that may vary, as dimensions ``module.option``.
 
     Args:
         settings: to which the module would be added; what it would have there is one of the values.
@@ -198,7 +198,7 @@ def options_of(settings: Table, name: str, shape: Shape | None = None) -> dict[s
 
 
 def present_options(settings: Table, names: Iterable[str], shape: Shape | None = None) -> dict[str, Value]:
-    """What these modules have of their options where nothing is chosen."""
+    """Return the present options of these modules, before any choice."""
     return {key: option.present for name in names for key, option in _options(settings, name, shape).items()}
 
 
@@ -245,7 +245,7 @@ def _options(settings: Table, name: str, shape: Shape | None = None) -> dict[str
 
 
 def _label(value: Any) -> Value:
-    """What a sampler can hold: a list as text."""
+    """Return a value that a sampler can hold: a list as text."""
     if isinstance(value, list | tuple):
         return ", ".join(map(str, value))
     scalar: Value = value

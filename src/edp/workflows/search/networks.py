@@ -1,4 +1,4 @@
-"""What a search hands on: which sessions stay frozen, and the networks of phase 6 as runs."""
+"""Results of a search for later commands: frozen sessions, and the networks of phase 6 as runs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FOLDER, CHOSEN = "networks", "chosen"
 
 
 def frozen_split(folder: Path, context: SearchContext, digests: Mapping[str, str]) -> ByFrozen:
-    """The sessions of a search by their content, for every command after it.
+    """Return the sessions of a search by their content, for every later command.
 
     Args:
         folder: of the study.
@@ -50,7 +50,7 @@ def write_networks(
     split: ByFrozen,
     outcomes: Sequence[Outcome],
 ) -> dict[str, Path]:
-    """Write the networks that were judged on the second sealed test set as runs, once phase 6 has decided.
+    """Write the networks judged on the second sealed test set as runs, after the decision of phase 6.
 
     Args:
         folder: of the study.

@@ -36,7 +36,7 @@ PRESETS = ("quick", "standard", "thesis")
 
 @dataclass(frozen=True)
 class SearchPlan:
-    """What is searched, and from where.
+    """Plan of a search: experiment, settings and space.
 
     Attributes:
         spec: the settings of the search.
@@ -49,13 +49,13 @@ class SearchPlan:
     preset: str = ""
 
     def to_plain(self) -> Table:
-        """What a study is bound to, in parts that a message can name."""
+        """Return the identity of a study, in parts that a message can name."""
         spec = plain_spec(self.spec)
         return {"space": spec.pop("space"), "search": spec, "network": settings_of(self.experiment)}
 
 
 def load_plan(path: str | Path | None = None, preset: str = "quick", overrides: Sequence[str] = ()) -> SearchPlan:
-    """A plan from a preset, changed by a TOML file, changed by ``key.path=value`` overrides.
+    """Load a plan from a preset, changed by a TOML file and by ``key.path=value`` overrides.
 
     The file is one of an experiment, with a table ``[search]`` beside the others, and may say with ``base`` from which
     preset of networks it starts. In ``[search.space]`` a dimension is ``{ low = .., high = .., log = true }`` or a list
@@ -166,7 +166,7 @@ def _spec(table: Table, where: str) -> SearchSpec:
 def space_of(
     table: Table, over: Space | None = None, where: str = "of a study", key: str = "space"
 ) -> dict[str, Range]:
-    """A space from its form in a settings file, laid over another one; `key` is its name there.
+    """Return a space from its form in a settings file, merged over another one; `key` is its name there.
 
     Raises:
         ConfigError: an unknown dimension, or a range that holds nothing.
@@ -198,14 +198,14 @@ def _range(entry: Any, where: str) -> Range:
 
 
 def plain_spec(spec: SearchSpec) -> Table:
-    """A spec as plain values."""
+    """Return a spec as plain values."""
     table: Table = plain_tree(spec)
     table["space"], table["deferred"] = plain_space(spec.space), plain_space(spec.deferred)
     return table
 
 
 def plain_space(space: Space) -> Table:
-    """A space as in a settings file."""
+    """Return a space as in a settings file."""
     return {
         name: list(dimension.options)
         if isinstance(dimension, Choice)

@@ -81,7 +81,7 @@ class Resources:
             )
 
     def gather(self) -> Executor:
-        """What does the trainings."""
+        """Return the executor of the trainings."""
         if self.cluster:
             return RayPool(self.cluster, self.threads, open_cluster=self.open_cluster)
         return LocalPool(self.workers or max(1, cores() // self.threads), self.threads)
@@ -89,7 +89,7 @@ class Resources:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """What a search has found so far.
+    """Results of a search so far.
 
     Attributes:
         folder: of the study.
@@ -120,7 +120,7 @@ def run_search(
     until: str | None = None,
     progress: Progress = SILENT,
 ) -> SearchResult:
-    """Search, or go on with a search where it stopped.
+    """Search, or continue a stopped search.
 
     Args:
         source: where the recordings are; each is a session.
@@ -198,7 +198,7 @@ def run_search(
 
 @dataclass(frozen=True)
 class _Data:
-    """What a search must know of its recordings; they themselves are read by those who train."""
+    """Facts on a search's recordings, which only the trainings read."""
 
     names: tuple[str, ...]
     families: dict[str, str]
@@ -232,7 +232,7 @@ def _gap(plan: SearchPlan) -> int:
 
 
 class _Observer:
-    """Passes on what happens, and opens a sealed test set when a batch is to be judged on its sessions.
+    """Observer that reports events, and opens a sealed test set before a batch is judged on its sessions.
 
     Attributes:
         second: outcomes of trainings that were evaluated on the second test set, by key.
@@ -285,7 +285,7 @@ class _Observer:
 
 
 def _refuse_twice(recordings: Sequence[Recording]) -> None:
-    """The same session twice would train and judge."""
+    """Refuse duplicate sessions, which would both train and judge."""
     seen: dict[str, str] = {}
     for recording in recordings:
         if recording.digest in seen:
@@ -339,7 +339,7 @@ def _study(plan: SearchPlan, data: _Data, source: DataSource, context: SearchCon
 
 
 def _write_teacher(folder: Path, context: SearchContext, split: ByFrozen) -> Path | None:
-    """The winner's settings with the sessions that stay frozen, as `edp train --config` takes them."""
+    """Write the winner's settings with the frozen sessions, for `edp train --config`."""
     decisions = list(context.decided.values())
     explored, joined = facts_of_kind(decisions, ExplorationFacts), facts_of_kind(decisions, SynthesisFacts)
     if joined is None:

@@ -1,4 +1,4 @@
-"""What a search is asked to do: budgets, arms and rules of its phases."""
+"""Settings of a search: budgets, arms and rules of its phases."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class CompressionSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class SearchSpec:
-    """The settings of a search. The thesis's own numbers are those of the preset ``thesis``.
+    """Settings of a search; the preset ``thesis`` holds the thesis's own numbers.
 
     Attributes:
         mode: ``sound`` (docs/statistics.md) or ``thesis``, whose tests and rules are followed (docs/thesis_preset.md).
@@ -219,7 +219,7 @@ class SearchSpec:
 
     @property
     def feature_sets(self) -> dict[str, str | Table]:
-        """By name, what ``task.features`` of an experiment is set to: a name, or a plain table."""
+        """Return the values of ``task.features`` by name: a name of a set, or a plain table."""
         return {
             feature_set if isinstance(feature_set, str) else feature_set.name: feature_set
             if isinstance(feature_set, str)
@@ -236,7 +236,7 @@ class SearchSpec:
 
     @property
     def length(self) -> int:
-        """Of a training in what its rungs are counted in: epochs where it has several, else steps."""
+        """Return the length of a training in the units of its rungs: epochs if there are several, else steps."""
         return self.epochs if self.epochs > 1 else self.updates
 
     def _wrong_epochs(self) -> list[str]:

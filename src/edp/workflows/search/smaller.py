@@ -1,4 +1,4 @@
-"""One network of phase 6: trained as its recipe says, judged in its number formats; a plain order in, a record out.
+"""One network of phase 6: trained by its recipe and judged in its number formats, from a plain request to a record.
 
 A network rests on those that it is made of: a student on the teacher, a rounded one on a student. What it is made of
 comes with the state of an earlier order, or is trained again from the same order to the same bits.
@@ -34,7 +34,7 @@ Weights = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class Recipe:
-    """What is made of the network of an order.
+    """Recipe that makes a network from that of a request.
 
     Attributes:
         updates: training steps of a smaller network over all epochs, 0 for passes over the data; one that is trained
@@ -58,7 +58,7 @@ class Recipe:
     final: str = ""
 
     def order(self) -> CompressionRequest | None:
-        """How it is made of the teacher; None for the teacher."""
+        """Return the request that makes it from the teacher; None for the teacher."""
         if self.units is None:
             return None
         # Rounded networks are made of plain ones, whose order comes first.
@@ -67,7 +67,7 @@ class Recipe:
         return rounded_order(plain) if self.rounded else plain
 
     def experiment(self, experiment: Experiment) -> Experiment:
-        """The experiment of the last training that makes the network, where `experiment` is the teacher's."""
+        """Return the experiment of the network's last training, given the teacher's."""
         order = self.order()
         if order is None:
             return experiment
@@ -81,7 +81,7 @@ class Recipe:
 
     @staticmethod
     def from_json(plain: Table) -> Recipe:
-        """The recipe that `to_json` gave.
+        """Return the recipe from the result of `to_json`.
 
         Raises:
             ConfigError: a value of another kind.
@@ -90,7 +90,7 @@ class Recipe:
 
 
 def before(order: TrainingRequest) -> list[TrainingRequest]:
-    """Orders whose state an order of phase 6 can go on from, the one that saves most first; none in other phases."""
+    """Return requests of phase 6 whose state can start this one, the most useful first; none in other phases."""
     if order.recipe is None:
         return []
     recipe = Recipe.from_json(order.recipe)
@@ -150,7 +150,7 @@ def make_smaller(plain: Table, start: bytes | None = None) -> tuple[Table, bytes
 
 
 def network_of(weights: str, task: Task, model: ModelSpec) -> Predictor:
-    """The network of a result with ``weights``."""
+    """Return the network of a result with ``weights``."""
     return _restored(load(base64.b64decode(weights)), task, model)
 
 
@@ -171,7 +171,7 @@ class _StateBench(Bench):
         super().__init__(_restored(weights[TEACHER], data.task, experiment.model), data, experiment.training)
 
     def training_of(self, order: CompressionRequest) -> TrainingSpec:
-        """How a smaller network is trained, for the steps of the recipe."""
+        """Return the training of a smaller network for the steps of the recipe."""
         return shortened(order, self.training, self.updates)
 
     def train(self, order: CompressionRequest, start: Predictor | None) -> Predictor:

@@ -1,4 +1,4 @@
-"""What a search varies besides modules: dimensions with their ranges, each a change of an experiment's settings."""
+"""Dimensions of a search apart from modules: each has a range and changes an experiment's settings."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ class Real:
             raise ConfigError(f"a logarithmic range from {self.low}; low > 0 must hold")
 
     def holds(self, value: Value) -> bool:
-        """Whether a value lies in the range."""
+        """Test whether a value lies in the range."""
         return isinstance(value, float | int) and self.low <= value <= self.high
 
     def around(self, value: float, reach: float, beyond: bool = False) -> Real:
-        """What is within `reach` of a value: in decades where logarithmic (thesis 3.3.3).
+        """Return the part within `reach` of a value, in decades if logarithmic (thesis 3.3.3).
 
         Args:
             value: the middle.
@@ -78,7 +78,7 @@ class Choice:
             raise ConfigError(f"a choice of {list(self.options)}; two values or more, each once, must hold")
 
     def holds(self, value: Value) -> bool:
-        """Whether a value is one of the options."""
+        """Test whether a value is one of the options."""
         return value in self.options
 
 
@@ -153,14 +153,14 @@ def _schedule(settings: Table, value: str) -> None:
 
 @DIMENSIONS.register("patience")
 def _patience(settings: Table, value: int) -> None:
-    """Epochs that a plateau is waited for; another schedule has none."""
+    """Set the patience of a plateau in epochs; other schedules have none."""
     if settings["training"]["schedule"]["kind"] == "plateau":
         settings["training"]["schedule"]["patience"] = int(value)
 
 
 @DIMENSIONS.register("smoothness")
 def _smoothness(settings: Table, value: float) -> None:
-    """Weight of the smoothness term; where it counts, windows are drawn in runs that have second differences."""
+    """Set the weight of the smoothness term; with it, windows are drawn in runs that have second differences."""
     training = settings["training"]
     training["terms"] = [term for term in training["terms"] if term["kind"] != "smoothness"]
     if not value:
@@ -189,7 +189,7 @@ ELASTIC = {"learning_rate": 1.0, "weight_decay": 1.0, "dropout": 0.15}
 
 
 def apply(settings: Table, candidate: Candidate) -> Table:
-    """Settings with the values of a candidate.
+    """Return settings with the values of a candidate.
 
     Raises:
         ConfigError: an unknown dimension.
@@ -206,13 +206,13 @@ def apply(settings: Table, candidate: Candidate) -> Table:
 
 
 def applicable(space: Space, settings: Table) -> Space:
-    """The dimensions that change something in these settings: a pure LSTM has no kernel."""
+    """Return the dimensions that affect these settings: a pure LSTM has no kernel."""
     backbone = settings["model"]["backbone"]
     return {name: dimension for name, dimension in space.items() if name != "kernel" or "kernel" in backbone}
 
 
 def halved(settings: Table) -> Table:
-    """Settings with the widths that the thesis's printed parameter counts have (Tables B.1, 4.8 and 4.9).
+    """Return settings with the widths of the thesis's printed parameter counts (Tables B.1, 4.8 and 4.9).
 
     Channels start at C and halve from level to level. The hidden layers of a head are C / 2 wide where there is one of
     them and C / 4 where there are more. A pure TCN gets as many levels as its receptive field needs for the window
@@ -241,7 +241,7 @@ WIDTHS: dict[str, Callable[[Table], Table]] = {"equal": lambda settings: setting
 
 
 def elastic(space: Space, baseline: Candidate, reach: Mapping[str, float] = ELASTIC, beyond: bool = False) -> Space:
-    """The window around a baseline in which candidates of phase 2 are tuned; other dimensions stay as they are.
+    """Return the window around a baseline for the tuning of candidates in phase 2; other dimensions are unchanged.
 
     Args:
         space: of phase 1.

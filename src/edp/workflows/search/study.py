@@ -1,4 +1,4 @@
-"""Ask and tell: the only door to Optuna. Nothing is stored; reported values are reported again when a search goes on.
+"""Ask-and-tell access to Optuna; nothing is stored, and a continued search reports its values again.
 
 A study is a pure function of its root seed and of the reports, in the order of the trials: each question is asked
 with a sampler seeded by root and number. So a search that was killed asks the same again and finds the answers in the
@@ -67,7 +67,7 @@ class Trial:
         return float(np.mean(scores)) if scores and np.isfinite(scores).all() else None
 
     def row(self, horizon: int) -> TrialRow:
-        """Return what the study's file says of it."""
+        """Return its row in the study's file."""
         return TrialRow(
             number=self.number,
             values={**self.values, **self.options},
@@ -82,7 +82,7 @@ class Trial:
 
 @dataclass(frozen=True, kw_only=True)
 class SamplerSpec:
-    """How questions are chosen.
+    """Settings of the sampler.
 
     Attributes:
         kind: ``gp`` (a Gaussian process for the first 100 trials, then TPE), ``tpe``, ``thesis_tpe`` (univariate,
@@ -104,7 +104,7 @@ class SamplerSpec:
 
 @dataclass
 class Study:
-    """Questions about a space and what they gave; smaller values are better.
+    """Questions about a space and their answers; smaller values are better.
 
     Attributes:
         space: dimensions and their ranges.
@@ -155,7 +155,7 @@ class Study:
         self._waiting: dict[int, tuple[Sequence[float] | None, Sequence[float], bool]] = {}
 
     def suggest(self, values: Candidate, flags: Sequence[str] | None = None, options: Candidate | None = None) -> None:
-        """Have this asked next: a warm start. What is not given, the sampler chooses.
+        """Ask this next as a warm start; the sampler chooses missing values.
 
         Args:
             values: of some or all dimensions.
@@ -183,7 +183,7 @@ class Study:
         self._study.enqueue_trial(dict(values) | switched | dict(options or {}))
 
     def ask(self, count: int) -> list[Trial]:
-        """The next questions, `count` of them; those asked before count as unanswered until they are reported."""
+        """Return the next `count` questions; earlier ones count as unanswered until they are reported."""
         return [self._ask() for _ in range(count)]
 
     def _ask(self) -> Trial:
@@ -214,7 +214,7 @@ class Study:
         return allowed
 
     def report(self, number: int, step: int, value: float) -> None:
-        """What a question that is not answered yet gives at a step of its training.
+        """Report the value of an unanswered question at a step of its training.
 
         Raises:
             ConfigError: a question that was not asked, a value that is not finite, or several objectives.
@@ -235,7 +235,7 @@ class Study:
     def tell(
         self, number: int, values: Sequence[float] | None, costs: Sequence[float] = (), pruned: bool = False
     ) -> None:
-        """What a question gave; reported in any order, it counts in the order of numbers.
+        """Report the answer of a question in any order; answers count in the order of numbers.
 
         Args:
             number: of the trial.

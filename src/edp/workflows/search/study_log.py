@@ -25,7 +25,7 @@ EVERY_S = 2.0
 
 
 class StudyLog:
-    """Writes down what happens, at most every two seconds but for decisions and the end.
+    """Record of events in the study's file, at most every two seconds except for decisions and the end.
 
     Rows of trainings stand in the order in which they were asked for, whatever order they ended in, so that a search
     that was stopped and went on writes what one that was not would have written, times apart. A training
@@ -69,7 +69,7 @@ class StudyLog:
         self.state = "running"
 
     def on_phase(self, name: str, context: SearchContext) -> None:
-        """A phase begins."""
+        """Note the start of a phase."""
         self._phase_began = time.monotonic()
         began = self._before[name].began if name in self._before else _now()
         self.phases[name] = PhaseRow(name=name, title=PHASES[name].title, began=began)
@@ -78,7 +78,7 @@ class StudyLog:
         self.write(force=True)
 
     def on_batch(self, batch: Mapping[str, TrainingRequest]) -> None:
-        """A batch of trainings is asked for, by key; those that were asked for before are no new ones."""
+        """Note a requested batch of trainings by key; repeated requests are not counted as new."""
         self._row_of = {key: digest_of(order.whole.to_json()) for key, order in batch.items()}
         self._end_paused(self._row_of.values())
         phase = list(self.phases.values())[-1]
@@ -91,7 +91,7 @@ class StudyLog:
         self.phases[phase.name] = phase
 
     def on_record(self, record: Record, order: TrainingRequest, trained: bool) -> None:
-        """A training, or a part of one, is in the ledger."""
+        """Note that a training, or a part of one, is in the ledger."""
         # A search that goes on comes by earlier records again.
         if record.key in self._heard:
             return
@@ -125,7 +125,7 @@ class StudyLog:
         self.write()
 
     def _end_row(self, which: str, status: str) -> None:
-        """A training is over; one that was pruned may be asked for again, and trained to its end."""
+        """Note the end of a training; a pruned one may be requested again and trained to its end."""
         row = self.rows[which]
         phase = self.phases[row.phase]
         again, pruned = row.status == "pruned", status == "pruned"
@@ -144,13 +144,13 @@ class StudyLog:
             self.trained += 1
 
     def _end_paused(self, going_on: Collection[str]) -> None:
-        """What was judged at a rung and is not among what goes on was pruned."""
+        """Mark trainings judged at a rung that do not continue as pruned."""
         for which in [one for one in self._paused if one not in going_on]:
             del self._paused[which]
             self._end_row(which, "pruned")
 
     def on_decision(self, decision: Decision) -> None:
-        """A phase ends."""
+        """Note the end of a phase."""
         earlier = self._before.get(decision.phase)
         self._end_paused(())
         spent, ended = round(time.monotonic() - self._phase_began, 1), _now()
@@ -162,12 +162,12 @@ class StudyLog:
         self.write(force=True)
 
     def end(self, state: str) -> None:
-        """The search is finished, or stopped."""
+        """Note that the search is finished or stopped."""
         self.state = state
         self.write(force=True)
 
     def counts(self) -> TrainingCounts:
-        """Trainings that are done, that were asked for, and that there will be in all at most."""
+        """Return the numbers of finished trainings, requested ones, and the largest total."""
         done = sum(row.status != "waiting" for row in self.rows.values())
         # A phase that has ended asks for no more.
         ahead = sum(
@@ -215,7 +215,7 @@ class StudyLog:
 
 @dataclass(frozen=True)
 class StudyStatus:
-    """What a study has written down, and who works on it.
+    """Recorded state of a study, and its present worker.
 
     Attributes:
         study: with its true state.
@@ -233,7 +233,7 @@ class StudyStatus:
 
 
 def look_at(folder: str | Path) -> StudyStatus:
-    """Return what a study has written down, and who works on it.
+    """Return the recorded state of a study, and its present worker.
 
     Raises:
         StorageError: as `edp.evaluation.study.read_study`.
@@ -249,7 +249,7 @@ def look_at(folder: str | Path) -> StudyStatus:
 
 
 def label_of(settings: Table) -> str:
-    """A training in a few words: backbone, feature set, and what else is in the network."""
+    """Return a short name of a training: backbone, feature set, and further modules."""
     task, model = settings["task"], settings["model"]
     features = task["features"] if isinstance(task["features"], str) else task["features"]["name"]
     backbone = model["backbone"]

@@ -36,7 +36,7 @@ SessionScores = dict[str, dict[str, dict[str, float]]]
 
 @dataclass(frozen=True)
 class TrainingRequest:
-    """A training to be done and judged; equal orders give equal records.
+    """Training to perform and judge; equal requests give equal records.
 
     Attributes:
         settings: the whole experiment as plain tables; its split is not used.
@@ -102,7 +102,7 @@ class TrainingRequest:
 
     @property
     def whole(self) -> TrainingRequest:
-        """The training that this is a part of."""
+        """Return the training of which this is a part."""
         return replace(self, until=None, stops=())
 
     def to_json(self) -> Table:
@@ -112,7 +112,7 @@ class TrainingRequest:
 
     @staticmethod
     def from_json(plain: Table) -> TrainingRequest:
-        """The order that `to_json` gave; other keys are left aside.
+        """Return the request from the result of `to_json`; other keys are ignored.
 
         Raises:
             ConfigError: a value that is missing or of another kind.
@@ -123,7 +123,7 @@ class TrainingRequest:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of an order.
+    """Outcome of a request.
 
     Attributes:
         order: what was to be trained.
@@ -139,22 +139,22 @@ class Outcome:
 
     @staticmethod
     def of(order: TrainingRequest, record: Record) -> Outcome:
-        """The outcome of an order, from the ledger's record of it."""
+        """Return the outcome of a request from the ledger's record."""
         return Outcome(order, str(record.status), record.result, record.message)
 
     def score(self, session: str, horizon: int, name: str = "composite") -> float:
-        """A score on one session; NaN where the training did not end well, which counts as the worst."""
+        """Return a score on one session; NaN for a failed training, which counts as the worst."""
         if self.result is None:
             return float("nan")
         return float(self.result["sessions"][session][str(horizon)][name])
 
     def mean(self, horizon: int, name: str = "composite") -> float:
-        """A score, mean over the judging sessions; NaN where the training did not end well."""
+        """Return a score, mean over the judging sessions; NaN for a failed training."""
         return float(np.mean([self.score(session, horizon, name) for session in self.order.judged]))
 
 
 def train_order(plain: Table) -> Table:
-    """Train and judge an order given as plain values; see `train_part`.
+    """Train and judge a request of plain values; see `train_part`.
 
     Returns:
         ``sessions``: for each judging session its scores at each horizon, report units, mean over targets;
@@ -164,7 +164,7 @@ def train_order(plain: Table) -> Table:
 
 
 def train_part(plain: Table, start: bytes | None = None) -> tuple[Table, bytes | None]:
-    """Train and judge an order, which may be a part of a training.
+    """Train and judge a request, which may be a part of a training.
 
     Args:
         plain: of `TrainingRequest.to_json`.
@@ -208,7 +208,7 @@ def train_part(plain: Table, start: bytes | None = None) -> tuple[Table, bytes |
 
 
 def experiment_of(order: TrainingRequest) -> Experiment:
-    """The experiment that an order trains.
+    """Return the experiment that a request trains.
 
     With one long epoch schedules run to their end and nothing is chosen; with several, each is validated.
     """
@@ -242,7 +242,7 @@ def mean_scores(sessions: Mapping[str, Mapping[str, Mapping[str, float]]]) -> di
 
 
 def prepared(order: TrainingRequest, experiment: Experiment) -> Prepared:
-    """Series of an order: those that train, the first of them as validation part, too; those that judge as test part.
+    """Return the series of a request: training sessions, the first also for validation; judging sessions for the test.
 
     Raises:
         ConfigError: settings that contradict the data.
@@ -273,7 +273,7 @@ def prepared(order: TrainingRequest, experiment: Experiment) -> Prepared:
 
 @dataclass(frozen=True)
 class _Named:
-    """Whole sessions by name; those that validate may be those that judge, which `ByRecording` refuses."""
+    """Split of whole sessions by name; validation and judging sessions may coincide, which `ByRecording` refuses."""
 
     train: tuple[str, ...]
     validation: tuple[str, ...]
@@ -294,7 +294,7 @@ def _frozen(source: Table) -> str:
 # One source: a worker serves one search, and two data sets might not fit in memory.
 @lru_cache(maxsize=1)
 def _recordings(source: str) -> Sequence[Recording]:
-    """The recordings of a source, kept by the process that trains on them again and again."""
+    """Return the recordings of a source, kept by the process that trains on them repeatedly."""
     return DataSource.from_plain(json.loads(source)).read()
 
 
@@ -320,7 +320,10 @@ def _costs(settings: str, channels: tuple[str, ...]) -> Mapping[str, float]:
 
 
 def settings_of(experiment: Experiment) -> Table:
-    """An experiment as plain tables, without what an order decides itself, so that equal orders have equal keys."""
+    """Return an experiment as plain tables, without the values that a request determines.
+
+    Equal requests then have equal keys.
+    """
     settings: Table = plain_tree(experiment)
     del settings["split"], settings["judge"]["baselines"]
     # Orders decide these; left in the settings they would make equal trainings different.

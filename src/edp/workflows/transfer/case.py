@@ -1,4 +1,4 @@
-"""One transfer: a source, the logs of a target, and the trainings that methods ask for."""
+"""One transfer: a source, the logs of a target, and the trainings that methods request."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NEIGHBOURS = 4
 
 @dataclass(frozen=True, eq=False)
 class TransferCase:
-    """What a method works with.
+    """Inputs of a method.
 
     Attributes:
         source: the network of another machine.
@@ -61,7 +61,7 @@ class TransferCase:
         judged: Sequence[Series] = (),
         centred: bool = True,
     ) -> Predictor:
-        """Train in the method's folder, or for a phase in a folder within; what was stopped goes on.
+        """Train in the method's folder, or for a phase in a subfolder; a stopped training continues.
 
         Args:
             name: what progress calls it.
@@ -91,14 +91,14 @@ class TransferCase:
         return train(self.logs, experiment, folder, training_steps(progress), strategy_factory, data).predictor
 
     def tuning(self, optimizer: OptimizerSpec | None = None, epochs: int | None = None) -> TrainingSpec:
-        """How a network is trained on, see `tuned`."""
+        """Return the settings of further training, see `tuned`."""
         return tuned(self.experiment.training, self.spec, optimizer, epochs)
 
 
 def tuned(
     training: TrainingSpec, spec: FinetuneSpec, optimizer: OptimizerSpec | None = None, epochs: int | None = None
 ) -> TrainingSpec:
-    """How a network is trained on: small batches, light smoothness, early stopping (thesis 3.4.5).
+    """Return the settings of further training: small batches, light smoothness, early stopping (thesis 3.4.5).
 
     Args:
         training: how the source was trained.
@@ -130,7 +130,7 @@ def tuned(
 
 
 def walked_again(chunks: ChunkSpec) -> ChunkSpec:
-    """Chunks with which minutes of logs, which do not fill many lanes, are walked again, cut elsewhere."""
+    """Return chunks for minutes of logs, which fill few lanes: they are read repeatedly with other cuts."""
     if chunks.carried or chunks.regime == "window":
         return chunks
     # A piece must be longer than its burn-in; eight chunks leave most of its ticks with a loss.

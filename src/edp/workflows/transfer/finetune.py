@@ -1,4 +1,4 @@
-"""From a network of one machine and logs of another to a network of the other, beside baselines on the same ticks."""
+"""Network for another machine from that of one machine and the other's logs, with baselines on the same ticks."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ RENAMED = {"replay": "rehearsal", "replay_distilled": "rehearsal_distilled"}
 
 @dataclass(frozen=True, kw_only=True)
 class FinetuneRequest:
-    """What is made of a source and logs.
+    """Request of a transfer.
 
     Attributes:
         spec: phases, rates and regularisers.
@@ -79,7 +79,7 @@ class FinetuneRequest:
 
     @property
     def names(self) -> list[str]:
-        """All methods, each once: the one that is kept, direct transfer, the others in the order of the registry."""
+        """Return all methods: the kept one, direct transfer, and the others in the registry's order."""
         asked_names = {self.method, BEFORE, *self.baselines}
         first = [self.method, BEFORE]
         return first + [name for name in METHODS if name in asked_names and name not in first]
@@ -93,7 +93,7 @@ def finetune(
     progress: Progress = SILENT,
     workers: Workers = IN_PROCESS,
 ) -> TransferFile:
-    """Train a network of one machine on for another, judge it beside baselines, and write a run folder.
+    """Train a network of one machine further for another, judge it with baselines, and write a run folder.
 
     The source's scaling is carried and never fitted again. Each log is divided by time into training, validation and
     test part with a gap of W + k. The same call goes on after a stop. Baselines lie in ``baselines/`` of the folder.
@@ -181,7 +181,7 @@ def train_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str
 
 
 def _able(source: SourceModel, order: FinetuneRequest) -> tuple[list[str], list[str]]:
-    """The methods for which the source has what they need; and which others are left out, and why.
+    """Return the methods whose needs the source meets, and the others with reasons.
 
     Raises:
         ConfigError: the method that is to be kept is one of the others.
@@ -204,7 +204,7 @@ def _able(source: SourceModel, order: FinetuneRequest) -> tuple[list[str], list[
 def target_data(
     source: SourceModel, logs: DataSource, experiment: Experiment, order: FinetuneRequest
 ) -> tuple[Prepared, list[str]]:
-    """The logs of a target, divided and held against the source; and what could not be held.
+    """Return the logs of a target, divided and checked against the source, and notes on missing checks.
 
     Raises:
         EdpError: logs that do not go with the source.

@@ -41,7 +41,7 @@ Predictions = list[NDArray[np.float32]]
 
 @dataclass(frozen=True, eq=False)
 class Made:
-    """What a method came to.
+    """Result of a method.
 
     Attributes:
         predict: predictions ``(time, horizon, target)``, SI units, on ``data.test`` of the target, or of the source,
@@ -74,7 +74,7 @@ class Method(Protocol):
     """Whether the source's network must read the code of a machine."""
 
     def make(self, case: TransferCase) -> Made:
-        """Carry it out, or go on where it was stopped."""
+        """Carry out the method, or continue a stopped one."""
         ...
 
 
@@ -88,7 +88,7 @@ def code_names(network: Predictor) -> list[str]:
 
 @METHODS.register("code")
 class MachineCodeAlone(Method):
-    """Find the code of the target's machine; all weights stay those of the fleet."""
+    """Search of the target machine's code; all weights stay those of the fleet."""
 
     label = "Code alone"
     needs_code = True
@@ -105,7 +105,7 @@ class MachineCodeAlone(Method):
 
 @METHODS.register("direct")
 class Direct(Method):
-    """The network of the source with its own scaling, not trained on (4.4.1)."""
+    """Network of the source with its own scaling, without further training (4.4.1)."""
 
     label = "Direct transfer"
     trains = False
@@ -206,7 +206,7 @@ class Rehearsal(Method):
 
 @METHODS.register("rehearsal_distilled")
 class DistilledRehearsal(Method):
-    """Rehearsal in which the source's own network teaches a share of its domain."""
+    """Rehearsal with a fraction of the source's domain that the source's own network teaches."""
 
     label = "Rehearsal, distilled"
     needs_source = True
@@ -257,7 +257,7 @@ def train_both(case: TransferCase, name: str, spec: BothSpec) -> Made:
 
 
 def share(series: Sequence[Series], ticks: int, least: int) -> list[Series]:
-    """The beginnings of as many series as `ticks` ticks suffice for, each of `least` ticks or more, spread over all."""
+    """Return the starts of as many series as `ticks` ticks allow, each at least `least` ticks, spread over all."""
     # As many ticks of the source as of the target: the larger domain must not choose the epoch alone.
     count = max(1, min(len(series), ticks // least))
     size = max(least, ticks // count)

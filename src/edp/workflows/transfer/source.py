@@ -1,4 +1,4 @@
-"""Where a transfer begins: a trained network, the settings of its run, and its recordings where they are at hand."""
+"""Start of a transfer: a trained network, the settings of its run, and its recordings if available."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ PLACES = ("training", "split", "judge")
 
 @dataclass(frozen=True, eq=False)
 class SourceModel:
-    """A trained network and where it comes from.
+    """Trained network with its origin.
 
     Attributes:
         bundle: the network with what it reads.
@@ -63,13 +63,13 @@ class SourceModel:
 
     @property
     def facts(self) -> dict[str, object]:
-        """What identifies it."""
+        """Return its identity."""
         digest = None if self.data is None else self.data.digest
         return {"weights": weights_digest(self.predictor), "recordings": digest}
 
 
 def read_source(path: str | Path, recordings: bool = True) -> SourceModel:
-    """The source of a run folder, of the run that a bundle lies in, or of a bundle alone.
+    """Read the source of a run folder, of the run that holds a bundle, or of a bundle alone.
 
     Args:
         path: of the folder.
@@ -103,7 +103,7 @@ def read_source(path: str | Path, recordings: bool = True) -> SourceModel:
 
 
 def target_experiment(source: SourceModel, changes: Sequence[Change] = ()) -> Experiment:
-    """Settings for logs of a target: the source's task and network, each log divided by time, then `changes`.
+    """Return settings for logs of a target: the source's task and network, each log divided by time, and `changes`.
 
     An epoch is a pass over the training parts, however long the source's epochs were, unless a change says otherwise.
 
@@ -122,7 +122,7 @@ def target_experiment(source: SourceModel, changes: Sequence[Change] = ()) -> Ex
 
 
 def _check_kept(layer: Table) -> None:
-    """Refuse changes of task and network, which decide what the weights mean, and of what ``[finetune]`` settles."""
+    """Refuse changes of task and network, which give weights their meaning, and of values of ``[finetune]``."""
     for name in layer:
         if name not in PLACES:
             raise ConfigError(
@@ -138,7 +138,7 @@ def _check_kept(layer: Table) -> None:
 
 
 def task_settings(task: Task) -> TaskSettings:
-    """Settings that resolve to a task, its features by name where the name says them."""
+    """Return settings that resolve to a task, with features by name if the name determines them."""
     feature_settings: str | FeatureSettings = task.features.name
     # A name may stand for another set by now; then the channels are listed.
     if FEATURE_SETS.get(task.features.name) != task.features:

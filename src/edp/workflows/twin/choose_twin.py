@@ -1,4 +1,4 @@
-"""Which twin suits these recordings: several formulations are fitted, and what each fit left out chooses."""
+"""Choice of a twin's formulation: several are fitted, and their errors on left-out data decide."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ class TwinChoice:
     run: KeyedRun
 
     def best(self) -> tuple[FittedFormulation, list[TwinCandidate]]:
-        """The simplest of the candidates that are as good as the best, and all of them.
+        """Return the simplest of the candidates that are as good as the best, and all of them.
 
         Raises:
             ConfigError: none can be fitted to these recordings.
@@ -137,13 +137,13 @@ class TwinChoice:
 
     @cached_property
     def training(self) -> FreeRunSpec:
-        """How networks are trained and candidates compared: as the settings say, at the pace of slow and short logs."""
+        """Return the training and comparison of candidates: the settings at the pace of slow and short logs."""
         block = sum(part.samples for part in self._everything) // self.auto.folds
         return paced(self.fit.experiment.training, self.fit.channels.rate_hz, block)
 
     @cached_property
     def folds(self) -> list[StretchFold]:
-        """How training and validation part are divided: as the settings say, or each stretch left out in turn.
+        """Return the division of training and validation part: by the settings, or each stretch left out in turn.
 
         From `LONG_TICKS` on, and where a fold would be shorter than what is trained on, the settings' own division.
         """
@@ -178,7 +178,7 @@ class TwinChoice:
         return [self._runs(spec.start(*shared, fold.train, seed), fold) for fold in self.folds]
 
     def _tried(self, name: str, rival: TwinCandidate | None) -> list[TwinCandidate]:
-        """A formulation with the default options; the recurrent one in several forms, the simplest first."""
+        """Try a formulation with default options; the recurrent one in several forms, the simplest first."""
         if name == "recurrent":  # a short training far behind a floor may be ahead of it as a long one
             return self._recurrent()
         spec = self._default(name)
@@ -193,7 +193,7 @@ class TwinChoice:
         return [self._attempt(described(spec), spec, fitted, rival, FAR_BEHIND)]
 
     def _recurrent(self) -> list[TwinCandidate]:
-        """The recurrent twin on a static map or not, as long as longer training helps."""
+        """Try the recurrent twin with and without a static map, with longer training as long as it helps."""
         count = len(self.folds)
         plain = Recurrent(prefix_ticks=self.auto.prefix_ticks)
         if count > 1:
@@ -223,7 +223,7 @@ class TwinChoice:
         return tried + unfit[:1]
 
     def _beyond_budget(self, form: Recurrent, training: FreeRunSpec, seconds: float) -> TwinCandidate:
-        """A training that is left out, and why."""
+        """Return a training that is left out, with the reason."""
         why = (
             f"about {typed(seconds / 60.0, 2)} min of counted time with those before it, of minutes = "
             f"{setting_text(self.auto.minutes)}"
@@ -233,7 +233,7 @@ class TwinChoice:
     def _trained(
         self, form: Recurrent, training: FreeRunSpec, rival: TwinCandidate | None, most: float
     ) -> TwinCandidate:
-        """A form whose members are trained for a length, each without one of the folds."""
+        """Train the members of a form for a length, each without one of the folds."""
         whole, label = self._whole, labelled(form, training)
         static = form.static_map(whole.channels, whole.scales, whole.data.train)
         name = f"recurrent{'_map' if form.valve_map else ''}_{sum(training.updates)}"
@@ -302,7 +302,7 @@ class TwinChoice:
         return TwinCandidate(label, seconds, trial, error, why)
 
     def _settled(self, trial: TwinTrial) -> FittedFormulation:
-        """The twin of all that may be learned from; intervals have what each fold left out."""
+        """Return the twin of all training data; the intervals come from the left-out part of each fold."""
         first, several = trial.fits[0], len(trial.fits) > 1
         unseen = [(fit.fitted.twin, fold.validation) for fit, fold in zip(trial.fits, self.folds, strict=True)]
         if isinstance(trial.spec, Recurrent):
@@ -322,26 +322,26 @@ class TwinChoice:
         return replace(result, unseen=tuple(unseen))
 
     def _simplest(self, tried: Sequence[TwinCandidate]) -> TwinCandidate | None:
-        """The simplest formulation that is as good as the best, of trainings of the same one the best."""
+        """Return the simplest formulation that is as good as the best; of its trainings the best one."""
         enough = _least(tried) / (1.0 - self.auto.least_gain)
         spec = next((one.spec for one in tried if one.error is not None and one.error <= enough), None)
         return None if spec is None else _best([one for one in tried if one.spec == spec])
 
     def _default(self, name: str) -> TwinSpec:
-        """A formulation with its defaults, or with the elements that are known, and the prefix of all candidates."""
+        """Return a formulation with its defaults or the known elements, and the common prefix of the candidates."""
         elements = self.auto.elements if name == "elements" else None
         spec: TwinSpec = replace(elements or TWINS[name](), prefix_ticks=self.auto.prefix_ticks)
         return spec
 
     def _runs(self, twin: Any, fold: StretchFold) -> FreeRuns:
-        """Free runs of what a fold leaves out, as long as those that choose among weights.
+        """Return free runs on the left-out part of a fold, as long as those that select weights.
 
         More of them fit into it, and differ more from one another, than long ones.
         """
         return free_runs(twin, fold.validation, self.training.validation_s, self.training.lanes)
 
     def _error(self, runs: Sequence[FreeRuns], reference: Sequence[FreeRuns]) -> float:
-        """Error over that of a reference in the same folds."""
+        """Return the error relative to a reference in the same folds."""
         seconds = self.training.validation_s
         judge = replace(self.fit.experiment.judge, seconds=seconds, at_s=tuple(sorted({a * seconds for a in AT})))
         ours, theirs = (FreeRuns.joined(some) for some in (runs, reference[: len(runs)]))
@@ -358,13 +358,13 @@ def _best(tried: Sequence[TwinCandidate]) -> TwinCandidate | None:
 
 
 def shortened(training: FreeRunSpec, share: float) -> FreeRunSpec:
-    """The same training with a share of its updates in each stage, and as many validations."""
+    """Return the training with a fraction of its updates in each stage, and as many validations."""
     updates = tuple(max(1, round(share * count)) for count in training.updates)
     return replace(training, updates=updates, validate_every=max(1, round(share * training.validate_every)))
 
 
 def described(spec: TwinSpec) -> str:
-    """How sentences call a formulation."""
+    """Return the name of a formulation in sentences."""
     name = TWINS.name_of(spec)
     if not isinstance(spec, Recurrent):
         return name
@@ -373,5 +373,5 @@ def described(spec: TwinSpec) -> str:
 
 
 def labelled(form: Recurrent, training: FreeRunSpec) -> str:
-    """How sentences call a recurrent twin that was trained so."""
+    """Return the name of a recurrent twin with this training in sentences."""
     return f"{described(form)}, {sum(training.updates):,} updates"

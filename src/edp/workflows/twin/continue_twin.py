@@ -1,4 +1,4 @@
-"""A trained twin goes on with other recordings, such as minutes of another machine's logs (fine-tuning)."""
+"""Further training of a twin on other recordings, such as minutes of another machine's logs (fine-tuning)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ UNLIKE = 30.0
 
 @dataclass(frozen=True, eq=False)
 class BaseTwin:
-    """A trained twin to begin with.
+    """Trained twin as a start.
 
     Attributes:
         folder: of its run.
@@ -51,7 +51,7 @@ class BaseTwin:
 
     @staticmethod
     def of(folder: str | Path) -> BaseTwin:
-        """The twin of a run folder.
+        """Return the twin of a run folder.
 
         Raises:
             EdpError: not a twin, or one that no training can go on with.
@@ -77,7 +77,7 @@ class BaseTwin:
         return twin
 
     def settled(self, experiment: TwinExperiment) -> TwinExperiment:
-        """Settings with the formulation and the channels of this twin.
+        """Return settings with the formulation and the channels of this twin.
 
         Raises:
             ConfigError: they name others.
@@ -97,7 +97,7 @@ class BaseTwin:
         return replace(experiment, twin=self.bundle.spec, channels=names)
 
     def check(self, channels: TwinChannels, train: Sequence[Series]) -> None:
-        """Refuse recordings that mean something else by the numbers of this twin.
+        """Refuse recordings with another meaning of this twin's channels.
 
         Raises:
             DataError: another rate or kind of a channel, or values of another order of magnitude.
@@ -146,7 +146,7 @@ class BaseTwin:
 
 @dataclass(frozen=True, eq=False)
 class ContinuedTwin:
-    """A twin that goes on, by as many updates as free runs of the validation part say; or as it is.
+    """Twin under further training; free runs of the validation part select the number of updates, possibly zero.
 
     Attributes:
         fit: what every fit of the run needs.
@@ -159,7 +159,7 @@ class ContinuedTwin:
     run: KeyedRun
 
     def best(self) -> tuple[FittedFormulation, list[TwinCandidate]]:
-        """The best of the twin as it is and of trainings of several lengths, and all of them."""
+        """Return the best of the unchanged twin and trainings of several lengths, and all of them."""
         start = self.start.twin
         scales = scales_for(start, self.fit.scales, self.fit.data.train)
         # End stops are the machine's: the twin as it is has those of these recordings, too.
@@ -180,7 +180,7 @@ class ContinuedTwin:
         return FittedFormulation(self.start.bundle.spec, fitted, facts=self.start.provenance()), tried
 
     def _trained(self, start: RecurrentTwin, share: float) -> FittedTwin:
-        """The members, each trained on from where it was, averaged again."""
+        """Train each member further from its start, and average them again."""
         training = shortened(self.fit.experiment.training, share)
         train, validation = self.fit.data.train, self.fit.data.validation
         label = f"{sum(training.updates):,} further updates"

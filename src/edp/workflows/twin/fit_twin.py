@@ -1,4 +1,4 @@
-"""From prepared recordings to a fitted twin of one formulation, as its settings say."""
+"""Fit of a twin of one formulation to prepared recordings."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class FittedFormulation:
 
 @dataclass(frozen=True, eq=False)
 class TwinFit:
-    """What every fit of a run needs.
+    """Common inputs of all fits of a run.
 
     Attributes:
         channels: of the twin.
@@ -111,7 +111,7 @@ class TwinFit:
     def train_members(
         self, jobs: Sequence[MemberTraining], on_event: Callable[[FreeRunProgress], None] | None
     ) -> Iterable[FittedTwin]:
-        """Train networks side by side, or one by one; in order.
+        """Train networks in parallel or one by one, and return them in order.
 
         Raises:
             EdpError: see `fit_free_runs`, or a process was killed again and again.
@@ -132,7 +132,7 @@ class TwinFit:
         return one_by_one(jobs, None)
 
     def refitted(self, first: FittedFormulation) -> FittedFormulation:
-        """What needs no stretches to choose its weights, fitted anew to the validation part as well.
+        """Fit formulations without weight selection again, with the validation part included.
 
         The first fit, of the training part alone, calibrates the intervals.
         """

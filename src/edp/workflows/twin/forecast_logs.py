@@ -1,4 +1,4 @@
-"""Logs with what a twin forecasts as further channels, which networks read like measured ones."""
+"""Logs with forecasts of a twin as further channels, which networks read like measured ones."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class ForecastErrors:
 
 @dataclass(frozen=True, eq=False)
 class ForecastLogs:
-    """What was written, and how far off the forecasts are.
+    """Written logs, and the errors of their forecasts.
 
     Attributes:
         files: a log each.
@@ -72,7 +72,7 @@ def forecast_logs(
     gain: float | None = None,
     progress: Progress = SILENT,
 ) -> ForecastLogs:
-    """Write logs anew with a channel for each forecast of a twin: ``CylVels_1_in_10`` is CylVels_1 in ten ticks.
+    """Write logs again with a channel for each forecast of a twin: ``CylVels_1_in_10`` is CylVels_1 in ten ticks.
 
     In the first ticks of a log, before the observer has settled, a forecast is the present value.
 
@@ -118,7 +118,7 @@ def forecast_logs(
 
 
 def _chosen_gain(bundle: TwinBundle, recordings: Sequence[Recording], horizons: Sequence[int]) -> float:
-    """A gain by logs from which the twin learned; where none of these is among the logs, by the first ones."""
+    """Choose a gain on the twin's training logs, or on the first logs if none of them is given."""
     learned_names = bundle.provenance.recording_names("train", "validation")
     chosen = [logged for logged in recordings if logged.name in learned_names] or list(recordings)
     task = bundle.twin.channels.task()
@@ -136,7 +136,7 @@ def _columns(twin: Twin, answers: Sequence[str]) -> list[int]:
 
 
 def _refuse_used(folder: Path) -> None:
-    """See before the work that nothing will be lost."""
+    """Check before the work that no file will be lost."""
     if is_there(folder) and (not is_folder_at(folder) or any(entries_of(folder))):
         raise ConfigError(f"--out '{folder}' holds something already; name a folder that is new or empty")
 
@@ -154,7 +154,7 @@ def _checked(twin: Twin, logged: Recording) -> Recording:
 def _forecasts(
     twin: Twin, recording: Recording, horizons: Sequence[int], columns: list[int], gain: float
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Forecasts ``(tick, horizon, column)``, what was measured ``(tick, column)``, and the first tick of a forecast."""
+    """Return forecasts ``(tick, horizon, column)``, measurements ``(tick, column)``, first forecast tick."""
     commands, measured = (
         np.ascontiguousarray(recording.select([channel.name for channel in part]))
         for part in (twin.channels.commands, twin.channels.answers)
@@ -184,7 +184,7 @@ def _channels(twin: Twin, horizons: Sequence[int], columns: list[int]) -> list[C
 def _extended(
     twin: Twin, recording: Recording, values: np.ndarray, horizons: Sequence[int], columns: list[int]
 ) -> Recording:
-    """The recording with its forecasts behind its own channels."""
+    """Return the recording with its forecasts after its own channels."""
     added = _channels(twin, horizons, columns)
     doubled = [channel.name for channel in added if channel.name in recording.channel_names]
     if doubled:

@@ -83,7 +83,7 @@ def ground_twin(
 
 
 def _base(start: str | Path | None) -> tuple[BaseTwin, str]:
-    """The twin to begin with, and the machine of its linkage.
+    """Return the start twin, and the machine of its linkage.
 
     Raises:
         EdpError: none is named, or it can carry no ground.
@@ -103,7 +103,7 @@ def _base(start: str | Path | None) -> tuple[BaseTwin, str]:
 
 
 def _known_rows(run: Path) -> list[dict[str, object]]:
-    """Rows of the datasheet of a run; none where it has none."""
+    """Return the datasheet rows of a run; none without a datasheet."""
     file = run / f"{DATASHEET}.json"
     if not is_file_at(file):
         return []

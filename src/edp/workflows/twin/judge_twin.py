@@ -1,4 +1,4 @@
-"""A twin judged on free runs and a few ticks ahead, beside its floors, on held-out recordings or on other ones."""
+"""Judgement of a twin with its floors, in free run and a few ticks ahead, on held-out recordings or on others."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def judge_twin(
     labels: Mapping[str, str],
     progress: Progress = SILENT,
 ) -> tuple[dict[str, FreeRunScores], FreeRuns]:
-    """Scores of a twin and its floors on the test part, by label, and the free runs of the twin.
+    """Return the scores of a twin and its floors on the test part by label, and the twin's free runs.
 
     Args:
         bundle: the twin.
@@ -103,7 +103,7 @@ def write_scores(
 
 
 def reported_channels(channels: TwinChannels) -> AnswerChannels:
-    """Return what a page needs of each answer."""
+    """Return the facts of each answer for a page."""
 
     def reported(channel: Channel) -> ReportedChannel:
         kind = KINDS[channel.kind]
@@ -116,7 +116,7 @@ def reported_channels(channels: TwinChannels) -> AnswerChannels:
 
 
 def shown_runs(runs: FreeRuns, intervals: FreeRunIntervals | None) -> dict[str, NDArray[Any]]:
-    """A few of the runs, thinned out for pages: time, answers, truth, and half widths where intervals are known.
+    """Return a few thinned runs for pages: time, answers, truth, and half widths if intervals are known.
 
     One run of each way of driving would need labels; one of each recording, evenly chosen, needs none.
     """
@@ -148,7 +148,7 @@ def evaluate_twin(
     predictor_run: str | Path | None = None,
     progress: Progress = SILENT,
 ) -> Path:
-    """Judge a twin anew: on its held-out recordings, or on other ones, all of which are judged.
+    """Judge a twin again: on its held-out recordings, or on all of other recordings.
 
     Args:
         run: run folder of a twin.
@@ -193,7 +193,7 @@ def evaluate_twin(
 def beside_predictor(
     twin: Twin, test: Sequence[Series], recordings: Sequence[Recording], run: Path, spec: FreeRunJudgeSpec
 ) -> PredictorComparison:
-    """Errors of a look-ahead predictor and of the twin at the same moments, for the channels that both answer.
+    """Return errors of a look-ahead predictor and of the twin at the same moments, for their common channels.
 
     The twin is told the commands in between; the predictor is not.
 
@@ -229,7 +229,7 @@ def beside_predictor(
 
 
 def _rows(name: str, recordings: Mapping[str, Recording]) -> tuple[Recording, int, int | None]:
-    """Recording and rows of a stretch by its name, ``recording`` or ``recording[start:stop]``, see `prepare`."""
+    """Return recording and rows of a stretch by its name, ``recording`` or ``recording[start:stop]``, see `prepare`."""
     if name in recordings:
         return recordings[name], 0, None
     whole, _, rows = name.removesuffix("]").rpartition("[")

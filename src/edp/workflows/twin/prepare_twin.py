@@ -1,4 +1,4 @@
-"""From recordings to the stretches on which a twin is trained and judged."""
+"""Stretches of recordings for training and judgement of a twin."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from edp.recording import Recording
 
 
 def prepare_twin(source: DataSource, experiment: TwinExperiment) -> tuple[TwinChannels, Prepared]:
-    """Read and cut a data set: commands as inputs, what the twin answers as targets.
+    """Read and cut a data set: commands as inputs, the twin's answers as targets.
 
     Raises:
         EdpError: recordings or settings that cannot be used.
@@ -46,7 +46,7 @@ def prepared_twin(recordings: Sequence[Recording], experiment: TwinExperiment) -
 
 
 def check_moves(channels: TwinChannels, train: Sequence[Series]) -> None:
-    """Refuse recordings in which no command ever moves: nothing could be learned of what drives a twin.
+    """Refuse recordings in which no command ever moves, from which a twin could learn no response.
 
     Raises:
         DataError: names the commands.
@@ -64,7 +64,7 @@ def check_moves(channels: TwinChannels, train: Sequence[Series]) -> None:
 
 
 def check_integrals(channels: TwinChannels, train: Sequence[Series]) -> None:
-    """Refuse strokes that are no integrals of their velocities, as a twin makes them.
+    """Refuse strokes that are not the integrals of their velocities, which a twin assumes.
 
     Raises:
         DataError: names both channels and the ratio.
@@ -78,6 +78,6 @@ def check_integrals(channels: TwinChannels, train: Sequence[Series]) -> None:
 
 
 def driving_labels(recordings: Sequence[Recording]) -> dict[str, str]:
-    """Way of driving by name of recording; empty where a recording does not tell."""
+    """Return the way of driving by name of recording; empty if a recording does not state it."""
     labels = {recording.name: str(recording.meta.get(FAMILY, "")) for recording in recordings}
     return labels if all(labels.values()) else {}

@@ -1,4 +1,4 @@
-"""A twin along a log: measured up to a moment, on the commands alone from there on."""
+"""Run of a twin along a log: measured up to a moment, free on the commands afterwards."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LOW, HIGH = f"{FREE}_low", f"{FREE}_high"
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """A free run beside what was measured.
+    """Free run with the measured values.
 
     Attributes:
         recording: commands, measured channels, and the twin's answers under names that end in `FREE`, with their
@@ -173,7 +173,7 @@ def _columns(twin: Twin, measured: Sequence[str]) -> list[int]:
 
 
 def _recorded(twin: Twin, recording: Recording, answers: np.ndarray, half: np.ndarray | None, start: int) -> Recording:
-    """Row t holds the commands and measured values of tick start + 1 + t, the answers for it, and their intervals."""
+    """Return a recording; row t holds commands, measurements, answers and intervals of tick start + 1 + t."""
     channels = twin.channels.commands + twin.channels.answers
     rows = slice(start + 1, start + 1 + len(answers))
     measured_values = recording.select([channel.name for channel in channels])[rows]
@@ -192,7 +192,7 @@ def _recorded(twin: Twin, recording: Recording, answers: np.ndarray, half: np.nd
 
 
 def _named(twin: Twin, suffix: str, text: str) -> tuple[Channel, ...]:
-    """The channels of the answers under other names."""
+    """Return the channels of the answers under other names."""
     return tuple(
         replace(channel, name=f"{channel.name}{suffix}", description=f"{channel.description} ({text})".strip())
         for channel in twin.channels.answers

@@ -1,4 +1,4 @@
-"""From recordings to a twin in a run folder, with its scores on free runs beside those of the floors."""
+"""Training of a twin into a run folder, with its scores and those of the floors in free run."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ DATASHEET = "datasheet"
 
 @dataclass(frozen=True, eq=False)
 class TrainedTwin:
-    """What `train_twin` leaves.
+    """Result of `train_twin`.
 
     Attributes:
         bundle: the twin on disk.
@@ -156,7 +156,7 @@ def _check_judged(channels: TwinChannels, data: Prepared, experiment: TwinExperi
 
 
 def _linkage(experiment: TwinExperiment) -> dict[str, object]:
-    """All numbers of the machine that settings name for its linkage: an edited file asks for another twin.
+    """Return all numbers of the machine that the settings name for the linkage: an edited file requires another twin.
 
     Raises:
         ConfigError: no such machine.
@@ -168,7 +168,7 @@ def _linkage(experiment: TwinExperiment) -> dict[str, object]:
 
 
 def _chosen(fit: TwinFit, run: KeyedRun, base: BaseTwin | None) -> FittedFormulation:
-    """The twin that the settings ask for, or the one that goes on; a choice is kept in ``candidates.json``."""
+    """Return the twin of the settings, or the further trained one; a choice is kept in ``candidates.json``."""
     spec = fit.experiment.twin
     if base is not None:
         result, tried = ContinuedTwin(fit, base, run).best()
@@ -183,13 +183,13 @@ def _chosen(fit: TwinFit, run: KeyedRun, base: BaseTwin | None) -> FittedFormula
 
 
 def _oil(recordings: Sequence[Recording]) -> dict[str, object]:
-    """Temperature of the oil that all recordings tell; nothing where one does not."""
+    """Return the oil temperature if all recordings state it."""
     celsius = np.concatenate([oil_celsius(recording) for recording in recordings])
     return {OIL_C: float(celsius.mean())} if np.isfinite(celsius).all() else {}
 
 
 def _full_strokes(recordings: Sequence[Recording]) -> dict[str, object]:
-    """Full strokes (m) of the machine, where simulated recordings say them and all say the same."""
+    """Return the full strokes (m) of the machine, if simulated recordings agree on them."""
     stated = [recording.meta[STROKES] for recording in recordings if STROKES in recording.meta]
     # A log may say anything; what is no list of numbers says nothing.
     if not stated or not all(_numbers(each) and each == stated[0] for each in stated):

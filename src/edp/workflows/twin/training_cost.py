@@ -14,7 +14,7 @@ and 96 units on M22 (347 s); within 15 % of these. Another machine takes another
 
 
 def training_seconds(form: Recurrent, channels: TwinChannels, training: FreeRunSpec, members: int) -> float:
-    """Counted processor time (s) of training so many members of a form; early ends are not foreseen."""
+    """Return the processor time (s) to train `members` members of a form, without early stopping."""
     units, answers = form.alone().units, len(channels.answers)
     weights = 3 * units * (len(channels.commands) + answers + units) + units * answers
     ticks = sum(

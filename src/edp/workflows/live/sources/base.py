@@ -1,4 +1,4 @@
-"""What gives rows to a live session: the registry of sources, and what they have in common."""
+"""Source of a live session's rows: registry and common parts."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ RATES_HZ = (0.01, 100_000.0)
 
 
 class SourceStopped(Exception):
-    """The session is over; a source passes it on."""
+    """Signal that the session is over; a source lets it pass."""
 
 
 class Sink(Protocol):
-    """What a source gives its rows to."""
+    """Receiver of a source's rows."""
 
     @property
     def stopped(self) -> bool:
@@ -38,7 +38,7 @@ class Sink(Protocol):
         ...
 
     def take(self, row: Row, missed: int = 0, trusted: bool = True, more: bool = False) -> None:
-        """A row, shape (channels,), SI units, NaN where missing; returns when the next one is due.
+        """Take a row, shape (channels,), SI units, NaN if missing; returns when the next one is due.
 
         Args:
             row: of the source's channels.
@@ -52,11 +52,11 @@ class Sink(Protocol):
         ...
 
     def show(self) -> None:
-        """Show what was taken: the row that was to follow does not come."""
+        """Show the rows so far: the next one is late."""
         ...
 
     def begin_anew(self) -> None:
-        """What follows does not continue what came: models forget."""
+        """Start anew: the next row does not continue the last one, and models forget."""
         ...
 
     def leave_out(self, reason: str) -> None:
@@ -64,13 +64,13 @@ class Sink(Protocol):
         ...
 
     def note(self, kind: str, text: str, group: str = "") -> None:
-        """An event, see `edp.live.session.LiveEvent`."""
+        """Report an event, see `edp.live.session.LiveEvent`."""
         ...
 
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """What a user said about a source.
+    """Options of a source from the user.
 
     Attributes:
         value: of the source's option: a path, a machine, a task, a port.
@@ -92,13 +92,13 @@ class SourceOptions:
         check_bounds("the live source", self, rate_hz=span(*RATES_HZ))
 
     def signal_map(self) -> SignalMap | None:
-        """The map, read."""
+        """Return the signal map of the file."""
         return None if self.map_file is None else load_signal_map(self.map_file)
 
 
 @dataclass(frozen=True)
 class Needs:
-    """What models read.
+    """Channels and rate that models read.
 
     Attributes:
         channels: of all models, each once.
@@ -141,7 +141,7 @@ class LiveSource(ABC):
     @classmethod
     @abstractmethod
     def of(cls, options: SourceOptions, needs: Needs) -> LiveSource:
-        """The source that a user asked for.
+        """Return the source of the user's options.
 
         Raises:
             EdpError: there is none, or it does not give what the models read.
@@ -160,7 +160,7 @@ class LiveSource(ABC):
         """
 
     def close(self) -> None:  # noqa: B027  most sources hold nothing open
-        """Give back what was opened."""
+        """Release opened resources."""
 
 
 SOURCES: Registry[type[LiveSource]] = Registry("live source")

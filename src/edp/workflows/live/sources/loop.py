@@ -91,13 +91,13 @@ class _Tapped:
         self._observation: Any = None
 
     def reset(self, **options: Any) -> Any:
-        """As the environment's."""
+        """Reset the environment."""
         self._tick = 0
         self._observation, info = self._env.reset(**options)
         return self._observation, info
 
     def step(self, levers: Any) -> Any:
-        """As the environment's; the row of before, with reference and levers, is shown first."""
+        """Step the environment, after the previous row with reference and levers is shown."""
         at = min(self._tick, self._reference.ticks - 1)
         parts = [self._observation, self._reference.strokes[at], self._reference.tip[at], levers]
         self._sink.take(np.concatenate(parts))

@@ -1,4 +1,4 @@
-"""``--sim``: the simulator tick by tick, with one of its operators at the levers."""
+"""``--sim``: simulator tick by tick with one of its operators at the levers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COMPILING = "preparing the simulator; its first start on a computer compiles it,
 
 @SOURCES.register("sim")
 class SimSource(LiveSource):
-    """A machine of the simulator that works on and on.
+    """Simulated machine that works without end.
 
     Args:
         machine: name, or path of a machine file.
@@ -110,7 +110,10 @@ class SimSource(LiveSource):
 
 
 def view_of_truth(truth: Table, full: Any) -> View:
-    """What an operator sees, from the noise-free channels of an environment; `full` are the strokes (m), shape (3,)."""
+    """Return the view of an operator from the noise-free channels of an environment.
+
+    `full` are strokes (m), shape (3,).
+    """
     strokes, angles, rates, speeds = (
         np.array([truth[f"{kind}_{i}"] for i in (1, 2, 3)])
         for kind in ("CylStroke", "JointAngle", "JointVel", "CylVels")

@@ -34,7 +34,7 @@ TIME = "t"
 
 @SOURCES.register("udp")
 class UdpSource(LiveSource):
-    """Datagrams on a port; each is one row, and says its names.
+    """Datagrams on a port; each one is a row with its names.
 
     Args:
         port: to listen on.
@@ -106,7 +106,7 @@ class UdpSource(LiveSource):
         self._socket.close()
 
     def _waits(self) -> bool:
-        """Whether a further datagram is there already: the models have been slower than the sender."""
+        """Test whether another datagram waits: the models are slower than the sender."""
         try:
             return bool(select.select([self._socket], [], [], 0.0)[0])
         except (OSError, ValueError):  # closed meanwhile
@@ -134,7 +134,7 @@ class UdpSource(LiveSource):
         return row
 
     def _first_channels(self) -> tuple[Channel, ...]:
-        """Those of the first row, where nothing else says which there are."""
+        """Return the channels of the first row if nothing else states them."""
         ends = time.monotonic() + STARTUP_S
         while time.monotonic() < ends:
             try:
@@ -153,7 +153,7 @@ class UdpSource(LiveSource):
 
 
 def row_of(data: bytes) -> Mapping[str, float]:
-    """The values by name of a datagram; NaN for null.
+    """Return the values of a datagram by name; NaN for null.
 
     Raises:
         DataError: it is too long, no JSON object of numbers, or has too many.

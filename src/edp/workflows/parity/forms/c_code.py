@@ -56,7 +56,7 @@ int main(void) {
 
 
 def streamed(bundle: Bundle, inputs: Rows, folder: Path) -> tuple[Rows, float]:
-    """Export, compile and run: numbers of each tick, and seconds a tick.
+    """Export, compile and run: return the numbers of each tick, and the seconds per tick.
 
     Raises:
         ExportError: the network has no such form.
@@ -77,7 +77,7 @@ def streamed(bundle: Bundle, inputs: Rows, folder: Path) -> tuple[Rows, float]:
 
 @FORMS.register("c")
 class CCode:
-    """``edp export --to c`` of the network as it is."""
+    """``edp export --to c`` of the unchanged network."""
 
     title: ClassVar[str] = "C"
 

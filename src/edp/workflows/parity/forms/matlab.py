@@ -67,7 +67,7 @@ int main(void) {
 
 
 def _octave(case: ParityCase, folder: Path, run: str, timed: str) -> tuple[Rows, float]:
-    """What a program in Octave finds, and its least seconds."""
+    """Return the results of a program in Octave, and its least seconds."""
     program = need("octave-cli", "octave")
     # The ONNX window is a form of its own and would need the package onnx here.
     SimulinkTarget(window=False).write(case.bundle, NAME, folder)
@@ -95,7 +95,7 @@ class MatlabCode:
 
 @FORMS.register("s_function")
 class SFunction:
-    """``edp export --to simulink``: the S-function as a MEX, with stand-ins for Simulink's headers."""
+    """``edp export --to simulink``: the S-function as a MEX with substitutes for Simulink's headers."""
 
     title: ClassVar[str] = "S-function, MEX in GNU Octave"
 

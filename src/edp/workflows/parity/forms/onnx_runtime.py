@@ -1,4 +1,4 @@
-"""The ONNX graphs in ONNX Runtime, in this Python and in others that have another version of it."""
+"""ONNX graphs in ONNX Runtime, in this Python and in others with other versions of it."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ print(json.dumps({"version": onnxruntime.__version__, "seconds": least / len(inp
 
 
 def _runs(case: ParityCase, folder: Path, kind: str, inputs: np.ndarray, rest: dict[str, Any]) -> list[tuple[str, Ran]]:
-    """The graph in every interpreter."""
+    """Run the graph in every interpreter."""
     for package in ("onnx", "onnxruntime"):
         if importlib.util.find_spec(package) is None:
             raise Missing(f"needs the Python package {package}")

@@ -1,4 +1,4 @@
-"""The plain part of the ROS 2 package: the C code through ctypes, one tick a call."""
+"""ROS-free part of the ROS 2 package: the C code through ctypes, one tick per call."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ print(json.dumps([found, least / len(rows)]))
 
 @FORMS.register("ros2")
 class Ros2Core:
-    """``edp export --to ros2``: what the node calls, without ROS."""
+    """``edp export --to ros2``: the core of the node, without ROS."""
 
     title: ClassVar[str] = "ROS 2 package, core"
 

@@ -1,4 +1,4 @@
-"""PyTorch itself, tick by tick: the stream as on the machine against the stream in one piece."""
+"""PyTorch tick by tick against PyTorch in one piece."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The phases of a search, a file each: coroutines that yield orders, are sent what came of them, and conclude.
+"""Phases of a search, one per file: coroutines that yield requests, receive outcomes, and conclude.
 
 The order of the imports is the order in which they run.
 """

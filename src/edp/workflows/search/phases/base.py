@@ -1,4 +1,4 @@
-"""What a phase is, and what several of them do: ask a study, train its questions, tell it."""
+"""Interface of a phase, and steps common to several: ask a study, train its questions, report results."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Course = Generator[list[TrainingRequest], list[Outcome], Decision]
 
 
 class PhaseSpec(Protocol):
-    """A phase: a pure function of the context and of the results of its orders; it does nothing else.
+    """Phase: a pure function of the context and of the outcomes of its requests, without side effects.
 
     Attributes:
         title: for progress and reports.
@@ -32,11 +32,11 @@ class PhaseSpec(Protocol):
     title: str
 
     def run(self, context: SearchContext) -> Course:
-        """The trainings that it needs, batch by batch, and what follows from them."""
+        """Yield the required trainings batch by batch, and return the conclusions."""
         ...
 
     def trainings(self, context: SearchContext) -> int:
-        """How many it will order at most, as far as is known now; for the time left, and for nothing else."""
+        """Return the largest number of requests known now, for the estimate of the remaining time."""
         ...
 
 
@@ -62,7 +62,7 @@ class Quest:
 def answer_all(
     context: SearchContext, quests: list[Quest], stops: Sequence[int] = ()
 ) -> Generator[list[TrainingRequest], list[Outcome], list[list[Trial]]]:
-    """Ask all quests side by side, a batch each at a time, until each has all its answers.
+    """Ask all quests in parallel, one batch each at a time, until each has all its answers.
 
     A trial whose costs exceed the limits, or whose network cannot be, is reported so and not trained.
 
@@ -132,7 +132,7 @@ def _costs(settings: Table, context: SearchContext) -> dict[str, float]:
 
 
 def possible(context: SearchContext, space: Space, arm: Table) -> tuple[Space, list[str]]:
-    """The part of a space in which every value makes a network of this arm, and in words what was left out."""
+    """Return the part of a space in which every value gives a network of this arm, and notes on the excluded part."""
     feasible: dict[str, Range] = {}
     notes = []
     for name, dimension in space.items():
@@ -168,7 +168,7 @@ def new_study(
     flags: Sequence[str] = (),
     barred: frozenset[frozenset[str]] = frozenset(),
 ) -> Study:
-    """A study under the costs and limits of this search, with a root of its own."""
+    """Return a study under the costs and limits of this search, with its own root."""
     spec = context.spec
     objectives = 1 if spec.cost == "none" else 2
     root = context.seed("study", name)
@@ -176,7 +176,7 @@ def new_study(
 
 
 def said_of_pruned(context: SearchContext, trials: Sequence[Trial]) -> list[str]:
-    """A sentence on the trials that were ended at a rung; none where none was."""
+    """State the number of trials that ended at a rung; no sentence if none did."""
     pruned = [trial for trial in trials if trial.pruned]
     if not pruned:
         return []
@@ -195,13 +195,13 @@ def scored(trials: Sequence[Trial]) -> list[tuple[float, Trial]]:
 
 
 def best(trials: Sequence[Trial]) -> Trial | None:
-    """The trial with the lowest score; None where none was trained to its end."""
+    """Return the trial with the lowest score; None if none was trained to its end."""
     # Ties go to the earlier question, so that replays decide alike.
     pairs = scored(trials)
     return min(pairs, key=lambda pair: (pair[0], pair[1].number))[1] if pairs else None
 
 
 def relative_change(test: MeanTest, reference: float) -> RelativeChange:
-    """A test of a mean difference as fractions of a reference."""
+    """Return a test of a mean difference as fractions of a reference."""
     low, high = test.interval()
     return RelativeChange(float(test.mean) / reference, float(low) / reference, float(high) / reference, float(test.p))

@@ -39,13 +39,16 @@ class Calibration:
     title = "calibration"
 
     def trainings(self, context: SearchContext) -> int:
-        """Every question of every backbone, were none too costly, and the final between them."""
+        """Count every question of every backbone, as if none were too costly, and the final between them."""
         spec = context.spec
         final = spec.folds if spec.mode == "sound" and len(spec.backbones) > 1 else 0
         return len(spec.backbones) * (spec.trials * spec.trial_runs + final)
 
     def run(self, context: SearchContext) -> Course:
-        """All backbones side by side: every size in turn, then what the sampler asks; the best of each on all folds."""
+        """Train all backbones in parallel: every size in turn, then the sampler's questions.
+
+        The best of each on all folds.
+        """
         features = context.spec.feature_sets[context.facts(IsolationFacts).features]
         arms = {backbone: arm_settings(context.base, backbone, features) for backbone in context.spec.backbones}
         # Only values that make a network of this arm are asked for.
@@ -71,7 +74,7 @@ class Calibration:
         final: Sequence[Outcome],
         notes: list[str],
     ) -> Decision:
-        """Of each backbone the smallest size that no larger one repays; of these the lowest score in the final."""
+        """Choose the smallest size that no larger one repays for each backbone, and the best of them in the final."""
         horizon = context.spec.horizon
         backbones = {}
         sentences = list(notes)
@@ -147,7 +150,7 @@ def _final(context: SearchContext, backbones: list[str], outcomes: Sequence[Outc
 
 
 def _efficient(trials: list[Trial]) -> Trial | None:
-    """The best trial of the size that the efficiency rule chooses (`edp.stats.efficiency`)."""
+    """Return the best trial of the size that the efficiency rule chooses (`edp.stats.efficiency`)."""
     by_size: dict[float, Trial] = {}
     # Of each size its best question stands for it.
     for _, trial in sorted(scored(trials), key=lambda pair: pair[0]):

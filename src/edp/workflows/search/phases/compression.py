@@ -1,4 +1,4 @@
-"""Phase 6: the teacher at length, smaller networks of it, and one evaluation on the second test set (thesis 3.3.7)."""
+"""Phase 6: long training of the teacher, smaller networks, one evaluation on the second test set (thesis 3.3.7)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NAME = "compression"
 
 
 class CompressionPhase:
-    """Phase 6. Networks are compared on development sessions that do not train; the second test set chooses nothing."""
+    """Phase 6: networks are compared on development sessions that do not train; the second test set selects nothing."""
 
     title = NAME
 
@@ -45,7 +45,7 @@ class CompressionPhase:
         return 3 * widths + 3
 
     def run(self, context: SearchContext) -> Course:
-        """Teacher; students of each width; the better of each with rounded numbers; the choice on the test set."""
+        """Train teacher and students of each width, round the better ones, evaluate the choice on the test set."""
         if not context.spec.compression.on:
             yield from ()
             return Decision(NAME, SmallerFacts(on=False), ("Left out: search.compression.on is false.",))
@@ -143,12 +143,15 @@ def _network(order: CompressionRequest | None, row: CompressedRow) -> SmallerNet
 
 
 def teacher_settings(context: SearchContext) -> Table:
-    """Settings of the winner of the search."""
+    """Return the settings of the winner of the search."""
     return context.facts(ExplorationFacts).teacher_settings
 
 
 def recipe_of(context: SearchContext, order: CompressionRequest | None = None) -> Recipe:
-    """Return the recipe of a network under the settings of this search; without an order that of the teacher."""
+    """Return the recipe of a request's network under the settings of this search.
+
+    That of the teacher without a request.
+    """
     spec = context.spec.compression
     steps = spec.updates or context.spec.final_updates
     recipe = Recipe(steps, spec.formats or tuple(FORMATS), spec.budget, context.validation)
@@ -158,7 +161,7 @@ def recipe_of(context: SearchContext, order: CompressionRequest | None = None) -
 
 
 def order_of(context: SearchContext, settings: Table, recipe: Recipe, judged: Sequence[str] = ()) -> TrainingRequest:
-    """The order that makes a network of a recipe and judges it, by default on the sessions that compare."""
+    """Return the request that makes and judges a recipe's network, by default on the comparing sessions."""
     validation, updates = context.validation, context.spec.final_updates
     sessions = tuple(judged) or validation
     order = context.order(settings, context.training, sessions, context.seed(NAME), updates, validation)
@@ -166,7 +169,7 @@ def order_of(context: SearchContext, settings: Table, recipe: Recipe, judged: Se
 
 
 def plan_of(context: SearchContext, settings: Table) -> CompressionPlan:
-    """Which networks are made.
+    """Return the plan of the smaller networks.
 
     Raises:
         ConfigError: a budget that no network of this kind meets.

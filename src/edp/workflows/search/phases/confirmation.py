@@ -31,7 +31,7 @@ class Confirmation:
     title = "confirmation"
 
     def trainings(self, context: SearchContext) -> int:
-        """Were nothing dropped at an interim analysis; before the screening, with half of the modules."""
+        """Count the trainings without interim drops; before the screening, with half of the modules."""
         spec, decisions = context.spec, list(context.decided.values())
         screening, planning = facts_of_kind(decisions, ScreeningFacts), facts_of_kind(decisions, PlanningFacts)
         half = len(spec.modules or MODULES) // 2
@@ -40,7 +40,7 @@ class Confirmation:
         return (1 + arms) * runs * (spec.run_seeds if spec.mode == "thesis" else 1) if arms else 0
 
     def run(self, context: SearchContext) -> Course:
-        """Trainings of the mode, and what is confirmed."""
+        """Train in the mode of the search, and confirm modules."""
         passed = list(context.facts(ScreeningFacts).passed)
         if not passed:
             yield from ()
@@ -90,7 +90,7 @@ def _sound(context: SearchContext, passed: list[str], arms: list[Table]) -> Cour
 
 
 def _hopeless(filled: Array, mask: Mask, stop: int, interim_analyses: Sequence[InterimAnalysis]) -> list[bool]:
-    """Which modules the interim analysis after `stop` runs drops."""
+    """Return for each module whether the interim analysis after `stop` runs drops it."""
     level = next(analysis.drop_above for analysis in interim_analyses if analysis.runs == stop)
     # Sessions that no run has judged so far hold nothing.
     seen = mask.any(axis=0)

@@ -23,16 +23,16 @@ from edp.workflows.search.trainings import Outcome
 
 
 class Exploration:
-    """Phase 5. Its winner is held against that of phase 4 on folds that no earlier phase has used."""
+    """Phase 5: its winner is compared with that of phase 4 on folds that no earlier phase has used."""
 
     title = "exploration"
 
     def trainings(self, context: SearchContext) -> int:
-        """The questions, and both winners on fresh folds."""
+        """Count the questions, and the trainings of both winners on fresh folds."""
         return context.spec.free_trials * context.spec.trial_runs + 2 * len(fresh_runs(context))
 
     def run(self, context: SearchContext) -> Course:
-        """Ask about all modules and options of those that are on; then both winners on fresh folds, same seeds."""
+        """Ask about all modules and options of active ones; train both winners on fresh folds with equal seeds."""
         spec = context.spec
         base = baseline_of(context)[0]
         free = fitting(base, context.channels, spec.modules)
@@ -56,7 +56,7 @@ class Exploration:
         options: Mapping[str, tuple[Value, ...]],
         outcomes: Sequence[Outcome],
     ) -> Decision:
-        """The teacher: the winner of phase 5 where fresh folds bear it out, else that of phase 4."""
+        """Choose the teacher: the winner of phase 5 if fresh folds confirm it, else that of phase 4."""
         size = len(outcomes) // 2
         # The last rows of the mask are the fresh runs.
         mask = context.folds(fresh_runs(context)[-1] + 1)[-size:]

@@ -1,4 +1,4 @@
-"""Phase 0: how much scores vary between folds and seeds, and which feature set goes on (thesis 3.3.1)."""
+"""Phase 0: variance of scores between folds and seeds, and choice of the feature set (thesis 3.3.1)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DEFAULT_BACKBONE: dict[str, Table] = {
 
 
 def arm_settings(base: Table, backbone: str, features: str | Table) -> Table:
-    """The base with another backbone of like size, and another feature set (a name, or a plain table)."""
+    """Return the base with another backbone of similar size, and another feature set (a name, or a plain table)."""
     base_backbone = base["model"]["backbone"]
     if base_backbone["kind"] == backbone:
         arm_backbone = dict(base_backbone)
@@ -127,7 +127,7 @@ class Isolation:
         return Decision("isolation", facts, tuple(sentences))
 
     def _comparisons(self, context: SearchContext, tables: list[Array], chosen: str) -> dict[str, FeatureComparison]:
-        """The chosen feature set against the next best one, for each backbone."""
+        """Compare the chosen feature set with the next best one, for each backbone."""
         spec = context.spec
         references = [name for name in spec.feature_sets if name != chosen]
         comparisons = {}
@@ -145,7 +145,7 @@ class Isolation:
 
 
 def lowest_against_others(tables: Mapping[str, Array], mask: NDArray[np.bool_]) -> dict[str, ArmComparison]:
-    """The arm with the lowest mean score against each of the others.
+    """Compare the arm with the lowest mean score with each of the others.
 
     Args:
         tables: scores ``(run, session)`` by the name of the arm.
@@ -174,14 +174,14 @@ def _tables(context: SearchContext, outcomes: Sequence[Outcome], arms: int, name
 
 
 def _judged(context: SearchContext) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Cells ``(run, session)`` of the sessions that some run is judged on, and which sessions these are."""
+    """Return a mask ``(run, session)`` of the sessions that some run judges, and those sessions."""
     mask = context.folds(context.spec.variance_runs)
     seen = np.asarray(mask.any(axis=0))
     return mask[:, seen], seen
 
 
 def _proxy(context: SearchContext, tables: list[Array], arms: list[tuple[str, str]]) -> PairedVariance:
-    """The variance of paired differences that planning takes for that of a module's effect.
+    """Return the variance of paired differences that planning assumes for a module's effect.
 
     Before a module was ever trained the variance of its effect is not known. That between the feature sets of one
     backbone stands in for it; with one feature set, that between backbones, and with one arm, that between seeds. The

@@ -1,4 +1,4 @@
-"""What phases 4 and 5 share: modules and rates tuned together, and what came of it."""
+"""Common part of phases 4 and 5: modules and rates tuned together, and the result."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def ask_together(
     starts: Sequence[Trial],
     options: Mapping[str, Mapping[str, Choice]] | None = None,
 ) -> Asked:
-    """Questions about modules on or off, rates inside the window and what was deferred, with warm starts first.
+    """Ask about active modules, rates inside the window and deferred options, with warm starts first.
 
     Args:
         context: with the baseline of phase 1.
@@ -58,7 +58,7 @@ def ask_together(
 
 
 def winner_of(context: SearchContext, name: str, modules: Sequence[str], trials: list[Trial]) -> JointFacts:
-    """The best trial, how often each module was on, and the front where a cost counts.
+    """Return the best trial, the frequency of each module, and the front if a cost counts.
 
     Raises:
         DataError: no training ended well.

@@ -13,7 +13,7 @@ from edp.workflows.search.phases.base import PHASES, Course
 
 
 class Planning:
-    """Phase 2.5: nothing is trained."""
+    """Phase 2.5: planning without training."""
 
     title = "power"
 
@@ -28,7 +28,7 @@ class Planning:
 
 
 def _sound(context: SearchContext) -> Decision:
-    """Closed form for the clustered test, at the level that a single true module has to pass."""
+    """Plan by the closed form for the clustered test, at the level that a single true module must pass."""
     spec = context.spec
     facts = context.facts(IsolationFacts)
     mean = facts.mean_scores[facts.features]

@@ -29,7 +29,7 @@ class ModuleScreening:
     title = "screening"
 
     def trainings(self, context: SearchContext) -> int:
-        """The design, or the questions of all modules with the baseline's seeds."""
+        """Count the trainings of the design, or the questions of all modules with the baseline's seeds."""
         spec = context.spec
         if spec.mode == "thesis":
             return spec.run_seeds + len(spec.modules or MODULES) * spec.module_trials * spec.trial_runs
@@ -41,7 +41,7 @@ class ModuleScreening:
 
 
 def baseline_of(context: SearchContext) -> tuple[Table, Candidate, Space]:
-    """Settings of the baseline, its values, and the window around them in which candidates are tuned."""
+    """Return the baseline's settings and values, and the window around them for the tuning of candidates."""
     facts = context.facts(CalibrationFacts)
     space = {name: dimension for name, dimension in context.spec.space.items() if name in context.spec.elastic}
     beyond = context.spec.mode == "thesis"
@@ -91,7 +91,7 @@ def _drawn(context: SearchContext, window: Space, count: int) -> list[dict[str, 
 
 @dataclass(frozen=True)
 class _DesignRow:
-    """A training of the design: which modules are on, the values that were drawn for it, and its fold."""
+    """Training of the design: its active modules, drawn values, and fold."""
 
     levels: NDArray[np.bool_]
     values: Mapping[str, float]
@@ -104,7 +104,7 @@ def _passed_by_design(
     rows: Sequence[_DesignRow],
     outcomes: Sequence[Outcome],
 ) -> Decision:
-    """Main effects by least squares, with the drawn values and the fold as covariates; what shows a sign passes."""
+    """Estimate main effects by least squares, with drawn values and fold as covariates; modules with a sign pass."""
     scores = np.array([outcome.mean(context.spec.horizon) for outcome in outcomes])
     failed = int((~np.isfinite(scores)).sum())
     # A failed training counts as the worst that was seen, not as missing.
@@ -131,7 +131,7 @@ def _passed_by_design(
 
 
 def _thesis(context: SearchContext) -> Course:
-    """The best of some questions of each module against the median of the baseline over seeds, as the thesis does."""
+    """Compare the best of some questions of each module with the baseline's median over seeds, as in the thesis."""
     spec = context.spec
     base, _, window = baseline_of(context)
     free = fitting(base, context.channels, spec.modules)

@@ -26,11 +26,11 @@ class Synthesis:
     title = "synthesis"
 
     def trainings(self, context: SearchContext) -> int:
-        """The questions, and both arms at length."""
+        """Count the questions, and the long trainings of both arms."""
         return context.spec.joint_trials * context.spec.trial_runs + 2 * context.spec.run_seeds
 
     def run(self, context: SearchContext) -> Course:
-        """Tune modules and rates together; then train the best and the baseline at length and judge both once."""
+        """Tune modules and rates together; train the best and the baseline at full length, and judge both once."""
         confirmed = list(context.facts(ConfirmationFacts).confirmed)
         switches = [*confirmed, *context.spec.toggles]
         base, values, _ = baseline_of(context)
@@ -51,7 +51,7 @@ class Synthesis:
         return self.decide(context, facts)
 
     def decide(self, context: SearchContext, facts: SynthesisFacts) -> Decision:
-        """What stays, what works against the others, and what the test sessions say."""
+        """Return the kept modules, counterproductive combinations, and the result on the test sessions."""
         names = ", ".join(map(title_of, facts.modules)) or "no module"
         sentences = [f"Best together: {names}; {typed(facts.score, 3)}{behind(context.unit)} on development sessions."]
         sentences += facts.said_of_pruned
@@ -69,7 +69,7 @@ class Synthesis:
 
 
 def final_orders(context: SearchContext, settings: Table) -> list[TrainingRequest]:
-    """Trainings on all development sessions at full length, judged on the test sessions; an order a seed.
+    """Return trainings on all development sessions at full length, judged on the test sessions; one per seed.
 
     Several epochs are validated by the development sessions that judge the first run, which then do not train: the test
     sessions have no say.
@@ -101,7 +101,7 @@ def judged(
 
 
 def gained(context: SearchContext, outcomes: Sequence[Outcome]) -> RelativeChange | None:
-    """The first arm against the second on the test sessions, clustered by session and seed.
+    """Return the first arm's change against the second on the test sessions, clustered by session and seed.
 
     None with one test session, one seed, or a training that did not end well.
     """
