@@ -316,7 +316,7 @@ class DataSource:
         return units
 
     def _drawn_findings(self, recordings: Sequence[Recording]) -> tuple[Finding, ...]:
-        """What an inspection says where these recordings are only a part of the store."""
+        """Return the note of an inspection if these recordings are only a part of the store."""
         whole = self.at_most_h is None
         return () if whole else findings_of_part(recordings, read_index(self.store_folder()).hours())
 
@@ -510,7 +510,7 @@ class LogInspections:
 
 
 def _units_of_logs(logs: Sequence[Log]) -> list[WorkUnit]:
-    """Logs in parts of like size."""
+    """Divide logs into parts of similar size."""
     parts: list[list[Log]] = []
     room = 0
     for log in logs:

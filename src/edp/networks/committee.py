@@ -127,7 +127,7 @@ class Committee(Streaming):
         return [functions for functions in parts if isinstance(functions, RadialFeatures)]
 
     def readers(self) -> dict[str, Streaming]:
-        """What reads the bank, by name, in the order of the representation."""
+        """Return the readers of the bank by name, in the order of the representation."""
         readers: dict[str, Streaming] = {f"group{at}": group for at, group in enumerate(self.members)}
         near = {f"near{at}": part for at, part in enumerate(self.near) if isinstance(part, RadialFeatures)}
         further = {"radial": self.radial, **near, "trees": self.trees}

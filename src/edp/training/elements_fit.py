@@ -86,7 +86,7 @@ class _Problem:
         self.weight = weight
 
     def size(self) -> tuple[int, int]:
-        """Number of parameter coordinates, and of all coordinates."""
+        """Return the number of parameter coordinates, and of all coordinates."""
         return len(self.nominal), len(self.nominal) + self.hidden * len(self.first)
 
     def numbers(self, theta: NDArray[Any]) -> NDArray[Any]:

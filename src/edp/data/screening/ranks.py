@@ -45,7 +45,7 @@ def rank_columns(values: FloatArray) -> FloatArray:
 
 @compiled
 def _dense(values: FloatArray, order: Orders, dense: NDArray[np.int32]) -> float:
-    """Number the distinct values in ascending order and return the number of pairs of equal values."""
+    """Assign ranks to the distinct values in ascending order and return the number of pairs of equal values."""
     level, run, tied = 0, 1, 0.0
     dense[order[0]] = 0
     for row in range(1, len(values)):

@@ -153,7 +153,7 @@ class _Part:
         return self.options[name]
 
     def count(self) -> Any:
-        """Samples seen before this one, an integer without derivative."""
+        """Return the number of earlier samples, an integer without derivative."""
         return ca.floor(self.m["age"] + 0.5)
 
     def push(self, slot: str, x: Any) -> Any:

@@ -31,7 +31,7 @@ class Experiments:
     others: tuple[str, ...]
 
     def names(self) -> list[str]:
-        """Unique names of the recordings: ``train_1``, prefixed with the file name if there are several files."""
+        """Return unique names of the recordings: ``train_1``, after the file name if there are several files."""
         files = {path for path, _ in self.entries}
         short = [entry.replace("{", "_").rstrip("}") for _, entry in self.entries]
         return short if len(files) == 1 else [f"{path.stem}_{name}" for (path, _), name in zip(self.entries, short)]

@@ -250,7 +250,7 @@ def _size(path: Path) -> int:
 
 
 def _batches(logs: dict[str, StoredLog], folder: Path) -> list[LogBatch]:
-    """Logs side by side, in batches of like size, the same for any number of workers."""
+    """Divide logs into batches of similar size, which do not depend on the number of workers."""
     sizes = {key: log.size for key, log in logs.items()}
     total = sum(sizes.values())
     bound = max(min(BATCH_LOG_BYTES, total // BATCHES), total // MOST_FILES)

@@ -191,7 +191,7 @@ class PhysicsBase(Streaming):
 
     @abstractmethod
     def arithmetic(self) -> int:
-        """Number of multiplications, divisions, roots, sines etc. per sample, in addition to the pose."""
+        """Return the number of multiplications, divisions, roots, sines etc. per sample, in addition to the pose."""
 
     def lower(self, build: Builder, x: str) -> str:
         """Add the velocities, ``horizon * target`` elements, by recording the equations."""
