@@ -95,12 +95,9 @@ def _sizes(recordings: Sequence[Recording], name: str) -> float:
 def _moving(recordings: Sequence[Recording], rng: np.random.Generator) -> list[str]:
     """Channels of Table A.1 that move, in random order."""
     names = [c.name for c in recordings[0].channels if c.name in TABLE_A1]
-    moving = [name for name in names if _sizes(recordings, name) > 1e-3 * _largest(recordings, name) > 0]
+    largest = {name: max(float(np.abs(r.column(name)).max()) for r in recordings) for name in names}
+    moving = [name for name in names if _sizes(recordings, name) > 1e-3 * largest[name] > 0]
     return [moving[i] for i in rng.permutation(len(moving))]
-
-
-def _largest(recordings: Sequence[Recording], name: str) -> float:
-    return max(float(np.abs(r.column(name)).max()) for r in recordings)
 
 
 def _noises(recordings: Sequence[Recording], each: int, rng: np.random.Generator) -> list[Recipe]:

@@ -48,13 +48,11 @@ def _note(where: Mapping[str, Any], line: str) -> None:
 def coordinate(study: str, log: str, trainings: int, seconds: float) -> None:
     """The process that is killed: all trainings through the ledger, then the digest."""
     with Ledger(study) as ledger, LocalPool(2) as pool:
-        jobs = [Job(_identity(seed, seconds), {"study": study, "log": log}) for seed in range(trainings)]
+        settings, where = {"seconds": seconds}, {"study": study, "log": log}
+        words = ("code", "data", {"threads": "1"})
+        jobs = [Job(TrainingIdentity("kill_storm:tiny", settings, {}, n, 1, *words), where) for n in range(trainings)]
         complete(ledger, pool, jobs)
         print(ledger.digest())
-
-
-def _identity(seed: int, seconds: float) -> TrainingIdentity:
-    return TrainingIdentity("kill_storm:tiny", {"seconds": seconds}, {}, seed, 1, "code", "data", {"threads": "1"})
 
 
 class Round:

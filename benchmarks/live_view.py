@@ -138,9 +138,6 @@ def serve(pipe: Connection, ticks: int | None, paced: bool, models: tuple[str, .
     async def run() -> None:
         stop, loop = asyncio.Event(), asyncio.get_running_loop()
 
-        def ready(one: LiveServer) -> None:
-            pipe.send(one.address)
-
         def answer() -> None:
             while True:
                 word = pipe.recv()
@@ -153,7 +150,7 @@ def serve(pipe: Connection, ticks: int | None, paced: bool, models: tuple[str, .
                     return
 
         threading.Thread(target=answer, daemon=True).start()
-        await server.run(stop, ready)
+        await server.run(stop, lambda one: pipe.send(one.address))
 
     asyncio.run(run())
     with contextlib.suppress(SourceStopped):

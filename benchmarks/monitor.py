@@ -189,7 +189,8 @@ def naming(plan: Plan, found: dict[str, list[MonitorAlarm]]) -> dict[str, float]
         hits["component"].append(parts[:1] == [right])
         hits["top_three"].append(right in parts[:3])
         hits["kind_and_site"].append([(c.kind, c.site) for c in causes[:1]] == [(fault.kind, fault.site)])
-        hits["place"].append([cause.at_fault for cause in causes[:1]] == [place_of(fault.kind)])
+        place = "sensor" if hasattr(FAULTS[fault.kind], "operation") else "machine"
+        hits["place"].append([cause.at_fault for cause in causes[:1]] == [place])
     diagnosed = any(alarm.causes for alarms in found.values() for alarm in alarms)
     return {key: float(np.mean(values)) for key, values in hits.items()} if diagnosed else {}
 
@@ -200,11 +201,6 @@ def component(kind: str, site: str) -> str:
         return kind
     of = getattr(FAULTS[kind], "component", None)
     return str(of(site)) if of is not None else f"{kind} {site}"
-
-
-def place_of(kind: str) -> str:
-    """Whether a fault is one of the machine or of a sensor."""
-    return "sensor" if hasattr(FAULTS[kind], "operation") else "machine"
 
 
 FITS, FIT_SESSIONS, MEASURED_SESSIONS = 20, 66, 120

@@ -28,7 +28,7 @@ import pyarrow.parquet as parquet
 from numpy.typing import NDArray
 
 from common import EXAMPLES, SHARED, Bench, benchmark, option, table
-from edp.config.monitor import MonitorExperiment, load_monitor_experiment
+from edp.config.monitor import load_monitor_experiment
 from edp.errors import DataError
 from edp.logs.source import DataSource
 from edp.monitor.detectors import EwmaSpec, statistics
@@ -216,11 +216,6 @@ SIZES: Mapping[str, tuple[float, ...]] = {
 """Offset and noise in deviations of the channel, scale as a share, delay in ticks."""
 
 
-def experiment_of(hours: float, seed: int, settings: Sequence[str] = ()) -> MonitorExperiment:
-    """Defaults with a promise and a bound on time."""
-    return load_monitor_experiment(None, settings, {"hours_per_false_alarm": hours, "minutes": MINUTES, "seed": seed})
-
-
 def injected(values: Values, column: int, kind: str, size: float, onset: int, rng: np.random.Generator) -> Values:
     """A copy with a fault of one sensor from a tick on.
 
@@ -270,7 +265,8 @@ def set_results(name: str, seed: int) -> dict[str, Any]:
     promised = 0.45 * hours
     detectors: dict[str, Any] = {}
     try:
-        monitor = fit_to_recordings(healthy, experiment_of(promised, seed, short_settings(rate_hz))).monitor
+        promise = {"hours_per_false_alarm": promised, "minutes": MINUTES, "seed": seed}
+        monitor = fit_to_recordings(healthy, load_monitor_experiment(None, short_settings(rate_hz), promise)).monitor
         detectors["edp.monitor"] = lambda part: [alarm.raised_s for alarm in _alarms(monitor, part)]
     except DataError as error:
         print(f"{name}: the monitor refuses: {error}")

@@ -41,7 +41,6 @@ from edp.data.screening.stability import piece_rows
 from edp.data.screening.table import CandidateTable, build_table
 from edp.data.screening.values import held_out_pieces
 from edp.logs import read_data_set, write_recording
-from edp.recording import Recording
 from edp.signals import TABLE_A1
 from edp.workflows.train_evaluate import SimulationOrder, simulate_data_set
 
@@ -59,7 +58,8 @@ def make_logs(folder: Path, minutes: float, each: int, seed: int) -> None:
     if not (simulated / "data_set.json").exists():
         simulate_data_set(simulated, SimulationOrder(minutes=minutes, recordings=RECORDINGS, seed=seed))
     recordings = read_data_set(simulated)
-    names = [c.name for c in recordings[0].channels if c.name in TABLE_A1 or moves(recordings, c.name)]
+    moving = {c.name for c in recordings[0].channels if any(np.ptp(r.column(c.name)) > 0 for r in recordings)}
+    names = [c.name for c in recordings[0].channels if c.name in TABLE_A1 or c.name in moving]
     names = names[: CHANNELS - 4 * each] if each == 20 else list(TABLE_A1)
     picked = [
         replace(r, values=r.select(names), channels=tuple(r.channels[r.index(name)] for name in names))
@@ -70,10 +70,6 @@ def make_logs(folder: Path, minutes: float, each: int, seed: int) -> None:
     for recording in laid:
         write_recording(recording, folder / f"{recording.name}.parquet")
     (folder / "made.json").write_text(json.dumps([asdict(decoy) for decoy in decoys]))
-
-
-def moves(recordings: Sequence[Recording], name: str) -> bool:
-    return any(np.ptp(r.column(name)) > 0 for r in recordings)
 
 
 def ours(folder: Path, out: Path) -> None:

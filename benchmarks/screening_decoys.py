@@ -42,22 +42,19 @@ def judged(found: ScreeningResult, decoys: Sequence[Decoy], truth: Sequence[Caus
     leaks = {decoy.name for decoy in decoys if decoy.family == "leak"}
     copies = {decoy.name for decoy in decoys if decoy.family == "copy"}
     as_copies = {flag.channel for flag in found.flags if flag.kind in (FlagKind.COPY, FlagKind.DUPLICATE)}
+    families = {d.name: f"{d.family}: {d.recipe}" for d in decoys}
     return {
         "proposed": list(found.proposal.kept),
         "needed lost": [c.name for c in truth if c.needed and c.name not in kept],
         "given causes lost": [c.name for c in truth if c.matters and not c.needed and c.name not in kept],
         "no causes kept": [c.name for c in truth if not c.matters and c.name in kept],
-        "decoys kept": {d.name: f"{d.family}: {d.recipe}" for d in decoys if d.name in kept},
+        "decoys kept": {name: family for name, family in families.items() if name in kept},
         "leaks not flagged": {d.name: d.recipe for d in decoys if d.name in leaks - flagged},
-        "leak flags on others": {name: _family(name, decoys) for name in sorted(flagged - leaks)},
+        "leak flags on others": {n: families.get(n, "a channel of Table A.1") for n in sorted(flagged - leaks)},
         "copies told as copies": len(copies & as_copies),
         "window": found.proposal.window,
         "seconds": found.seconds,
     }
-
-
-def _family(name: str, decoys: Sequence[Decoy]) -> str:
-    return next((f"{d.family}: {d.recipe}" for d in decoys if d.name == name), "a channel of Table A.1")
 
 
 def show_screening(found: dict[str, Any], decoys: Sequence[Decoy], truth: Sequence[Cause]) -> None:
