@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import edp
+from edp.evaluation.scores_file import ScoredTarget
 from edp.live.layout import Forecast, LiveLayout, LiveTrace
 from edp.logs.quality.quality import inspect
 from edp.recording import Recording
 from edp.report.notebook.figures import BandLine, prediction_figure, recordings_figure
-from edp.report.run.facts import Target
 from edp.signals import KINDS, UNITS, Channel, Kind, display_offset
 
 SOURCE = Path(edp.__file__).parent
@@ -83,7 +83,7 @@ def test_temperatures_are_shown_in_degrees_celsius():
     assert KINDS[Kind.TEMPERATURE].to_report(312.15) == pytest.approx(39.0)
     assert display_offset("degC") == -273.15
     assert display_offset("bar") == display_offset("no unit") == 0.0
-    assert Target("T", "T", "degC", 1.0).offset == -273.15
+    assert ScoredTarget(name="T", unit="degC").offset == -273.15
 
 
 OIL = Channel("Oil", Kind.TEMPERATURE, "oil")

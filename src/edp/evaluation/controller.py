@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from edp.errors import ConfigError, closest
-from edp.export.c.sizes import Sizes
-from edp.networks.streaming import Cost
 from edp.settings.bounds import check_bounds, integer
 from edp.settings.tree import SettingsTree
 from edp.storage import read_toml
+
+if TYPE_CHECKING:  # exports bring torch, which a command that shows a page does without
+    from edp.export.c.sizes import Sizes
+    from edp.networks.streaming import Cost
 
 STACK_BYTES = 1_024  # an allowance: a tick was seen to take 340 (``benchmarks/controller_memory.py``)
 # Published boards against zero-wait memory (flash wait states): the best, and the slowest, which decides.

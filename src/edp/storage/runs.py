@@ -17,7 +17,7 @@ from edp import __version__
 from edp.errors import BusyError, ConfigError, EdpError, StorageError
 from edp.storage.folders import check_kind
 from edp.storage.locks import check_held, held_by, hold
-from edp.storage.paths import entries_of, full_path, is_file_at, is_folder_at, is_there
+from edp.storage.paths import entries_of, files_below, full_path, is_file_at, is_folder_at, is_link_at, is_there
 from edp.storage.reading import read_object
 from edp.storage.run_kinds import RUN_KINDS, RunKind
 from edp.storage.seals import sealed_line
@@ -141,9 +141,12 @@ class Run:
         return False
 
     def release(self) -> None:
-        """Release the folder of a run that has written only its identity, settings and state."""
+        """Release the folder of a run that has written only its identity, settings, state and empty folders."""
         own = {*LEFT, IDENTITY, STATUS}
-        if {entry.name for entry in entries_of(self.path)} <= own:
+        if {file.name for file in files_below(self.path)} <= own:
+            for entry in entries_of(self.path):
+                if is_folder_at(entry) and not is_link_at(entry):
+                    shutil.rmtree(entry, ignore_errors=True)
             # The identity last: a kill in between leaves the folder of a run, not of something else.
             for name in (STATUS, "config.toml", IDENTITY):
                 self.file(name).unlink(missing_ok=True)

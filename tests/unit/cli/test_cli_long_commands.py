@@ -108,6 +108,8 @@ WHOLE = {
     "init": "reads heads of logs, which takes seconds",
     "search run": "trainings, which `tests/unit/search` divides and kills",
     "search report": "writes a page",
+    "search status": "reads the state of a study",
+    "search export": "writes a copy of a study",
     "monitor report": "writes a page",
     "fleet network": "writes one bundle",
     "store check": "reads samples as fast as the disk gives them",

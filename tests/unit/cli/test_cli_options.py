@@ -128,8 +128,10 @@ LINES = {
     ("simulate", "changes.limit"): "simulate new --set limit.moments=60",
     ("train", "minutes"): "train there --out new --preset quick --minutes 5",
     ("train", "workers"): "train there --out new --preset quick --workers 2",
+    ("train", "cluster"): "train there --out new --preset quick --cluster there:1",
     ("twin", "minutes"): "twin there --out new --set twin.kind=recurrent --minutes 5",
     ("twin", "workers"): "twin there --out new --set twin.kind=static --workers 2",
+    ("twin", "cluster"): "twin there --out new --set twin.kind=static --cluster there:1",
 }
 """A command line for each option of `DEPENDENT`, with settings or files by which it has no effect."""
 MORE_LINES = [

@@ -5,6 +5,7 @@ import json
 import pytest
 
 from edp.errors import StorageError
+from edp.settings.provenance import Provenance
 from edp.workflows.fleet.registry import ENTRIES, _data_of, find_entry, lineage, list_registry, read_entry
 
 GOOD, OTHER = "a" * 32, "b" * 32
@@ -70,5 +71,6 @@ def test_a_recording_that_is_divided_by_time_is_counted_once():
         "train": {"recordings": 2, "hours": 0.5, "names": ["a[0:60]", "b[0:60]"]},
         "test": {"recordings": 2, "hours": 0.25, "names": ["a[70:100]", "b[70:100]"]},
     }
-    assert _data_of({"data": parts})["recordings"] == 2
-    assert _data_of({"data": {part: {**held, "names": []} for part, held in parts.items()}})["recordings"] == 4
+    nameless = {part: {**held, "names": []} for part, held in parts.items()}
+    assert _data_of(Provenance.from_table({"data": parts}, "here"))["recordings"] == 2
+    assert _data_of(Provenance.from_table({"data": nameless}, "here"))["recordings"] == 4

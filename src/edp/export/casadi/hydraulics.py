@@ -13,8 +13,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from edp.storage.reading import Table
-
 NONE = 65535
 """Entry of a table of places: there is no such thing."""
 ATMOSPHERE, LEAST_ABSOLUTE = 0.1013, 1e-3
@@ -58,7 +56,7 @@ class HydraulicMachine:
         w: its arrays by name.
     """
 
-    def __init__(self, layer: Table, w: Mapping[str, np.ndarray]) -> None:
+    def __init__(self, layer: dict[str, Any], w: Mapping[str, np.ndarray]) -> None:
         self.w = {name: np.asarray(values, dtype=float) for name, values in w.items()}
         places = ("valve_at", "valve_actuator", "valve_pump", "actuator_at", "pump_at", "ports", "exponents", "sides")
         self.at = {name: np.asarray(w[name]).astype(int) for name in places}
@@ -328,7 +326,7 @@ class HydraulicMachine:
         y = self.pressures(content)
         return y, s + 0.5 * length * self.moved * (before + y[self.nodes :]), after, d, rows
 
-    def tick(self, m: Table, commands: Any, fed: Any) -> Any:
+    def tick(self, m: dict[str, Any], commands: Any, fed: Any) -> Any:
         """Advance one sample and return the scaled outputs without strokes; `m` is the state, updated in place."""
         history = ca.horzcat(self.demands(commands), m["history"][:, :-1])
         y, s = self.feed(fed, m["pressures_and_velocities"], m["strokes"])

@@ -20,13 +20,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from edp.storage.reading import Table
-
 LARGEST = 3e38
 """Inputs beyond, or NaN, make the results NaN."""
 EXTERNAL = "_external"
 
-Held = Table
+Held = dict[str, Any]
 """What a layer remembers, by slot: columns, and rings with a column for each tick, the oldest first."""
 
 

@@ -162,8 +162,9 @@ def _train_elsewhere(
         arguments = {"name": name, "method": order.method, "spec": asdict(order.spec), "changes": changes}
         where = {**shared, "order": order}
         units.append(WorkUnit(f"{__name__}:train_unit", f"method '{name}'", arguments, logs.content_key(), where))
-    for _ in workers.map(units):
-        check_visible(out)
+    list(workers.map(units))
+    if names:
+        check_visible(out if order.method in names else _baseline_folder(out, names[0]))
 
 
 def train_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str, str]:
