@@ -43,21 +43,14 @@ class ChannelErrors:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Moment:
-    """A time after the start of a free run, in seconds."""
+class StrokeErrors(ChannelErrors):
+    """Errors of strokes `at_s` seconds after the start, with the median over runs and channels."""
 
     at_s: float
+    median: float | None
 
     def __post_init__(self) -> None:
-        check_bounds("moment", self, at_s=POSITIVE)
-
-
-# Keys of the file begin with the last of the bases.
-@dataclass(frozen=True, kw_only=True)
-class StrokeErrors(ChannelErrors, _Moment):
-    """Errors of strokes at a time after the start, with the median over runs and channels."""
-
-    median: float | None
+        check_bounds("stroke_error", self, at_s=POSITIVE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,18 +79,13 @@ class FreeRunErrors:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Count:
-    """Number of free runs."""
+class RunSummary(FreeRunErrors):
+    """Errors of some of the free runs, `runs` of them."""
 
     runs: int
 
     def __post_init__(self) -> None:
         check_bounds("errors", self, runs=COUNT)
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunSummary(FreeRunErrors, _Count):
-    """Errors of some of the free runs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,13 +142,17 @@ class PartCoverage:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CoverageAt(_Moment):
-    """Coverage at a time after the start, by kind of channel; `calibrated` is False beyond the calibrated horizon."""
+class CoverageAt:
+    """Coverage `at_s` seconds after the start, by kind of channel; `calibrated` is False later than the calibration."""
 
+    at_s: float
     calibrated: bool = True
     velocities: PartCoverage | None = None
     strokes: PartCoverage | None = None
     pressures: PartCoverage | None = None
+
+    def __post_init__(self) -> None:
+        check_bounds("intervals.at", self, at_s=POSITIVE)
 
     def parts(self) -> dict[str, PartCoverage]:
         """Return the coverage of the kinds of channels that the twin has."""
@@ -244,21 +236,13 @@ class CommandExcess:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Extent(_Count):
-    """Number of free runs and of their recordings, and the length of a run."""
-
-    recordings: int
-    seconds: float
-
-    def __post_init__(self) -> None:
-        check_bounds("errors", self, runs=COUNT, recordings=COUNT, seconds=POSITIVE)
-
-
-@dataclass(frozen=True, kw_only=True)
-class FreeRunScores(FreeRunErrors, _Extent):
+class FreeRunScores(FreeRunErrors):
     """Scores of one model.
 
     Attributes:
+        runs: number of free runs.
+        recordings: number of their recordings.
+        seconds: length of a run.
         by_driving: by way of driving; empty where recordings do not tell.
         situations: by what actuators do; one that never occurs is left out.
         intervals: None without intervals.
@@ -267,6 +251,9 @@ class FreeRunScores(FreeRunErrors, _Extent):
         beside: None without a predictor.
     """
 
+    runs: int
+    recordings: int
+    seconds: float
     by_horizon: HorizonErrors
     by_recording: Mapping[str, RunSummary]
     by_driving: Mapping[str, RunSummary]
@@ -275,6 +262,9 @@ class FreeRunScores(FreeRunErrors, _Extent):
     ahead: AheadErrors | None = None
     beyond: Mapping[str, CommandExcess] = field(default_factory=dict)
     beside: PredictorComparison | None = None
+
+    def __post_init__(self) -> None:
+        check_bounds("errors", self, runs=COUNT, recordings=COUNT, seconds=POSITIVE)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,9 +1,9 @@
-"""Units of work, and the workers that do them: this process, processes of this machine, or a Ray cluster.
+"""Units of work, executed by this process, by several processes of this machine, or by a Ray cluster.
 
-A unit is a function by name, called with what decides its result and with where things are. Its key covers function,
-arguments, data, code, versions and threads. A folder of results makes a loop over units resumable: a command that was
-stopped does only the units that are not there. Results are plain values and bytes in a stated form: nothing that a unit
-has read is unpickled.
+A unit names a function. The function receives the arguments that determine the result, and the places of its data.
+The key of a unit covers function, arguments, data, code, versions and threads. A folder of results makes a loop over
+units resumable: a stopped command executes only the missing units when it is given again. Results are plain values and
+bytes in a stated form, so that data which a unit has read are never unpickled.
 """
 
 from __future__ import annotations
@@ -106,14 +106,15 @@ class UnitResult:
 
 @dataclass(frozen=True, kw_only=True)
 class Workers:
-    """Who does the units of a command.
+    """Processes that execute the units of a command.
 
     Attributes:
-        count: processes of this machine, 1 for this process alone, 0 for one to each core over `threads`.
-        threads: of each unit; another number may give other bits.
-        cluster: address of a Ray cluster that does the work instead; empty for this machine.
-        open_cluster: take a cluster without a token at an address that other computers may reach.
-        executor: see `stay`.
+        count: number of processes of this machine; 1 for this process alone, 0 for the number of cores divided by
+            `threads`.
+        threads: number of threads per unit; another number may change the last bits of results.
+        cluster: address of a Ray cluster that is used instead; empty for this machine.
+        open_cluster: accept a cluster without a token at an address that other computers may reach.
+        executor: open processes or connection, see `stay`.
 
     Raises:
         ConfigError: a number out of range, or workers of this machine and a cluster.
@@ -129,8 +130,8 @@ class Workers:
         check_bounds("workers", self, count=integer(0, MOST_THREADS), threads=integer(1, MOST_THREADS))
         if self.cluster and self.count > 1:
             raise ConfigError(
-                f"workers = {self.count} and the cluster '{self.cluster}' came; a cluster has its own number of "
-                "workers, as many as its cores hold: give one of the two"
+                f"workers: got {self.count} and the cluster '{self.cluster}', expected one of the two; leave the "
+                "number of workers out, since a cluster has one for each of its cores"
             )
 
     @property
@@ -140,11 +141,11 @@ class Workers:
 
     @property
     def are_alone(self) -> bool:
-        """Whether this process does everything."""
+        """Whether this process executes all units."""
         return not self.cluster and self.processes == 1
 
     def open(self) -> Executor:
-        """Return a new executor; to be closed, best by a ``with`` block.
+        """Return a new executor; close it, preferably by a ``with`` block.
 
         Raises:
             ConfigError: a cluster that does not answer, is open, or has other versions.
@@ -169,16 +170,16 @@ class Workers:
         folder: Path | None = None,
         waiting: Callable[[], None] | None = None,
     ) -> Iterator[tuple[int, UnitResult]]:
-        """Do units and yield the number and the result of each as it ends.
+        """Execute units, and yield the index and the result of each unit when it ends.
 
         Args:
-            units: equal ones are done once if there is a folder or a second process.
-            progress: receiver of the label of each unit, and of the number of units done.
-            folder: of results; units whose result is in it are not done again. None keeps no results.
-            waiting: called now and then while other processes are at work.
+            units: equal units are executed once if there is a folder or a second process.
+            progress: receiver of the label of each unit, and of the number of finished units.
+            folder: folder of results; units with a result in it are not executed again. None stores no results.
+            waiting: called every `WAKE_S` seconds while other processes work.
 
         Raises:
-            EdpError: what a unit raised, also in another process; the results of others stay in `folder`.
+            EdpError: error of a unit, also in another process; the results of other units stay in `folder`.
             UnitError: a unit raised an error of another kind in another process.
             LostError: the process of a unit was killed again and again.
             ConfigError: the cluster cannot be used.
@@ -202,7 +203,7 @@ class Workers:
         folder: Path | None = None,
         waiting: Callable[[], None] | None = None,
     ) -> Iterator[UnitResult]:
-        """Do units as `map` does and yield the results in the order of the units."""
+        """Execute units as by `map`, and yield the results in the order of the units."""
         early: dict[int, UnitResult] = {}
         following = 0
         for index, result in self.map(units, progress, folder, waiting):
@@ -254,7 +255,7 @@ IN_PROCESS: Workers = Workers()
 
 
 def _call_all(units: Sequence[WorkUnit], progress: Progress) -> Iterator[tuple[int, UnitResult]]:
-    """Do units in this process and keep no results."""
+    """Execute units in this process without storing results."""
     for index, unit in enumerate(units):
         progress.note(unit.label)
         where = {**unit.where, PROGRESS: progress}
@@ -265,7 +266,7 @@ def _call_all(units: Sequence[WorkUnit], progress: Progress) -> Iterator[tuple[i
 def _do_alone(
     ledger: Ledger, jobs: Sequence[Job], labels: Mapping[str, str], progress: Progress
 ) -> Iterator[JobEnd | None]:
-    """Do jobs in this process and keep their results in a ledger."""
+    """Execute jobs in this process and store their results in a ledger."""
     for job in {job.key: job for job in jobs}.values():
         record = ledger.finished(job.key)
         if record is not None:
@@ -281,7 +282,7 @@ def _do_alone(
 
 @contextlib.contextmanager
 def _open_ledger(folder: Path | None) -> Iterator[Ledger]:
-    """Open the ledger of units: in a folder that stays, or for the time of the block."""
+    """Open the ledger of units in a folder, or in a temporary folder for the duration of the block."""
     if folder is not None:
         with Ledger(folder) as ledger:
             yield ledger
@@ -313,8 +314,12 @@ def _raise_failure(label: str, record: Record) -> None:
 def _error_type(name: str) -> type[EdpError] | None:
     """Return the class of an error of EDP that is made from its message alone; None for any other class."""
     module, _, kind = name.partition(":")
-    if not module.startswith("edp."):
+    # The name comes from another process; `__main__` would run a command.
+    if not module.startswith("edp.") or module.endswith("__main__"):
         return None
-    error_type = getattr(importlib.import_module(module), kind, None)
+    try:
+        error_type = getattr(importlib.import_module(module), kind, None)
+    except ImportError:
+        return None
     is_plain = isinstance(error_type, type) and issubclass(error_type, EdpError) and "__init__" not in vars(error_type)
     return error_type if is_plain else None
