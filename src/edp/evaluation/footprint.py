@@ -9,6 +9,7 @@ import torch
 
 from edp.errors import ConfigError, ExportError
 from edp.evaluation.controller import CORES, Budget, Estimate, LimitCheck, estimate
+from edp.evaluation.footprint_file import PartCost
 from edp.export.c.sizes import Sizes, sizes_of
 from edp.ir import Graph
 from edp.ir.rls import Adaptation
@@ -23,16 +24,6 @@ GRAPHS: dict[str, Callable[[Predictor], Graph]] = {
     "w8a16": lambda predictor: outline(predictor.graph()),
 }
 """Layers of a network by number format of `FORMATS`."""
-
-
-@dataclass(frozen=True)
-class PartCost:
-    """Parameters of a part of a network, and its multiply-accumulates per sample of a stream and per window."""
-
-    part: str
-    parameters: int
-    macs_tick: int
-    macs_window: int
 
 
 @dataclass(frozen=True)

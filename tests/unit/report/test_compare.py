@@ -203,10 +203,12 @@ def test_a_damaged_footprint_is_one_error(pair, content):
         compare_runs(pair)
 
 
-def test_a_footprint_of_another_form_is_not_known(pair):
+def test_each_value_of_another_form_in_a_footprint_is_told(pair):
     odd = '{"budget": 3, "estimates": [1, {"cycles": "x"}], "parameters": "many"}'
     (pair[1] / "footprint.json").write_text(odd)
-    assert compare_runs(pair).runs[1].costs == {}
+    with pytest.raises(StorageError, match=r"(?s)footprint\.json.*budget.*remove it and run edp evaluate") as told:
+        compare_runs(pair)
+    assert all(word in str(told.value) for word in ("estimates", "parameters"))
 
 
 def test_names_stay_text(pair):

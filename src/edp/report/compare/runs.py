@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError, DataError, count_of
+from edp.evaluation.controller import Budget
 from edp.evaluation.free_run_file import TWIN, ChannelErrors
 from edp.report.run.facts import NETWORK, TRUTH, Facts, label_of, read_facts, read_history
 from edp.report.twin.facts import holds_free_runs, read_free_runs
@@ -196,16 +197,18 @@ def _digest(provenance: Provenance | None) -> str:
 
 
 def _costs(facts: Facts) -> dict[str, float]:
-    """Return the costs that the footprint states; entries of an unknown form are left out."""
-    footprint = facts.footprint or {}
-    costs = {"Parameters": footprint.get("parameters"), "Multiply-accumulates per tick": footprint.get("macs_tick")}
-    core = str(_table(footprint.get("budget")).get("core", "cortex_m4f"))
-    estimates = footprint.get("estimates")
-    for row in map(_table, estimates if isinstance(estimates, list) else ()):
-        cycles, name = _table(row.get("cycles")).get(core), str(row.get("number_format"))[:20]
-        if isinstance(cycles, list) and len(cycles) == 3:
-            costs[f"Cycles per tick, {name}"] = cycles[1]  # low, typical, high
-        costs[f"Flash, {name} [B]"] = row.get("flash_bytes")
+    """Return the costs that the footprint states."""
+    footprint = facts.footprint
+    if footprint is None:
+        return {}
+    costs: dict[str, int | None] = {
+        "Parameters": footprint.parameters,
+        "Multiply-accumulates per tick": footprint.macs_tick,
+    }
+    for row in footprint.estimates:
+        cycles, name = row.cycles.get((footprint.budget or Budget()).core), row.number_format[:20]
+        costs[f"Cycles per tick, {name}"] = None if cycles is None else cycles[1]  # low, typical, high
+        costs[f"Flash, {name} [B]"] = row.flash_bytes
     return _positive(costs)
 
 
@@ -213,7 +216,7 @@ def _table(value: Any) -> Table:
     return value if isinstance(value, dict) else {}
 
 
-def _positive(values: Table) -> dict[str, float]:
+def _positive(values: Mapping[str, object]) -> dict[str, float]:
     numbers = {name: value for name, value in values.items() if isinstance(value, int | float) and value is not True}
     return {name: float(value) for name, value in numbers.items() if 0 < value < math.inf}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError, StorageError, count_of
+from edp.evaluation.footprint_file import FootprintFile
 from edp.evaluation.guard import MEASURE, MEASURE_NAME, network_verdict
 from edp.evaluation.scores_file import MEAN, ModelScores, ScoredTarget, ScoresFile, error_at
 from edp.report.run.outputs import by_output, judged_line, losses_line, minutes_of, situation_line
@@ -62,7 +63,7 @@ class Facts:
     provenance: Provenance | None = None
     history: tuple[Mapping[str, Any], ...] = ()
     scores: ScoresFile | None = None
-    footprint: Table | None = None
+    footprint: FootprintFile | None = None
     predictions: Mapping[str, Mapping[str, NDArray[np.floating]]] = field(default_factory=dict)
     absent: tuple[str, ...] = ()
     limit: Mapping[str, Any] | None = None
@@ -131,9 +132,6 @@ def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts
         missing = f"'{folder}' is not a run folder: it holds none of {listed(MAKERS)}"
         raise StorageError(unfinished_text(folder) or missing)
 
-    def json_part(name: str) -> Any:
-        return None if name in absent else read_object(folder / name)
-
     provenance = None if PROVENANCE in absent else Provenance.read(folder)
     facts = Facts(
         folder=folder,
@@ -141,7 +139,7 @@ def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts
         provenance=provenance,
         history=() if "history.jsonl" in absent else read_history(folder / "history.jsonl"),
         scores=None if "scores.json" in absent else ScoresFile.read(folder),
-        footprint=json_part("footprint.json"),
+        footprint=None if "footprint.json" in absent else FootprintFile.read(folder),
         predictions={} if "predictions.safetensors" in absent else _read_predictions(folder),
         absent=absent,
         limit=read_limit(None if limit is None else Path(limit), provenance),
@@ -420,28 +418,12 @@ def verdict_lines(facts: Facts) -> list[str]:
     beyond = situation_line(facts.scores) if facts.scores else ""
     limit = limit_line(facts, main_horizon(facts))
     lines += [line for line in (judged, beyond, limit) if line]
-    checks = budget_rows(facts.footprint)
-    if checks:
-        over = [str(check["what"]) for check in checks if not check["fits"]]
-        name = budget_name(facts.footprint) or "the controller"
+    footprint = facts.footprint
+    if footprint is not None and footprint.stated_budget is not None and footprint.checks:
+        over = [check.what for check in footprint.checks if not check.fits]
         verdict = f"exceeded in {listed(over)}" if over else "met on every count"
-        lines.append(f"Budget ({name}): {verdict}.")
+        lines.append(f"Budget ({footprint.stated_budget.name}): {verdict}.")
     return lines
-
-
-def budget_name(footprint: Mapping[str, Any] | None) -> str:
-    """Return the name of the stated controller in a run's ``footprint.json``; empty without one."""
-    # Here, since pages are also written where torch cannot be imported, which this module needs.
-    from edp.evaluation.controller import Budget
-
-    budget = (footprint or {}).get("budget")
-    # Earlier versions held every run against the thesis's controller.
-    return str(budget.get("name") or "") if isinstance(budget, Mapping) and budget != asdict(Budget()) else ""
-
-
-def budget_rows(footprint: Table | None) -> list[Table]:
-    """Return the verdict by resource against the stated controller; empty without one."""
-    return list((footprint or {}).get("verdict", ())) if budget_name(footprint) else []
 
 
 def recordings_won(facts: Facts, baseline: str) -> tuple[int, int]:

@@ -252,9 +252,10 @@ def _errors(facts: run.Facts, charts: Mapping[str, Chart]) -> list[Part | None]:
 
 def _footprint(facts: run.Facts) -> list[Part | None]:
     """Return the cost of a prediction and the limits of the budget."""
-    budget, rows, checks = run.budget_name(facts.footprint), tables.footprint_rows(facts), tables.budget_table(facts)
+    budget = facts.footprint.stated_budget if facts.footprint else None
+    rows, checks = tables.footprint_rows(facts), tables.budget_table(facts)
     against = (
-        Markup("against what {} grants").format(budget)
+        Markup("against what {} grants").format(budget.name)
         if budget
         else Markup("<code>edp report RUN --budget FILE</code> holds it against that of your machine")
     )

@@ -15,7 +15,6 @@ from edp.report.run.facts import (
     NETWORK,
     ComparisonRow,
     Facts,
-    budget_rows,
     comparison_rows,
     horizon_text,
     label_of,
@@ -147,12 +146,11 @@ def worst_recordings_table(facts: Facts, most: int = 10) -> Table | None:
 def budget_table(facts: Facts) -> Table:
     """Return the footprint against each limit of the budget; a table without rows if there is no budget."""
     rows = []
-    for row in budget_rows(facts.footprint):
-        value, limit = row.get("value"), row.get("limit")
-        # No share of a limit that is zero or unknown.
-        share = value / limit if value is not None and limit else None
-        verdict, unit, note = FITS if row["fits"] else EXCEEDS, str(row.get("unit") or ""), str(row.get("note") or "")
-        rows.append((str(row["what"]), _amount(value), _amount(limit), unit, share, verdict, note))
+    for check in facts.footprint.checks if facts.footprint else ():
+        share = check.value / check.limit if check.limit else None
+        verdict = FITS if check.fits else EXCEEDS
+        amounts = (count_text(check.value), count_text(check.limit))
+        rows.append((check.what, *amounts, check.unit, share, verdict, check.note))
     columns = (
         Column("Resource"),
         Column("Needed"),
@@ -178,23 +176,14 @@ def _coloured(verdict: Value) -> Markup:
     return Markup('<span class="fits{}">{}</span>').format(" over" if verdict == EXCEEDS else "", verdict)
 
 
-def _amount(value: float | None) -> str:
-    return count_text(value) if value is None or abs(value) >= 100 or float(value).is_integer() else number(value)
-
-
 def part_table(facts: Facts) -> Table | None:
     """Parameters and multiply-accumulates of each part of the network."""
-    rows = (facts.footprint or {}).get("rows", [])
+    rows = facts.footprint.rows if facts.footprint else ()
     if not rows:
         return None
-    keys = [key for key in ("parameters", "macs_tick", "macs_window") if any(row.get(key) is not None for row in rows)]
-    names = {
-        "parameters": Column("Parameters"),
-        "macs_tick": Column("Per tick", "MAC"),
-        "macs_window": Column("Per window", "MAC"),
-    }
-    lines = tuple((str(row["part"]), *(count_text(row.get(key)) for key in keys)) for row in rows)
-    return Table("By part", (Column("Part"), *(names[key] for key in keys)), lines)
+    columns = (Column("Part"), Column("Parameters"), Column("Per tick", "MAC"), Column("Per window", "MAC"))
+    counts = ((row.parameters, row.macs_tick, row.macs_window) for row in rows)
+    return Table("By part", columns, tuple((row.part, *map(count_text, each)) for row, each in zip(rows, counts)))
 
 
 def footprint_rows(facts: Facts) -> list[tuple[str, str]]:
@@ -211,8 +200,9 @@ def footprint_rows(facts: Facts) -> list[tuple[str, str]]:
         "state_bytes": ("State carried between ticks", "B"),
         "window": ("Window", "samples"),
     }
-    values = dict(facts.footprint or {})
-    values |= {row["number_format"]: row["parameter_bytes"] for row in values.get("estimates", [])}
+    if facts.footprint is None:
+        return []
+    values = vars(facts.footprint) | {row.number_format: row.parameter_bytes for row in facts.footprint.estimates}
     figures = [(label, values.get(key), unit) for key, (label, unit) in names.items()]
     return [(label, f"{count_text(value)} {unit}".rstrip()) for label, value, unit in figures if value is not None]
 
@@ -235,9 +225,9 @@ def key_figures(facts: Facts) -> list[tuple[str, str, str]]:
         tiles.append((percent(best.change, signed=True), "", f"error against {best.label}, the best baseline"))
     elif ours and ours.r2 is not None:
         tiles.append((number(ours.r2, 4), "", "R²"))
-    checks = budget_rows(facts.footprint)
+    checks = facts.footprint.checks if facts.footprint else ()
     if checks:
-        fitting = sum(bool(check["fits"]) for check in checks)
+        fitting = sum(check.fits for check in checks)
         tiles.append((f"{fitting} of {len(checks)}", "", "budget limits met"))
     elif facts.provenance is not None and facts.provenance.more.get("parameters") is not None:
         tiles.append((count_text(facts.provenance.more["parameters"]), "", "parameters"))
