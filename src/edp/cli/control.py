@@ -130,22 +130,21 @@ def tune(
         tuned_on, judged_on = (ControlSources(where, twin, predictor, trusted=True) for where in (on, plant))
         tuning_spec, divided = TuningSpec(trials=trials, loops=loops), workers_of(workers, cluster, open_cluster)
         tuning = tune_gains(experiment, folder, tuned_on, judged_on, tuning_spec, progress, divided)
-    judged = tuning.content["judged_mm"]
+    judged = tuning.content.judged_mm
     verdict = tuning_verdict(judged)
 
     def show() -> None:
         show_verdict(verdict)
-        gains = ", ".join(f"{name} {figure(value, 3)}" for name, value in tuning.content["gains"].items())
+        gains = ", ".join(f"{name} {figure(value, 3)}" for name, value in tuning.content.gains.items())
         out.print(
-            f"position error of the tip on the plant: {number(judged['after'], 1)} mm (rms), "
-            f"{number(judged['before'], 1)} mm before"
+            f"position error of the tip on the plant: {number(judged.after, 1)} mm (rms), "
+            f"{number(judged.before, 1)} mm before"
         )
         out.print(f"gains: {gains}")
         out.print(f"next: edp control RUN --config {folder / TUNED}")
 
-    emit(
-        as_json, {"run": str(folder), "settings": str(folder / TUNED), **tuning.content} | verdict_facts(verdict), show
-    )
+    places = {"run": str(folder), "settings": str(folder / TUNED)}
+    emit(as_json, places | tuning.content.to_table() | verdict_facts(verdict), show)
     end_with(verdict)
 
 

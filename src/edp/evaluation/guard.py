@@ -23,6 +23,7 @@ import numpy as np
 from edp.errors import count_of
 from edp.evaluation.free_run_file import FreeRunErrors, FreeRunScores
 from edp.evaluation.scores_file import ByHorizon, ModelScores, ScoresFile, error_at
+from edp.evaluation.tuning_file import TipErrors
 from edp.stats.resampled import paired_t
 from edp.storage.reading import Table
 from edp.wording import figure, percent, percent_interval
@@ -368,19 +369,10 @@ def adaptation_verdict(facts: Table) -> ErrorVerdict:
     return change_verdict(facts["change"], facts["change_by_recording"], UNADAPTED)
 
 
-def tuning_verdict(judged: Table) -> ErrorVerdict:
-    """Return the verdict on tuned gains against the gains before, on the plant.
-
-    Args:
-        judged: position errors of the tip, ``before`` and ``after``, and both of each reference in ``by_reference``.
-    """
-    by_reference = {name: _relative_change(pair) for name, pair in judged.get("by_reference", {}).items()}
-    return change_verdict(_relative_change(judged), by_reference, BEFORE_TUNING)
-
-
-def _relative_change(judged: Table) -> float:
-    before, after = float(judged["before"]), float(judged["after"])
-    return after / before - 1.0 if before > 0 < after else 0.0
+def tuning_verdict(errors: TipErrors) -> ErrorVerdict:
+    """Return the verdict on tuned gains against the initial gains, on the plant of the evaluation."""
+    by_reference = {name: change.relative for name, change in errors.by_reference.items()}
+    return change_verdict(errors.relative, by_reference, BEFORE_TUNING)
 
 
 def change_verdict(change: float, by_unit: Mapping[str, float], reference: ErrorVerdict) -> ErrorVerdict:

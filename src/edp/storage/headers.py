@@ -32,17 +32,21 @@ def digests_of(folder: str | Path, *names: str) -> dict[str, str]:
     return {name: digest_of_bytes(read_bytes(Path(folder, name), ARRAYS_BYTES)) for name in names}
 
 
-def check_files(files: Mapping[str, str], folder: str | Path, advice: str) -> None:
+def check_files(files: object, folder: str | Path, advice: str) -> None:
     """Raise an error if an accompanying file does not match its hash in the JSON file.
 
     Args:
-        files: hashes by name, see `digests_of`; empty in a file of an earlier version.
+        files: value of `FILES`, hashes by name, see `digests_of`; empty in a file of an earlier version.
         folder: of the JSON file.
         advice: what to do about it.
 
     Raises:
-        StorageError: a file is missing, or was changed or replaced since.
+        StorageError: a file is missing, or was changed or replaced since, or `files` has another form.
     """
+    if not isinstance(files, Mapping):
+        raise StorageError(
+            f"'{folder}': got {type(files).__name__} as hashes of files, expected a table by name; {advice}"
+        )
     for name, digest in files.items():
         file = Path(folder, Path(str(name)).name)  # never a path out of the folder
         if digest_of_bytes(read_bytes(file, ARRAYS_BYTES)) != digest:

@@ -28,6 +28,7 @@ from edp.evaluation.guard import (
     twin_verdict,
 )
 from edp.evaluation.scores_file import ModelScores, ScoredTarget, ScoredTask, ScoresFile
+from edp.evaluation.tuning_file import ErrorChange, TipErrors
 from edp.report.transfer.facts import transfer_verdict
 
 ROOT = Path(__file__).parents[3]
@@ -102,8 +103,8 @@ class Methods:
 
 def tuned(*ratios):
     """Position errors of 1 after tuning on each reference, and `ratios` before."""
-    by_reference = {f"grade {i}": {"before": ratio, "after": 1.0} for i, ratio in enumerate(ratios)}
-    return {"before": sum(ratios) / len(ratios), "after": 1.0, "by_reference": by_reference}
+    by_reference = {f"grade {i}": ErrorChange(before=ratio, after=1.0) for i, ratio in enumerate(ratios)}
+    return TipErrors(before=sum(ratios) / len(ratios), after=1.0, by_reference=by_reference)
 
 
 VERDICTS = {
@@ -175,7 +176,7 @@ def test_stretches_of_one_recording_are_one_unit():
 def test_scores_of_earlier_versions_without_recordings_have_no_interval():
     old = {name: replace(one, by_recording={}) for name, one in free_runs((1.5, 1.6, 1.7), "twin").items()}
     assert "no interval: chance is not excluded" in twin_verdict(old).sentence()
-    assert "no interval" in tuning_verdict({"before": 2.0, "after": 1.0}).sentence()
+    assert "no interval" in tuning_verdict(TipErrors(before=2.0, after=1.0)).sentence()
 
 
 def test_pages_take_their_headline_from_the_verdict():

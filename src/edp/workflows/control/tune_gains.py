@@ -11,22 +11,22 @@ import numpy as np
 
 from edp.config.control import CONTROL_SETTINGS, ControlExperiment, control_toml
 from edp.control.controllers import CONTROLLERS, ControllerSpec
-from edp.errors import ConfigError
+from edp.errors import ConfigError, StorageError
+from edp.evaluation.tuning_file import ErrorChange, TipErrors, TuningFile, TuningTrial
 from edp.jobs import IN_PROCESS, Workers
 from edp.jobs.workers import UNITS, forget_units
 from edp.progress import SILENT, Progress
 from edp.settings.bounds import check_bounds, integer
-from edp.storage import read_object, write_bytes, write_json
-from edp.storage.arrays import numbers_in
-from edp.storage.reading import Table, object_with
+from edp.storage import write_bytes
 from edp.storage.runs import Run, check_claimable, check_free, run_key
+from edp.wording import listed
 from edp.workflows.control.bench import ControlBench, ControlSources, DividedLoops
 from edp.workflows.search.space import Real
 from edp.workflows.search.study import SamplerSpec, Study
 
 TUNING_SEED = 1_000_000
 """First seed of the references that gains are tuned on; those that judge begin at 0 and never come so far."""
-TUNED, RESULTS = "tuned.toml", "tuning.json"
+TUNED = "tuned.toml"
 
 
 @dataclass(frozen=True)
@@ -55,11 +55,11 @@ class Tuning:
 
     Attributes:
         best: the controller with the least cost where it was tuned.
-        content: of ``tuning.json``.
+        content: content of ``tuning.json``.
     """
 
     best: ControllerSpec
-    content: Table
+    content: TuningFile
 
 
 def tune_gains(
@@ -105,16 +105,18 @@ def tune_gains(
     key = run_key(CONTROL_SETTINGS.plain(experiment) | sources | {"tuning": asdict(chosen)}, "")
     with Run.create(out, "tuning", key, control_toml(experiment)) as run, workers.stay() as staying:
         if run.is_finished:
-            content = read_object(run.file(RESULTS), ("gains", "controller", "trials", "judged_mm"))
-            where = f"'{run.file(RESULTS)}', gains,"
-            gains = object_with(content["gains"], space, where)
-            values = {name: float(numbers_in(gains[name], where, ())) for name in space}
-            return Tuning(with_gains(experiment.controller, values), content)
+            content = TuningFile.read(run.path)
+            if content.gains.keys() != space.keys():
+                raise StorageError(
+                    f"'{run.file(TuningFile.NAME)}': got gains {listed(content.gains)}, expected {listed(space)}; "
+                    f"{TuningFile.ADVICE}"
+                )
+            return Tuning(with_gains(experiment.controller, content.gains), content)
         study = Study(
             {name: Real(*ends) for name, ends in space.items()}, chosen.seed, SamplerSpec(kind=chosen.sampler)
         )
         study.suggest({name: _within(getattr(experiment.controller, name), ends) for name, ends in space.items()})
-        rows: list[Table] = []
+        rows: list[TuningTrial] = []
         units = run.file(UNITS)
         tuned = DividedLoops(staying, units, f"{key} tuned on")
         best, trials = experiment.controller, progress.stage("trial", chosen.trials)
@@ -124,24 +126,23 @@ def tune_gains(
             spec = with_gains(experiment.controller, trial.values)
             cost = bench.cost(spec, tuned)
             study.tell(trial.number, [cost])
-            best = spec if not rows or cost < min(row["cost_mm"] for row in rows) else best
-            rows.append({"gains": dict(trial.values), "cost_mm": cost})
+            best = spec if not rows or cost < min(row.cost_mm for row in rows) else best
+            rows.append(TuningTrial(gains={name: float(value) for name, value in trial.values.items()}, cost_mm=cost))
             trials.step(number + 1)
         judged = DividedLoops(staying, units, f"{key} judged on")
         before, after = judge.costs(experiment.controller, judged), judge.costs(best, judged)
-        content = {
-            "schema": 1,
-            "controller": CONTROLLERS.name_of(best),
-            "gains": {name: getattr(best, name) for name in space},
-            "tuned_cost_mm": min(row["cost_mm"] for row in rows),
-            "judged_mm": {
-                "before": float(np.mean(list(before.values()))),
-                "after": float(np.mean(list(after.values()))),
-                "by_reference": {name: {"before": before[name], "after": after[name]} for name in before},
-            },
-            "trials": rows,
-        }
-        write_json(run.file(RESULTS), content)
+        content = TuningFile(
+            controller=CONTROLLERS.name_of(best),
+            gains={name: getattr(best, name) for name in space},
+            tuned_cost_mm=min(row.cost_mm for row in rows),
+            judged_mm=TipErrors(
+                before=float(np.mean(list(before.values()))),
+                after=float(np.mean(list(after.values()))),
+                by_reference={name: ErrorChange(before=before[name], after=after[name]) for name in before},
+            ),
+            trials=tuple(rows),
+        )
+        content.write(run.path)
         write_bytes(run.file(TUNED), control_toml(replace(experiment, controller=best)).encode())
     forget_units(units)
     return Tuning(best, content)
