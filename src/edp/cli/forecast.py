@@ -60,7 +60,7 @@ def forecast(
                 [
                     name,
                     row.twin.unit_of(name),
-                    *(figure(one.by_channel[name] or 0.0, 3) for one in (row.twin, row.persistence)),
+                    *(figure(one.by_channel[name], 3) for one in (row.twin, row.persistence)),
                 ]
                 for name in row.twin.by_channel
             ]

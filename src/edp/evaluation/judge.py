@@ -19,7 +19,15 @@ from edp.errors import ConfigError
 from edp.evaluation.baselines import BASELINES, Baseline, BaselineTask
 from edp.evaluation.measured import IntervalsState, MeasuredState
 from edp.evaluation.ruler import Numbered, Ruler
-from edp.evaluation.scores_file import ByHorizon, IntervalScores, Means, ModelScores, ScoresFile, nearest_to_shown
+from edp.evaluation.scores_file import (
+    ByHorizon,
+    IntervalScores,
+    Means,
+    ModelScores,
+    ScoresFile,
+    metric,
+    nearest_to_shown,
+)
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_groups, streamed
 from edp.progress import SILENT, Progress
@@ -289,7 +297,7 @@ def _weighted(overall: ByHorizon, intervals: Mapping[str, Sequence[IntervalScore
     return {
         horizon: {
             target: weighted_interval_score(
-                overall[horizon][target]["mae"] or 0.0, {row.coverage: row.score[target] for row in rows}
+                metric(overall[horizon][target], "mae"), {row.coverage: row.score[target] for row in rows}
             )
             for target in rows[0].score
         }

@@ -151,14 +151,14 @@ def _final(context: SearchContext, backbones: list[str], outcomes: Sequence[Outc
 
 def _efficient(trials: list[Trial]) -> Trial | None:
     """Return the best trial of the size that the efficiency rule chooses (`edp.stats.efficiency`)."""
-    by_size: dict[float, Trial] = {}
-    # Of each size its best question stands for it.
-    for _, trial in sorted(scored(trials), key=lambda pair: pair[0]):
-        by_size.setdefault(trial.costs["parameters"], trial)
+    by_size: dict[float, tuple[float, Trial]] = {}
+    # The best trial of each size represents the size.
+    for score, trial in sorted(scored(trials), key=lambda pair: pair[0]):
+        by_size.setdefault(trial.costs["parameters"], (score, trial))
     if not by_size:
         return None
-    candidates = [SizeScore(f"{size:,.0f}", size, trial.score or 0.0) for size, trial in by_size.items()]
-    return by_size[most_efficient(candidates).parameters]
+    candidates = [SizeScore(f"{size:,.0f}", size, score) for size, (score, _) in by_size.items()]
+    return by_size[most_efficient(candidates).parameters][1]
 
 
 def _front(context: SearchContext, trials: list[Trial]) -> tuple[TrialRow, ...]:
