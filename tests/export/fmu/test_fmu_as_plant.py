@@ -152,9 +152,9 @@ def test_loops_and_tunings_on_an_fmu_are_those_on_its_twin(fmu, twin_run, tmp_pa
         assert other.score.violations == one.score.violations
     spec = TuningSpec(trials=2, loops=1)
     contents = [tune_gains(experiment, tmp_path / str(n), plant, plant, spec).content for n, plant in enumerate(plants)]
-    costs = [[trial["cost_mm"] for trial in content["trials"]] for content in contents]
+    costs = [[trial.cost_mm for trial in content.trials] for content in contents]
     assert costs[1] == pytest.approx(costs[0], abs=TOLERANCE_MM)
-    assert contents[1]["judged_mm"]["after"] == pytest.approx(contents[0]["judged_mm"]["after"], abs=TOLERANCE_MM)
+    assert contents[1].judged_mm.after == pytest.approx(contents[0].judged_mm.after, abs=TOLERANCE_MM)
 
 
 def test_a_task_is_learned_on_an_fmu_too(fmu):
