@@ -1,4 +1,7 @@
 import importlib
+import os
+import subprocess
+import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -22,7 +25,7 @@ def compiler(tmp_path, monkeypatch):
     monkeypatch.setattr(machine_code, "PACKAGE", tmp_path)
     monkeypatch.setattr(machine_code, "__file__", str(source))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    return lambda facts="": Compiler("part", lambda: (source,), {}, facts)
+    return lambda facts="": Compiler("part", lambda: (source,), facts)
 
 
 def double(x: float) -> float:
@@ -83,6 +86,52 @@ def test_compiled_code_uses_nothing_outside_the_files_of_the_fingerprint(part, n
                     used = importlib.import_module(used.py_func.__module__)
                 if isinstance(used, ModuleType) and used.__name__.startswith("edp."):
                     assert Path(used.__file__).resolve() in known, f"{path.name}: {name}"
+
+
+def test_no_compiled_code_reorders_or_fuses_operations():
+    assert "fastmath" not in machine_code.OPTIONS
+    texts = {path: path.read_text() for path in Path(machine_code.__file__).parents[1].rglob("*.py")}
+    assert [path.name for path, text in texts.items() if "import numba" in text] == ["machine_code.py"]
+    assert [path.name for path, text in texts.items() if "fastmath=" in text or '"fastmath":' in text] == []
+
+
+FIRST_CALLS = """
+import hashlib
+import numpy as np
+from edp.sim import Scenario
+from edp.sim.machine.machine_files import load_machine
+from edp.sim.machine.parameters import pack
+from edp.sim.physics.pose import Kinematics
+from edp.sim.simulate import rehearse, simulate
+from edp.testing.bench import bench_channels, bench_grey_box, bench_series
+from edp.networks.twin import fit_scales
+from edp.networks.twin.greybox import GreyFitSpec
+from edp.training.grey_fit import fit_grey_box
+
+kinematics = Kinematics(*pack(load_machine("M22")))
+print(kinematics.strokes(kinematics.poses(np.linspace(0.1, 1.0, 300).reshape(100, 3))).tobytes().hex())
+rehearse(swings=True)
+for excitation, material in (("combined", ""), ("dig", "clay"), ("six_levers", "")):
+    state = simulate(Scenario(excitation=excitation, duration_s=2.0, **({"material": material} if material else {})))
+    print(hashlib.sha256(state.values.tobytes()).hexdigest())
+fit = GreyFitSpec(lengths_s=(0.1,), rounds=(2,), final_rounds=2, lanes=8, ticks=200, final_ticks=200, validation_s=0.5)
+series = [bench_series(seed=seed) for seed in range(3)]
+twin = bench_grey_box(prefix_ticks=30, fit=fit).start(bench_channels(), fit_scales(bench_channels(), series), series, 0)
+fitted = fit_grey_box(twin, series[:2], series[2:], seed=0)
+print(hashlib.sha256(fitted.theta.tobytes() + fitted.information.tobytes()).hexdigest())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.processes
+def test_the_first_process_of_an_installation_computes_the_bits_of_later_ones(tmp_path):
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    first, second = (
+        subprocess.run([sys.executable, "-c", FIRST_CALLS], env=environment, capture_output=True, text=True, check=True)
+        for _ in range(2)
+    )
+    assert len(first.stdout.splitlines()) == 5
+    assert second.stdout == first.stdout
 
 
 def test_not_a_number_stays_visible():

@@ -21,6 +21,10 @@ import numba
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 PACKAGE = Path(__file__).parents[1]
+# Operations in the order written, none fused (no "fastmath"): otherwise the last bits of a loop depend on which copy of
+# a function it runs, and so on whether this process compiled the function or loaded it. Divisions follow NumPy's rules.
+# Without the interpreter's lock, threads run loops side by side.
+OPTIONS: Mapping[str, object] = {"nogil": True, "error_model": "numpy"}
 
 
 class Compiler:
@@ -29,14 +33,18 @@ class Compiler:
     Args:
         part: name of the part, with which the folder's name begins.
         sources: gives the source files that compiled code comes from.
-        options: of ``numba.njit``.
         facts: what compiled code contains besides, from files that are not among the sources.
+        options: of ``numba.njit``, in addition to `OPTIONS`.
     """
 
     def __init__(
-        self, part: str, sources: Callable[[], Sequence[Path]], options: Mapping[str, object], facts: str = ""
+        self,
+        part: str,
+        sources: Callable[[], Sequence[Path]],
+        facts: str = "",
+        options: Mapping[str, object] | None = None,
     ) -> None:
-        self.part, self.sources, self.options, self.facts = part, sources, options, facts
+        self.part, self.sources, self.facts, self.options = part, sources, facts, {**OPTIONS, **(options or {})}
 
     @cached_property
     def folder(self) -> Path | None:

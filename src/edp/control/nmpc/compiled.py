@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from edp.storage.machine_code import Compiler
 
 Array = NDArray[np.float64]
-compiler = Compiler("control", lambda: (Path(__file__),), {"nogil": True, "error_model": "numpy"})
+compiler = Compiler("control", lambda: (Path(__file__),))
 
 
 @compiler.inner

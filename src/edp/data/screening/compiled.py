@@ -21,8 +21,7 @@ def sources() -> tuple[Path, ...]:
     return (*files_with(Path(__file__).parent, "from edp.data.screening.compiled import compiled"), Path(__file__))
 
 
-# Without the interpreter's lock, threads run the loops side by side; divisions follow NumPy's rules.
-compiler = Compiler("screening", sources, {"nogil": True, "error_model": "numpy"})
+compiler = Compiler("screening", sources)
 compiled = compiler.compiled
 
 

@@ -27,9 +27,7 @@ from edp.storage.machine_code import Compiler
 
 Array = NDArray[np.float32]
 
-# No "nnan" and "ninf": gradients that are not finite must stay visible.
-_FASTMATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
-compiler = Compiler("twin", lambda: (Path(__file__),), {"nogil": True, "error_model": "numpy", "fastmath": _FASTMATH})
+compiler = Compiler("twin", lambda: (Path(__file__),))
 
 
 @compiler.compiled

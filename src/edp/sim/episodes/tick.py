@@ -11,7 +11,7 @@ from edp.sim.episodes import blocks
 from edp.sim.machine import layout as at
 from edp.sim.physics import commands, plant, terramechanics
 from edp.sim.physics import scratch as places
-from edp.sim.physics.jit import compiled, inlined, pasted, plainly_inlined
+from edp.sim.physics.jit import compiled, inlined, pasted
 from edp.sim.sensors import chain, logbook
 
 Array = NDArray[np.float64]
@@ -27,7 +27,7 @@ FINE, NOT_FINITE_LEVER, DIVERGED = 0, 1, 2
 Setup = tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]]
 
 
-@plainly_inlined
+@inlined
 def finite(value: float) -> bool:
     """Whether a number is finite; where sums may be reordered, a compiler takes the test of Python as passed."""
     return math.isfinite(value)

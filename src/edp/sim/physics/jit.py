@@ -10,14 +10,9 @@ from edp.storage.machine_code import Compiler, files_with
 from edp.storage.paths import is_there
 from edp.storage.portable import lock as lock_file
 
-# No "nnan"/"ninf": a diverging state must stay visible as NaN.
 # No reference counts ("_nrt"): compiled functions read and write arrays of their callers and allocate none. Counting
 # references to them, with atomic operations at every use, took 40 % of a step.
-OPTIONS: dict[str, object] = {
-    "fastmath": {"nsz", "arcp", "contract", "afn", "reassoc"},
-    "error_model": "numpy",
-    "_nrt": False,
-}
+OPTIONS = {"_nrt": False}
 
 
 def fingerprinted() -> tuple[Path, ...]:
@@ -27,13 +22,10 @@ def fingerprinted() -> tuple[Path, ...]:
     return (*files_with(room, "from edp.sim.physics.jit import"), *places, Path(__file__))
 
 
-compiler = Compiler("sim", fingerprinted, OPTIONS, facts=str(GROUND_POINTS))
+compiler = Compiler("sim", fingerprinted, str(GROUND_POINTS), OPTIONS)
 compiled, inlined = compiler.compiled, compiler.inlined
-# Operations in the order written, none fused: the bits do not depend on which loop a function is a part of.
-_plain = Compiler("sim", fingerprinted, {**OPTIONS, "fastmath": False}, facts=str(GROUND_POINTS))
-plainly_compiled, plainly_inlined = _plain.compiled, _plain.inlined
 # Pasted into callers before these are compiled: without reference counts, no others may return parts of arrays.
-pasted = Compiler("sim", fingerprinted, {**OPTIONS, "inline": "always"}, facts=str(GROUND_POINTS)).compiled
+pasted = Compiler("sim", fingerprinted, str(GROUND_POINTS), {**OPTIONS, "inline": "always"}).compiled
 
 
 class WarmUp:

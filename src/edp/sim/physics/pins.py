@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from edp.sim.machine import layout as at
 from edp.sim.physics import dynamics, friction, linkage
-from edp.sim.physics.jit import compiled, plainly_compiled, plainly_inlined
+from edp.sim.physics.jit import compiled, inlined
 
 Array = NDArray[np.float64]
 FILM = 4e5
@@ -51,7 +51,7 @@ def fill_loads(log: Array, axes: Array, plant: Array, force: Array, mass: Array)
             mass[k, i] = inertia[i] / (lever * lever)
 
 
-@plainly_inlined
+@inlined
 def cross_play(
     pull: tuple[float, float], mass: float, half: float, step_s: float, before: tuple[float, float]
 ) -> tuple[float, float]:
@@ -74,13 +74,13 @@ def cross_play(
     return pin_offset, speed
 
 
-@plainly_inlined
+@inlined
 def first_offset(force: float, half: float) -> float:
     """Return the initial pin offset: on the side to which its force pushes."""
     return -half if force >= 0.0 else half
 
 
-@plainly_compiled
+@compiled
 def follow_play(force: Array, mass: Array, width: Array, step_s: float, out: Array) -> None:
     """Velocity of each joint against its cylinder in the play of its pins, m/s, shape (time, 3), into `out`.
 

@@ -101,6 +101,16 @@ def fill_poses(strokes: Array, axes: Array, plant: Array, limits: Array, out: Ar
         out[k, 0], out[k, 1], out[k, 2] = x, y, angle
 
 
+@compiled
+def fill_strokes(poses: Array, axes: Array, plant: Array, limits: Array, reached: Array, out: Array) -> None:
+    """Strokes in m from closed at tip poses, both of shape (time, 3), into `out`; NaN out of reach."""
+    for k in range(poses.shape[0]):
+        reach(poses[k, 0], poses[k, 1], poses[k, 2], axes, plant, limits, reached)
+        for i in range(at.AXES):
+            stroke = reached[REACHED_STROKE + i] * axes[i, at.STROKE]
+            out[k, i] = stroke if reached[REACHABLE] > 0.5 else math.nan
+
+
 def joint_limits(axes: Array, plant: Array) -> Array:
     """Joint angles (rad) at the ends of each stroke, lower first, shape (3, 2)."""
     ends = [[linkage.angle_at_stroke(i, share * axes[i, at.STROKE], axes, plant) for share in (0, 1)] for i in range(3)]
@@ -165,11 +175,13 @@ class Kinematics:
         NaN where a pose cannot be reached.
         """
         poses = np.asarray(poses, dtype=float)
-        out, reached = np.full((poses.size // 3, at.AXES), math.nan), np.empty(REACHED_VALUES)
-        # Called from here and not from a compiled loop: which copy of its code such a loop runs, and so the last bits,
-        # depends on whether this process compiled it or loaded it.
-        for row, (x, y, attitude) in zip(out, poses.reshape(-1, 3).tolist(), strict=True):
-            reach(x, y, attitude, self.axes, self.plant, self.limits, reached)
-            if reached[REACHABLE] > 0.5:
-                row[:] = reached[REACHED_STROKE : REACHED_STROKE + at.AXES] * self.axes[:, at.STROKE]
+        out = np.empty((poses.size // 3, 3))
+        fill_strokes(
+            np.ascontiguousarray(poses.reshape(-1, 3)),
+            self.axes,
+            self.plant,
+            self.limits,
+            np.empty(REACHED_VALUES),
+            out,
+        )
         return out.reshape(poses.shape)

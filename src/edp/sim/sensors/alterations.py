@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.sim.physics.jit import plainly_inlined
+from edp.sim.physics.jit import inlined
 from edp.sim.sensors import transducers
 
 Array = NDArray[np.float64]
@@ -22,7 +22,7 @@ COLUMNS = 3
 OFFSET, SCALE, STUCK, DROPOUT, LAG, DELAY, SWAP, NOISE = range(8)
 
 
-@plainly_inlined
+@inlined
 def alter(
     tick: int,
     sizes: Array,

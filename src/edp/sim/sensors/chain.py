@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from edp.sim.machine import layout as at
 from edp.sim.physics import linkage, pins
-from edp.sim.physics.jit import plainly_compiled, plainly_inlined
+from edp.sim.physics.jit import compiled, inlined
 from edp.sim.sensors import alterations, filters, transducers
 
 Array = NDArray[np.float64]
@@ -47,7 +47,7 @@ Setup = tuple[Array, Array, Array, Array]
 State = tuple[Array, Array, Array, Array]
 
 
-@plainly_inlined
+@inlined
 def remember(sample: Array, kelvin: float, tick: int, setup: Setup, memory: Array, row: Array, work: Array) -> None:
     """Write the quantities sensed at this sample to `row` of the history; `sample` is one log row, (1, columns)."""
     numbers, axes, plant, _ = setup
@@ -83,7 +83,7 @@ def remember(sample: Array, kelvin: float, tick: int, setup: Setup, memory: Arra
         row[DEMAND + j] = sample[0, at.LOG_DEMAND + j]
 
 
-@plainly_inlined
+@inlined
 def between(history: Array, position: float) -> tuple[Array, Array, float]:
     """Return the stored rows around a position in samples, and the interpolation weight of the second."""
     low = int(position)
@@ -93,7 +93,7 @@ def between(history: Array, position: float) -> tuple[Array, Array, float]:
     return history[low % history.shape[0]], history[high % history.shape[0]], part
 
 
-@plainly_inlined
+@inlined
 def read_joints(drawn: Array, setup: Setup, history: Array, out: Array) -> None:
     """Cylinder velocities that the joints' ECU sends: v = J(measured angle) * measured rate."""
     numbers, _, plant, _ = setup
@@ -111,7 +111,7 @@ def read_joints(drawn: Array, setup: Setup, history: Array, out: Array) -> None:
         out[i] = v + drawn[VELOCITY_ERROR + i]
 
 
-@plainly_inlined
+@inlined
 def read_pressures(drawn: Array, numbers: Array, history: Array, out: Array) -> None:
     """Cylinder pressures that the transmitters' ECU sends, into ``out[6:12]``."""
     low, high, part = between(history, drawn[AT_PRESSURES])
@@ -125,7 +125,7 @@ def read_pressures(drawn: Array, numbers: Array, history: Array, out: Array) -> 
         out[6 + n] = transducers.quantised(transducers.limited(p, numbers[RANGE]), numbers[QUANTUM])
 
 
-@plainly_inlined
+@inlined
 def read_pilots(position: float, full: float, history: Array, out: Array) -> None:
     """Write the 12 one-sided pilot pressures sent by the valve ECU to ``out[12:24]``."""
     low, high, part = between(history, position)
@@ -136,7 +136,7 @@ def read_pilots(position: float, full: float, history: Array, out: Array) -> Non
         out[13 + 2 * j] = down_a + part * (down_b - down_a)
 
 
-@plainly_inlined
+@inlined
 def differentiate(tick: int, numbers: Array, memory: Array, out: Array) -> None:
     """Accelerations, the filtered derivative of the velocities shown, into ``out[3:6]``."""
     coefficients = numbers[DERIVATIVE : DERIVATIVE + 5]
@@ -148,7 +148,7 @@ def differentiate(tick: int, numbers: Array, memory: Array, out: Array) -> None:
         out[3 + i] = filters.biquad(out[i] - memory[FIRST_VELOCITY + i], coefficients, memory[first : first + 2])
 
 
-@plainly_compiled
+@compiled
 def sense(
     sample: Array,
     kelvin: float,
@@ -197,7 +197,7 @@ def sense(
     differentiate(tick, numbers, memory, out)
 
 
-@plainly_compiled
+@compiled
 def sense_all(
     log: Array,
     kelvin: Array,

@@ -7,14 +7,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.sim.physics.jit import plainly_compiled, plainly_inlined
+from edp.sim.physics.jit import compiled, inlined
 
 Array = NDArray[np.float64]
 DERIVATIVE_DAMPING = 0.7
 """Share of critical: nearly flat up to the bandwidth, with hardly any overshoot of the acceleration."""
 
 
-@plainly_inlined
+@inlined
 def biquad(x: float, numbers: Array, state: Array) -> float:
     """One sample of a filter of order two with a[0] = 1, transposed direct form II.
 
@@ -26,7 +26,7 @@ def biquad(x: float, numbers: Array, state: Array) -> float:
     return y
 
 
-@plainly_compiled
+@compiled
 def _filter(numbers: Array, values: Array, state: Array, out: Array) -> None:
     for channel in range(values.shape[1]):
         state[0] = state[1] = 0.0

@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.sim.physics.jit import plainly_inlined
+from edp.sim.physics.jit import inlined
 
 Array = NDArray[np.float64]
 
 
-@plainly_inlined
+@inlined
 def quantised(value: float, quantum: float) -> float:
     """Round to the nearest multiple of `quantum`."""
     return float(np.rint(value / quantum) * quantum) if quantum > 0.0 else value
 
 
-@plainly_inlined
+@inlined
 def limited(value: float, full_scale: float) -> float:
     """Limit to the range of a transmitter, 0 to `full_scale`."""
     return min(max(value, 0.0), full_scale) if full_scale > 0.0 else value

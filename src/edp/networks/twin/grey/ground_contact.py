@@ -19,7 +19,7 @@ from edp.storage.machine_code import Compiler
 
 Array = NDArray[np.float64]
 # Kept on disk apart: no plan waits for it.
-compiler = Compiler("grey_ground", lambda: (*jit.compiler.sources(), Path(__file__)), jit.compiler.options)
+compiler = Compiler("grey_ground", lambda: (*jit.compiler.sources(), Path(__file__)))
 compiled, inner = compiler.compiled, compiler.inner
 CELL_M = 0.05
 """Of the profile of the ground."""

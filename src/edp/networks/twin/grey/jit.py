@@ -7,8 +7,6 @@ from pathlib import Path
 from edp.storage.machine_code import Compiler, files_with
 
 _FOLDER = Path(__file__).parent
-# No "nnan" and "ninf": numbers that are not finite must stay visible.
-_FASTMATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
 compiler = Compiler(
     "grey",
     # The cell on top of a grey box is that of the recurrent twin.
@@ -17,6 +15,5 @@ compiler = Compiler(
         _FOLDER.parent / "steps.py",
         *files_with(_FOLDER, "from edp.networks.twin.grey.jit import"),
     ),
-    {"nogil": True, "error_model": "numpy", "fastmath": _FASTMATH},
 )
 compiled, inlined, inner = compiler.compiled, compiler.inlined, compiler.inner

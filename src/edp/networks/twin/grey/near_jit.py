@@ -11,6 +11,5 @@ _FOLDER = Path(__file__).parent
 compiler = Compiler(
     "grey_near",
     lambda: (*whole.sources(), *files_with(_FOLDER, "from edp.networks.twin.grey.near_jit import")),
-    whole.options,
 )
 compiled, inner = compiler.compiled, compiler.inner

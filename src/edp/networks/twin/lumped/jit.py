@@ -10,6 +10,5 @@ _FOLDER = Path(__file__).parent
 compiler = Compiler(
     "lumped",
     lambda: (_FOLDER / "constants.py", *files_with(_FOLDER, "from edp.networks.twin.lumped.jit import")),
-    {"nogil": True, "error_model": "numpy"},
 )
 compiled, inner = compiler.compiled, compiler.inner
