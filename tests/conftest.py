@@ -216,10 +216,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if process_guard.starts_processes(item):
             item.add_marker("processes")
-        elif process_guard.takes_long(item):
-            item.add_marker("training")
     if config.getoption("--no-processes"):
-        left_out = [item for item in items if any(map(item.get_closest_marker, ("processes", "training")))]
+        left_out = [item for item in items if any(map(item.get_closest_marker, ("processes", "long")))]
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in set(left_out)]
 

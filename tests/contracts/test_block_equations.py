@@ -49,6 +49,7 @@ def gelu(x):
     return x * 0.5 * (1 + torch.erf(x / math.sqrt(2)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("window", "ticks", "heads"), [(1, 6, 2), (5, 3, 1), (5, 14, 2), (40, 200, 4)])
 def test_the_bridge_is_eq_3_10_and_3_11_over_the_trailing_window(window, ticks, heads):
     width = 8

@@ -255,6 +255,7 @@ def build_material(table):
     MATERIAL_FILE.build(Material, table, "here")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("build", "folder", "name"),
     [(build_machine, "machines", "m22.toml"), (build_material, "materials", "clay.toml")],

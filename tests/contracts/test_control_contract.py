@@ -48,10 +48,11 @@ def needs_a_model(name):
 
 
 # Of all tasks but the first the quick check runs the controllers that cost milliseconds a tick in `make test` alone.
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("task", "name"),
     [
-        pytest.param(task, name, marks=[pytest.mark.training] * (number > 0 and needs_a_model(name)))
+        pytest.param(task, name, marks=[pytest.mark.long] * (number > 0 and needs_a_model(name)))
         for number, task in enumerate(TASKS)
         for name in CONTROLLERS
     ],
@@ -71,6 +72,7 @@ def test_limits_hold_and_the_loop_repeats_itself(name, task, env, models):
     assert np.array_equal(run_loop(env, controller, drawn, 5).recording.values, first.recording.values)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_it_moves_the_tip_along(name, env, models):
     drawn = draw_task(TASKS["grade"](length_m=(1.0, 1.2)), interface_of(env).geometry, 100.0, 3)
@@ -79,6 +81,7 @@ def test_it_moves_the_tip_along(name, env, models):
     assert score.position_rms_mm < 0.15 * way
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CONTROLLERS)
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_each_missing_channel_that_it_reads_gives_the_safe_command_and_no_error(name, value, env, models):

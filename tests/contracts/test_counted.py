@@ -23,6 +23,7 @@ from edp.workflows.compression import dynamic_int8
 from edp.workflows.deployment import footprint_of
 
 
+@pytest.mark.long
 def test_every_network_of_the_registries_passes(structure, predictor_of):
     predictor = predictor_of(structure)
     check_work_counted(predictor)

@@ -85,6 +85,7 @@ def test_a_network_behind_all_derivations_keeps_every_contract(model):
     check_network(small_network(model, task_of(entries())))
 
 
+@pytest.mark.long
 def test_entries_stay_in_their_order():
     mixed = tuple(entries()[number] for number in np.random.default_rng(0).permutation(len(entries())))
     network = small_network(ModelSpec(backbone=TcnSpec(channels=(4,), kernel=9), blocks=(), window=9), task_of(mixed))

@@ -129,6 +129,7 @@ def test_what_is_missing_says_nothing_and_what_does_not_fit_is_refused(spec):
         spec.build(3).step(np.zeros(3))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("spec", SPECS[: len(LISTED)], ids=IDS[: len(LISTED)])
 def test_a_larger_shift_is_seen_sooner_and_an_endless_one_stays_a_number(spec):
     limit = np.quantile(statistics(spec.build(2, 300), white(4, 300, 300, 2)).max(axis=0), 0.9)
@@ -208,6 +209,7 @@ def test_hours_that_are_no_multiple_of_the_promise_lie_between():
     assert count == half.alarms
 
 
+@pytest.mark.long
 def test_promise_and_interval_hold_on_other_sessions():
     """Rates of ten limits on fresh sessions, long enough to be nearly exact."""
     inside, ratios, promise = 0, [], 0.06

@@ -45,6 +45,7 @@ DIFFERENCES = {
 """Files that use the factor of a unit alone, and for what. A new one belongs here, or calls `KindFacts.to_report`."""
 
 
+@pytest.mark.long
 def test_the_factor_alone_is_used_for_differences_only():
     used = set()
     for path in SOURCE.rglob("*.py"):

@@ -50,6 +50,7 @@ def met(graph):
     return found
 
 
+@pytest.mark.long
 def test_a_covering_set_meets_every_layer_and_every_pair_of_layers(parts, covering, predictor_of):
     seen = {structure: met(predictor_of(structure).graph()) for structure in parts[0]}
     assert set().union(*(seen[structure] for structure in covering)) == set().union(*seen.values())

@@ -87,6 +87,7 @@ def test_a_learned_constant_is_where_every_stream_begins():
     assert not fresh.constant.detach().any()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", LEARNED)
 def test_gradients_are_right(name):
     net, x = make(name), draw(2, 9)

@@ -40,6 +40,7 @@ def test_networks_without_a_form_are_refused_by_name(structure, predictor_of, ro
         calibrate(graph, [rows_of(predictor, 5)])
 
 
+@pytest.mark.long
 @pytest.mark.covering
 def test_integers_predict_nearly_the_same(network, rows_of):
     predictor, integers = network

@@ -63,6 +63,7 @@ def rows_of(source: ResidualSource, recordings) -> np.ndarray:
     return np.stack([recording.select(source.inputs) for recording in recordings])
 
 
+@pytest.mark.long
 def test_ticks_chunks_and_one_call_agree(source, sessions):
     rows = rows_of(source, sessions[:2])[:, :150]
     whole, _ = source.run(rows, source.initial_state(2))
@@ -75,6 +76,7 @@ def test_ticks_chunks_and_one_call_agree(source, sessions):
         np.testing.assert_allclose(np.concatenate(parts, axis=1) / scale, whole / scale, atol=2e-4)
 
 
+@pytest.mark.long
 def test_a_missing_channel_silences_what_reads_it_and_spoils_nothing(source, sessions):
     rows = rows_of(source, sessions[:1])
     gone = rows.copy()
@@ -155,6 +157,7 @@ def test_parts_give_the_same_source(source, sessions):
     np.testing.assert_array_equal(given, expected)
 
 
+@pytest.mark.long
 def test_a_channel_of_another_kind_is_no_trap():
     """A constant channel, and one that nothing explains, must not stop a fit."""
     sessions = rig_sessions(4, TICKS, seed=5)

@@ -17,6 +17,7 @@ from edp.testing.twins import sample_front, sample_twin
 from edp.training.twin_bundle import TwinBundle, save_twin
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", list(TWINS))
 def test_a_formulation_keeps_the_contract(name):
     check_twin(name)

@@ -60,6 +60,7 @@ def deviations(plant: TwinPlant, a: np.ndarray, b: np.ndarray) -> float:
     return float((np.abs(a - b) / plant.twin.scales.answer_width).max())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sensors", list(SENSORS))
 @pytest.mark.parametrize("name", LOWERED)
 def test_the_layers_mean_what_the_twin_answers_measured_free_and_mixed(name, sensors):
@@ -71,6 +72,7 @@ def test_the_layers_mean_what_the_twin_answers_measured_free_and_mixed(name, sen
     assert deviations(plant, stream(plant, rows), exact) < 1e-4  # a free ARX amplifies what rounding leaves
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", LOWERED)
 def test_a_free_run_of_the_plant_is_the_rollout_of_the_twin(name):
     plant = plant_of(name)
@@ -88,6 +90,7 @@ def test_a_free_run_of_the_plant_is_the_rollout_of_the_twin(name):
     assert np.array_equal(stream(plant, rows)[prefix:], free[0])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", LOWERED)
 def test_a_port_reads_its_last_answer_whatever_is_fed_beside_a_flag_of_zero(name):
     plant = plant_of(name)
@@ -108,6 +111,7 @@ def test_the_feedback_edge_is_a_slot_that_an_answer_writes():
     assert not plant_of("static", "velocities only").graph().fed_back
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("target", list(TARGETS))
 @pytest.mark.parametrize("name", LOWERED)
 def test_every_form_writes_a_twin_or_says_why_not(name, target, tmp_path):

@@ -122,7 +122,7 @@ def tables(monkeypatch) -> list[list[str]]:
     return printed
 
 
-@pytest.mark.training
+@pytest.mark.long
 @pytest.mark.parametrize("line", CASES)
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_a_command_line_of_the_docs_runs(line, ground, tables, tmp_path, monkeypatch, capsys):

@@ -18,6 +18,8 @@ from edp.workflows.train_evaluate import train, trained_run
 
 from .test_workflow import CHANNELS, SMALL
 
+pytestmark = pytest.mark.processes
+
 HZ = 2.0
 """A stretch of two minutes has 240 rows."""
 LENGTHS = (1500, 900, 120, 2000)

@@ -25,6 +25,8 @@ from edp.workflows.auto.candidates import CANDIDATES, Amount, RecurrentTrial, sp
 from edp.workflows.auto.promise import Promise, choose
 from edp.workflows.train_evaluate import DataSource, evaluate, trained_run
 
+pytestmark = pytest.mark.processes
+
 RATE = 50.0
 SET = ["task.targets=['y']", "task.horizons=[1, 4]", "auto.minutes=0.01", "split.kind='time'", "judge.baselines=[]"]
 
@@ -179,7 +181,6 @@ def test_recordings_are_divided_by_time_where_whole_ones_are_no_parts(tmp_path, 
     assert sum(part.samples for part in data.train) > 0.5 * sum(lengths)
 
 
-@pytest.mark.processes
 def test_candidates_side_by_side_give_the_same_bits(tmp_path, monkeypatch):
     monkeypatch.setattr("edp.workflows.auto.candidates.RECURRENT_ROWS", 1000)
     source = write(tmp_path / "logs", ticks=1500)

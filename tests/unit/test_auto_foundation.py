@@ -13,6 +13,8 @@ from edp.errors import ConfigError, DataError
 from edp.workflows.auto import load_auto, train_auto
 from edp.workflows.train_evaluate import DataSource, evaluate, train, trained_run
 
+pytestmark = pytest.mark.processes
+
 TASK = ["task.features='all'", "task.targets=['y']", "task.horizons=[4]", "split.kind='time'"]
 SMALL = [
     *("model.backbone={kind='hybrid',channels=[8],kernel=3,units=8}", "model.window=20"),

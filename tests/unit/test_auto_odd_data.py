@@ -21,6 +21,8 @@ from edp.storage import read_json
 from edp.workflows.auto import candidates, load_auto, train_auto
 from edp.workflows.train_evaluate import DataSource, evaluate
 
+pytestmark = pytest.mark.processes
+
 ROOT = Path(__file__).parents[2]
 REAL = ROOT / "examples" / "real"
 SHARED = Path(os.environ.get("EDP_SHARED_DATA") or ROOT.parent / "shared" / "data")

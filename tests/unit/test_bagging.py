@@ -36,6 +36,8 @@ from edp.training.bagging.table import table_of
 from edp.training.fit import fit
 from edp.training.spec import TrainingSpec, check_fitted_parts
 
+pytestmark = pytest.mark.long
+
 RATE = 50.0
 CHANNELS = (Channel("u", Kind.GENERIC), Channel("y", Kind.GENERIC))
 

@@ -8,6 +8,7 @@ from edp.errors import ConfigError, DataError
 from edp.evaluation.baselines import BASELINES, Baseline, BaselineTask, RidgeArx
 
 AHEAD = BaselineTask(horizons=(1, 3), present=(2, None), history=12, seed=5)
+NAMES = [pytest.param(name, marks=pytest.mark.processes) if name == "boosted_trees" else name for name in BASELINES]
 NOW = BaselineTask(horizons=(0,), present=(None, None), history=12, seed=5)
 
 
@@ -50,7 +51,7 @@ def test_all_four_are_registered():
 
 
 @pytest.mark.parametrize("task", [AHEAD, NOW], ids=["ahead", "now"])
-@pytest.mark.parametrize("name", list(BASELINES))
+@pytest.mark.parametrize("name", NAMES)
 class TestEveryBaseline:
     def test_shape_type_and_warm_up_ticks(self, name, task):
         prediction = fitted(name, task).predict(linear_series(4, 60))
@@ -212,7 +213,7 @@ def test_a_penalty_of_nothing_on_copied_inputs_is_refused():
         ridge_solution([doubled], AHEAD, penalties=[0.0])
 
 
-@pytest.mark.parametrize("name", ["boosted_trees", "small_mlp"])
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in ("persistence", "ridge_arx")])
 def test_nonlinear_learners_beat_the_linear_map_on_a_dead_band(name):
     def plant(seed: int) -> Series:
         rng = np.random.default_rng(seed)

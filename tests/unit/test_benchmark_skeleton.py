@@ -58,6 +58,7 @@ def test_every_script_finds_what_it_imports():
     assert done.stdout == ""
 
 
+@pytest.mark.processes
 def test_the_short_form_is_written_only_where_it_is_asked_for(common, tmp_path, capsys):
     @common.benchmark()
     def main(bench):
@@ -76,6 +77,7 @@ def test_the_short_form_is_written_only_where_it_is_asked_for(common, tmp_path, 
         assert result["seed"] == (3 if quick else 0)
 
 
+@pytest.mark.processes
 def test_figures_that_are_no_numbers_are_kept_as_null(common, tmp_path):
     """JSON has no infinity and no NaN, and a run of hours must not end with a message about them."""
 
@@ -109,6 +111,7 @@ def test_a_part_is_read_from_the_working_folder_of_an_earlier_run(common, tmp_pa
     assert not measured[1].exists()
 
 
+@pytest.mark.processes
 def test_several_results_of_one_run_do_not_mix(common, tmp_path):
     @common.benchmark()
     def main(bench):

@@ -44,7 +44,7 @@ RUN_HERE = [
 ]
 
 
-@pytest.mark.training
+@pytest.mark.long
 @pytest.mark.parametrize("page", RUN_HERE)
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_python_blocks_run_in_order(page, tmp_path, monkeypatch, request):

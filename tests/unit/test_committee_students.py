@@ -33,7 +33,7 @@ from edp.training.spec import TrainingSpec, by_gradient
 from edp.training.warm_start import WarmStart
 from edp.workflows.compression.bench import CompressionRequest
 
-pytestmark = pytest.mark.training
+pytestmark = pytest.mark.long
 HORIZON = 2
 
 

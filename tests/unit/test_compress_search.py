@@ -38,6 +38,8 @@ from edp.workflows.compression import (
 from edp.workflows.compression.planning import make_plan
 from edp.workflows.train_evaluate import train
 
+pytestmark = pytest.mark.long
+
 SETTINGS = (
     'task.features={name="levers", channels=["speed", "lever"]}',
     'task.targets=["speed"]',

@@ -11,6 +11,8 @@ from edp.networks.predictor import build_model
 from edp.networks.stream import Stream
 from edp.signals import Kind
 
+pytestmark = pytest.mark.long
+
 KINDS = [Kind.VELOCITY] * 3
 
 

@@ -42,6 +42,7 @@ CASES = st.tuples(
 )
 
 
+@pytest.mark.long
 @settings(max_examples=40, deadline=None)
 @given(case=CASES)
 def test_chunks_give_each_sample_one_loss_but_for_the_burn_in_at_the_start(case):

@@ -150,6 +150,7 @@ def of_machines(*owners, masses=()):
     ]
 
 
+@pytest.mark.processes
 @settings(max_examples=40, deadline=None)
 @given(owners=st.lists(st.sampled_from("ABCDEFGH"), min_size=3, max_size=30), seed=st.integers(0, 5))
 def test_no_machine_is_in_two_parts(owners, seed):
@@ -213,6 +214,7 @@ def test_names_alone_draw_the_parts():
     assert {names[s.recording] for s in other.test} != parts[0]["test"]
 
 
+@pytest.mark.processes
 def test_other_formats_of_one_set_draw_the_same_tests(tmp_path):
     meta = [{"excitation": kind} for kind in ("sine", "steps", "sine", "steps", "dig", "dig", "dig", "dig")]
     draw = np.random.default_rng(0)

@@ -1,7 +1,11 @@
 """Learning rates by part of the network."""
 
+import pytest
+
 from edp.networks.predictor import build_model
 from edp.training.optimizers import Discriminative
+
+pytestmark = pytest.mark.long
 
 
 def test_each_part_has_its_rate_and_matrices_alone_decay(tiny, tiny_model):

@@ -31,6 +31,8 @@ from edp.training.strategy import BatchContext
 from edp.training.warm_start import continue_from
 from edp.workflows.compression import Distillation, DistillationSpec, SoftmaxDivergence
 
+pytestmark = pytest.mark.long
+
 THESIS = Path(__file__).parents[2] / "examples" / "thesis"
 
 

@@ -18,6 +18,8 @@ from edp.workflows.compression import DistillationSpec, DistilRequest, DistilSpe
 from edp.workflows.compression.distil import read_run
 from edp.workflows.train_evaluate import DataSource, evaluate, train
 
+pytestmark = pytest.mark.long
+
 SETTINGS = (
     'task.features={name="levers", channels=["speed", "lever"]}',
     'task.targets=["speed"]',

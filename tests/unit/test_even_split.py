@@ -145,6 +145,7 @@ def test_missing_values_and_what_stands_still_are_alike():
     assert most_unlike(ByTime(), [still], 42, ["x"], [1]) == (np.inf, "x", 1)
 
 
+@pytest.mark.processes
 def test_the_proposal_for_two_sweeps_is_blocks(tmp_path):
     for name in "ab":
         log = sweep(name, 8.0)
@@ -155,6 +156,7 @@ def test_the_proposal_for_two_sweeps_is_blocks(tmp_path):
     assert any("moves unlike the rest" in note for note in found.notes)
 
 
+@pytest.mark.processes
 def test_the_proposal_for_a_log_that_rests_at_its_end_is_blocks(tmp_path):
     log = recording("a", RESTS_AT_ITS_END)
     table = np.column_stack([np.arange(6000) / RATE, log.values])

@@ -9,6 +9,8 @@ import pytest
 
 import edp
 
+pytestmark = pytest.mark.processes
+
 HEAVY = ("torch", "numpy", "pandas", "polars", "scipy", "plotly", "matplotlib", "pyarrow", "edp.workflows")
 
 

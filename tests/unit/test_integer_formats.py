@@ -39,6 +39,7 @@ def test_the_format_becomes_finer_while_the_error_falls(errors, chosen):
     assert finer(8, lambda frac: errors[frac - 8]) == chosen
 
 
+@pytest.mark.long
 def test_one_wild_tick_does_not_make_all_inputs_coarse(network, tiny):
     known = with_spike(tiny.train, 3000.0)
     plain = calibrate(network.graph(), [part.inputs for part in known]).fracs[SCALED]

@@ -12,6 +12,8 @@ from edp.logs.as_before import read_as_before
 from edp.logs.source import DataSource
 from edp.signals import ChannelMap, Kind, SignalMap
 
+pytestmark = pytest.mark.processes
+
 MAP = SignalMap((ChannelMap("boom", "v boom", "mm/s", Kind.VELOCITY),), time="t")
 REPAIR = Repair(nan="hold")
 

@@ -13,6 +13,8 @@ from edp.recording import Recording
 from edp.signals import ChannelMap, Kind, SignalMap
 from edp.workflows.proposal import propose
 
+pytestmark = pytest.mark.processes
+
 WHOLE = SignalMap(others=True)
 PATHS = ("", "Root/pressure (2022)/Boom_P", "Root/pressure (2022)/Arm_P", "Root/valves", "Root/gain")
 NAMES = ("", "In1", "In1", "Boom_duty", "Value")

@@ -14,6 +14,8 @@ from edp.logs.formats.csv_dates import dates_of
 from edp.recording import Recording
 from edp.signals import ChannelMap, SignalMap
 
+pytestmark = pytest.mark.processes
+
 WHOLE = SignalMap(others=True)
 
 

@@ -19,6 +19,8 @@ from edp.logs.formats.matlab.check import check_size
 from edp.recording import Recording
 from edp.signals import TABLE_A1, Channel, ChannelMap, Kind, SignalMap
 
+pytestmark = pytest.mark.processes
+
 SUFFIXES = [part.suffixes[0] for part in FORMATS.values()]
 
 

@@ -27,6 +27,8 @@ from edp.recording import Recording
 from edp.signals import TABLE_A1, Channel, ChannelMap, Kind, SignalMap
 from edp.testing import check_log_format
 
+pytestmark = pytest.mark.processes
+
 NAMES = ("CylVels_1", "CylPressures_1", "BmUp")
 
 

@@ -15,6 +15,8 @@ from edp.logs import LogEvent, Repair, inspect_log, read_parts, read_recording, 
 from edp.recording import Recording
 from edp.signals import TABLE_A1, ChannelMap, Kind, SignalMap
 
+pytestmark = pytest.mark.processes
+
 
 def signal(name, samples, stamps, unit="", **more):
     return Signal(samples=np.asarray(samples), timestamps=np.asarray(stamps), name=name, unit=unit, **more)

@@ -12,6 +12,8 @@ from edp.logs.read import find_recordings
 from edp.signals import SignalMap
 from edp.workflows.proposal import propose
 
+pytestmark = pytest.mark.processes
+
 ALL = SignalMap(others=True)
 
 

@@ -11,6 +11,8 @@ from edp.errors import DataError
 from edp.logs import read_recording
 from edp.signals import ChannelMap, SignalMap
 
+pytestmark = pytest.mark.processes
+
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 TIME = np.arange(60) / 100
 EXPECTED = {

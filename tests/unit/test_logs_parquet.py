@@ -12,6 +12,8 @@ from edp.logs import inspect_log, read_recording, write_recording
 from edp.recording import Recording
 from edp.signals import TABLE_A1, ChannelMap, Kind, SignalMap
 
+pytestmark = pytest.mark.processes
+
 
 def table(path, columns, row_group=None, units=None):
     """Columns may be arrays or pyarrow arrays, and names may occur twice."""

@@ -224,6 +224,7 @@ def test_a_recording_at_rest_votes_for_nothing():
     assert find_repeats([sketch(rest), sketch(replace(rest, name="shorter", values=rest.values[:9000]))]) == ()
 
 
+@pytest.mark.long
 def test_looking_for_repeats_holds_little_beside_the_sketches():
     """Fingerprints of all recordings at once would be as much as the sketches again and again."""
     sketches = [sketch(session(f"s{i}", 100 + 10 * i, samples=120_000)) for i in range(10)]
@@ -247,6 +248,7 @@ def test_columns_in_pieces_say_the_same(monkeypatch):
     np.testing.assert_array_equal(np.stack(list(columns.columns(recording)), axis=1), recording.values)
 
 
+@pytest.mark.processes
 def test_data_set_tells_repeats_and_a_channel_in_two_units(tmp_path):
     pressures = [replace(entry, channels=(TABLE_A1["CylPressures_1"], *entry.channels[1:])) for entry in OTHERS]
     for entry in pressures:

@@ -16,6 +16,8 @@ from edp.logs import FORMATS, find_recordings, inspect_log, read_data_set, read_
 from edp.recording import Recording
 from edp.signals import TABLE_A1, ChannelMap, Kind, SignalMap
 
+pytestmark = pytest.mark.processes
+
 CONTAINERS = ("mcap", "db3", "bag")
 STEP_NS = 10_000_000
 START_NS = 1_700_000_000_000_000_000

@@ -12,7 +12,7 @@ from edp.logs import inspect_log, read_recording
 from edp.signals import ChannelMap, Kind, SignalMap
 
 ROOT = Path(os.environ.get("EDP_SHARED_DATA") or Path(__file__).parents[2].parent / "shared" / "data")
-pytestmark = pytest.mark.shared_data
+pytestmark = [pytest.mark.processes, pytest.mark.shared_data]
 
 VOLT, LENGTH, GENERIC = Kind.VOLTAGE, Kind.POSITION, Kind.GENERIC
 BENCH = ("t", "reference", "position", "valve")

@@ -13,6 +13,8 @@ from edp.logs import read_recording
 from edp.logs.formats.matlab.library import MatlabOpaque, matio
 from edp.signals import ChannelMap, Kind, SignalMap
 
+pytestmark = pytest.mark.processes
+
 ALL = SignalMap(others=True)
 
 

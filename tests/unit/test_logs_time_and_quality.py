@@ -13,6 +13,8 @@ from edp.logs.timebase import judge
 from edp.recording import Recording
 from edp.signals import TABLE_A1, Channel, ChannelMap, Kind, SignalMap
 
+pytestmark = pytest.mark.processes
+
 
 def log(tmp_path, time, values, name="a.csv", column="CylVels_1", digits=6):
     rows = "\n".join(f"{t:.{digits}f},{'' if np.isnan(v) else repr(float(v))}" for t, v in zip(time, values))

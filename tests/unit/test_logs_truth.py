@@ -20,6 +20,8 @@ from edp.logs.formats.matlab.library import matio
 from edp.recording import Recording
 from edp.signals import TABLE_A1, VOCABULARY, Channel, Kind, SignalMap
 
+pytestmark = pytest.mark.processes
+
 TRUTH = {name: channel for name, channel in VOCABULARY.items() if name not in TABLE_A1}
 SUFFIXES = [part.suffixes[0] for part in FORMATS.values()]
 

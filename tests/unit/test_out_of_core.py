@@ -35,6 +35,8 @@ from edp.signals import Channel, Kind
 from edp.stats.sketch import QuantileSketch
 from edp.storage import write_json
 
+pytestmark = pytest.mark.processes
+
 NAMES = ("a", "b", "c", "d", "e", "f")
 CHANNELS = tuple(Channel(name, Kind.VELOCITY if name in "bd" else Kind.GENERIC) for name in NAMES)
 SCATTERED = FeatureSet("scattered", ("e", "a", "d"), (Derived("da", "a", "derivative"),))

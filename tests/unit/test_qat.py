@@ -31,6 +31,8 @@ from edp.workflows.compression import (
     weight_levels,
 )
 
+pytestmark = pytest.mark.long
+
 THESIS = Path(__file__).parents[2] / "examples" / "thesis"
 
 

@@ -16,6 +16,8 @@ from edp.networks.predictor import ModelSpec, Predictor, build_model
 from edp.signals import Kind
 from edp.training.ridge_start import start_bypass
 
+pytestmark = pytest.mark.long
+
 TAPS = 6
 # Column 3 never moves; the fourth channel is an input only, as the source of a derived feature.
 FEATURES = FeatureSet(

@@ -20,6 +20,8 @@ from edp.workflows.search.space import Choice, Real
 from edp.workflows.search.study import SamplerSpec
 from edp.workflows.search.trainings import SCORES, Outcome, settings_of
 
+pytestmark = pytest.mark.long
+
 SESSIONS = tuple(f"s{number:02d}" for number in range(12))
 SPACE = {"learning_rate": Real(1e-4, 1e-1, log=True), "units": Choice((4, 8, 16))}
 SPEC = SearchSpec(

@@ -12,6 +12,8 @@ from edp.stats.pareto import pareto
 from edp.workflows.search.space import Choice, Real
 from edp.workflows.search.study import SAMPLERS, SamplerSpec, Study
 
+pytestmark = pytest.mark.long
+
 SPACE = {"learning_rate": Real(1e-4, 1e-1, log=True), "units": Choice((16, 32, 64))}
 FLAGS = ("a", "b", "c")
 BARRED = frozenset({frozenset({"a", "c"})})

@@ -35,6 +35,7 @@ def test_the_families_of_the_design_are_there():
     }
 
 
+@pytest.mark.processes
 def test_inverse_kinematics_undo_forward_kinematics():
     kinematics = pose.Kinematics(*pack(MACHINE))
     for strokes in np.random.default_rng(0).uniform(0.0, 1.0, (100, 3)):
@@ -58,6 +59,7 @@ def test_a_view_says_where_the_plant_is():
     np.testing.assert_allclose((plant.strokes - before) * MACHINE.cylinders.stroke * 100, view.speeds, atol=2e-2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("family", list(EXCITATIONS))
 def test_targets_stay_on_the_lever_and_strokes_near_the_middle(family):
     runs = [run(family, 120.0, seed) for seed in range(2)]
@@ -80,6 +82,7 @@ def test_steps_take_nine_levels_around_the_dead_band_and_chirps_reach_5_hz():
     assert max(turns[k : k + 100].sum(axis=0).max() for k in range(0, len(turns), 50)) >= 8
 
 
+@pytest.mark.long
 def test_broadband_commands_are_flat_to_4_hz_and_of_different_courses():
     """Within 10 dB from 0.1 to 4 Hz on every axis, by demands as logs have them; axes are not the same signal."""
     simulation = run("broadband", 120.0, seed=3)

@@ -102,7 +102,7 @@ from edp.sim import Scenario
 from edp.sim.machine.machine_files import load_machine
 from edp.sim.machine.parameters import pack
 from edp.sim.physics.pose import Kinematics
-from edp.sim.simulate import rehearse, simulate
+from edp.sim.simulate import simulate
 from edp.testing.bench import bench_channels, bench_grey_box, bench_series
 from edp.networks.twin import fit_scales
 from edp.networks.twin.greybox import GreyFitSpec
@@ -110,7 +110,6 @@ from edp.training.grey_fit import fit_grey_box
 
 kinematics = Kinematics(*pack(load_machine("M22")))
 print(kinematics.strokes(kinematics.poses(np.linspace(0.1, 1.0, 300).reshape(100, 3))).tobytes().hex())
-rehearse(swings=True)
 for excitation, material in (("combined", ""), ("dig", "clay"), ("six_levers", "")):
     state = simulate(Scenario(excitation=excitation, duration_s=2.0, **({"material": material} if material else {})))
     print(hashlib.sha256(state.values.tobytes()).hexdigest())

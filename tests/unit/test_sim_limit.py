@@ -12,6 +12,8 @@ from edp.sim import DataSetSpec, load_machine
 from edp.sim.data_set import SimulationOrder, find_data_set_limit, simulate_data_set
 from edp.sim.predictability import LimitSpec, find_limit, least_mae, plan_limit
 
+pytestmark = pytest.mark.processes
+
 SMALL = LimitSpec(horizons=(1, 10, 40), moments=8, branches=8)
 NOISE_MAE = 1e3 * np.sqrt(2 / np.pi)
 

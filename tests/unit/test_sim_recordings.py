@@ -22,6 +22,8 @@ from edp.sim.machine.machine_files import parse_machine
 from edp.sim.plan import hand_out
 from edp.sim.sensors.filters import filtered_derivative
 
+pytestmark = pytest.mark.processes
+
 SHORT = 4.0
 
 

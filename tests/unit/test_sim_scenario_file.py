@@ -23,6 +23,7 @@ def written(tmp_path, text):
     return path
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_examples_are_valid(path):
     order = SimulationOrder.of(path)
@@ -151,6 +152,7 @@ def test_another_format_leaves_out_the_layout_of_the_file_and_says_so(tmp_path):
         SimulationOrder.of(path, suffix=".parquet", layout="simulink")
 
 
+@pytest.mark.processes
 def test_a_family_takes_the_place_of_the_file_s_machine_and_the_rest_stays(tmp_path):
     order = SimulationOrder.of(written(tmp_path, SOIL), family=2, masses=(12.0, 20.0))
     plan = order.scenarios()
@@ -204,6 +206,7 @@ def test_room_is_estimated_from_above(tmp_path):
     assert 0.5 < path.stat().st_size / bytes_needed(order.scenarios(), ".csv") < 1.0
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("material", ["", "sandy_loam"])
 def test_closed_loops_give_the_same_bits_for_any_number_of_workers(material):
     materials = {material: 1.0} if material else {}

@@ -33,6 +33,7 @@ def test_running_in_pieces_and_going_on_from_a_snapshot_give_the_same_bits(famil
     assert again.recording().meta == whole.meta
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("family", "material"), FAMILIES)
 def test_branches_share_the_past_and_differ_later(family, material):
     simulation = Simulation(scenario_of(family, material=material, duration_s=60.0))

@@ -20,6 +20,8 @@ from edp.signals import Channel, Kind
 from edp.training.fit import fit
 from edp.training.optimizers import AdamW
 
+pytestmark = pytest.mark.long
+
 TICKS = 4
 FEATURES = FeatureSet("free", ("lever",), (Derived("dlever", "lever"),), starting=("boom",), starting_ticks=TICKS)
 TASK = Task(FEATURES, ("boom",), (0,), TargetMode.ABSOLUTE, 100.0)

@@ -22,6 +22,8 @@ from edp.recording import Recording
 from edp.signals import Channel, Kind
 from edp.storage import hold
 
+pytestmark = pytest.mark.processes
+
 CHANNELS = (Channel("u", Kind.RATIO), Channel("p", Kind.PRESSURE, "head side"), Channel("v", Kind.VELOCITY))
 
 
@@ -105,7 +107,6 @@ def test_long_logs_are_stored_in_parts(tmp_path, monkeypatch):
     assert_same(read_store(tmp_path / "store"), read_data_set(tmp_path / "a.parquet"))
 
 
-@pytest.mark.processes
 def test_two_processes_build_the_same_store(logs, tmp_path, monkeypatch):
     monkeypatch.setattr("edp.logs.store.building.BATCH_LOG_BYTES", 1)
     build(logs, tmp_path / "one")

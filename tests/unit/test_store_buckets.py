@@ -20,6 +20,8 @@ from edp.signals import Channel, Kind
 sys.path.insert(0, str(Path(__file__).parent))
 from s3_server import serving
 
+pytestmark = pytest.mark.processes
+
 CHANNELS = (Channel("u", Kind.RATIO), Channel("p", Kind.PRESSURE, "head side"), Channel("v", Kind.VELOCITY))
 
 

@@ -60,6 +60,7 @@ def by_name(recordings):
     return sorted(recordings, key=lambda one: one.name)
 
 
+@pytest.mark.processes
 def test_a_store_is_built_from_logs_and_read_from_a_bucket(server, top, tmp_path, monkeypatch):
     monkeypatch.setattr(buckets, "PIECE_BYTES", 1000)  # several pieces of each object
     expected = [read_data_set(top / "fleet" / "logs" / name) for name in ("machine0", "machine1")]
@@ -73,6 +74,7 @@ def test_a_store_is_built_from_logs_and_read_from_a_bucket(server, top, tmp_path
     assert_same(by_name(stored.read()), expected)
 
 
+@pytest.mark.processes
 def test_samples_that_are_not_what_the_index_says_are_refused(server, top):
     DataSource.of(top / "fleet" / "logs" / "machine0").store(top / "fleet" / "store")
     server.mode = "cut"

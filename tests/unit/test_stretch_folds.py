@@ -27,6 +27,7 @@ def ticks(parts):
     return [(int(which), int(tick)) for part in parts for which, tick in part.inputs]
 
 
+@pytest.mark.long
 @given(st.lists(st.integers(30, 200), min_size=1, max_size=9), st.integers(2, 5), st.integers(0, 9), st.integers(0, 99))
 def test_each_tick_is_left_out_once_and_learned_from_by_the_others(lengths, count, gap, seed):
     series = stretches(lengths)

@@ -22,6 +22,8 @@ from edp.training.optimizers import OPTIMIZERS, AdamW
 from edp.training.schedules import SCHEDULES, Constant
 from edp.training.spec import thread_count
 
+pytestmark = pytest.mark.long
+
 
 def weights(fitted):
     return {name: parameter.detach().clone() for name, parameter in fitted.predictor.named_parameters()}

@@ -15,6 +15,8 @@ from edp.training.fit import fit
 from edp.training.optimizers import OPTIMIZERS
 from edp.training.parts import fit_part
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def one_epoch(tiny_training):

@@ -23,6 +23,8 @@ from edp.training.fit import fit
 from edp.training.optimizers import OPTIMIZERS
 from edp.training.schedules import Plateau
 
+pytestmark = pytest.mark.long
+
 KEY = "k" * 32
 UPDATES = 10
 
@@ -212,6 +214,7 @@ fit(tiny["prepared"](), tiny["MODEL"], spec, KeyedRun(Run(sys.argv[2]), "k" * 32
 """
 
 
+@pytest.mark.processes
 def test_a_process_killed_while_it_writes_a_checkpoint_goes_on_to_the_same_bits(
     tmp_path, tiny, tiny_model, tiny_training, uninterrupted
 ):

@@ -22,6 +22,8 @@ from edp.workflows.feature_selection.trials import (
     with_differences,
 )
 
+pytestmark = pytest.mark.processes
+
 CHANNELS = (
     Channel("v", Kind.VELOCITY),
     Channel("u", Kind.RATIO),

@@ -42,6 +42,7 @@ def test_the_names_are_those_of_the_thesis_and_ours():
     assert {"dynamic_int8", "float32", "w8a16"} <= set(FORMATS)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", list(VARIANTS))
 def test_each_variant_is_a_network_that_runs_in_its_format(tiny, bench, name):
     found = VARIANTS[name](bench)

@@ -78,6 +78,7 @@ def test_map_entries_take_the_kind_of_the_vocabulary_or_their_own():
         SignalMap((ChannelMap("a", "x"), ChannelMap("a", "y")))
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("unit", UNITS)
 def test_the_unit_of_a_map_tells_the_kind_that_an_entry_leaves_out(unit, tmp_path):
     log = tmp_path / "log.csv"
@@ -92,6 +93,7 @@ def test_the_unit_of_a_map_tells_the_kind_that_an_entry_leaves_out(unit, tmp_pat
     assert _conversions(signal_map)("Load", {"F": 7.0}) == pytest.approx(float(recording.column("Load")[7]))
 
 
+@pytest.mark.processes
 def test_numbers_stay_as_they_are_where_the_map_says_generic_or_the_unit_has_no_kind(tmp_path):
     log = tmp_path / "log.csv"
     log.write_text("time,F\n" + "".join(f"{0.01 * k:.2f},{k}\n" for k in range(50)))

@@ -36,6 +36,8 @@ from edp.workflows.train_evaluate import (
     train,
 )
 
+pytestmark = pytest.mark.processes
+
 CHANNELS = (Channel("v", Kind.VELOCITY), Channel("u", Kind.RATIO))
 SMALL = (
     'task.features={name="rig", channels=["v", "u"]}',

@@ -15,7 +15,6 @@ from edp.sim.faults.course import MachineCourse, SensorCourse, numbers_of, share
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_files import known_mass
-from edp.sim.physics.jit import motor_rehearsal, rehearsal
 from edp.sim.physics.plant import Plant
 from edp.sim.physics.snapshot import Snapshot, capture, restored
 from edp.sim.scenario import Scenario, SimulationError, plain
@@ -34,7 +33,6 @@ class Simulation:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        rehearse(EXCITATIONS[scenario.excitation].swings)
         self.scenario = scenario
         machine = scenario.load()
         hand = np.random.default_rng(seeds_of(scenario)[1])
@@ -213,22 +211,3 @@ def _recording(scenario: Scenario, machine: Machine, log: Array, clamps: int) ->
         source=f"sim:{machine.name}",
         meta={**facts, "clamps": clamps, "full_strokes_m": list(machine.cylinders.stroke)},
     )
-
-
-def rehearse(swings: bool = False) -> None:
-    """Compile everything that a simulation runs, once for each cache folder; what only `swings` needs on demand."""
-    rehearsal.once(_play)
-    if swings:
-        motor_rehearsal.once(_play_motors)
-
-
-def _play() -> None:
-    """Call all compiled code: in free air and in soil, open and closed loops, light and full sensors."""
-    simulate(Scenario(excitation="combined", duration_s=0.5))
-    simulate(Scenario(machine="C14", excitation="dig", material="clay", duration_s=0.5))
-
-
-def _play_motors() -> None:
-    """Call all compiled code that swings and travels, by hand and not."""
-    for excitation in ("six_levers", "swing_dig"):
-        simulate(Scenario(excitation=excitation, duration_s=0.1))

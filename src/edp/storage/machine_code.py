@@ -18,6 +18,8 @@ from typing import Any, TypeVar
 
 import numba
 
+from edp.storage.portable import lock as lock_file
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 PACKAGE = Path(__file__).parents[1]
@@ -93,11 +95,11 @@ class Compiler:
         finally:
             # Restored at once: other users of Numba in this process keep their own cache folder.
             config.CACHE_DIR = before
-        _keep_if_possible(fast)
+        _keep_if_possible(fast, self.folder)
         return fast  # type: ignore[no-any-return]
 
 
-def _keep_if_possible(fast: Any) -> None:
+def _keep_if_possible(fast: Any, folder: Path) -> None:
     """Run a Numba function without the cache if its machine code cannot be stored, such as on a full disk."""
     cache = getattr(fast, "_cache", None)  # absent where NUMBA_DISABLE_JIT leaves the function as it is
     if cache is None:
@@ -106,7 +108,9 @@ def _keep_if_possible(fast: Any) -> None:
 
     def save_if_possible(signature: Any, data: Any) -> None:
         # RuntimeError: Numba has no machine code yet to store, where another thread compiles the same function.
-        with contextlib.suppress(OSError, RuntimeError):
+        with contextlib.suppress(OSError, RuntimeError), (folder / "lock").open("w") as stream:
+            # Numba numbers the files of a function by its index: two processes would give two signatures one file.
+            lock_file(stream, wait=True)
             save(signature, data)
 
     cache.save_overload = save_if_possible

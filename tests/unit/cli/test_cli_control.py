@@ -11,7 +11,7 @@ from edp.settings.provenance import Provenance
 from edp.testing.control import sample_excavator_twin, sample_grey_box
 from edp.training.twin_bundle import TwinBundle, save_twin
 
-pytestmark = pytest.mark.training
+pytestmark = pytest.mark.long
 LINE = ("--set", "task.length_m=[0.4,0.5]", "--set", "task.hold_s=0.2", "--set", "task.lead_s=0.2")
 
 

@@ -22,7 +22,7 @@ from edp.storage.seals import HASH
 from edp.testing.monitor import rig_sessions
 from edp.testing.twins import sample_actuators
 
-pytestmark = [pytest.mark.training, pytest.mark.processes]
+pytestmark = [pytest.mark.long, pytest.mark.processes]
 LINE = ("--set", "task.length_m=[0.4,0.5]", "--set", "task.hold_s=0.2")
 RIG = ("BmUp", "CylVels_1", "CylStroke_1", "CylPressures_1", "CylPressures_5")
 TRIALS = (

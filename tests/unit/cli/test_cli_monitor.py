@@ -20,7 +20,7 @@ from edp.testing.monitor import rig_sessions
 from edp.workflows.monitor import fit_monitor
 from edp.workflows.monitor.run_monitor import RESULT
 
-pytestmark = pytest.mark.training
+pytestmark = pytest.mark.long
 NAMES = ("BmUp", "CylVels_1", "CylStroke_1", "CylPressures_1", "CylPressures_5")
 """Of the rig's channels, so that logs need no map."""
 TICKS = 2000

@@ -11,7 +11,7 @@ from edp.monitor.monitor_file import save_monitor
 from edp.signals import VOCABULARY
 from edp.testing.monitor import rig_sessions
 
-pytestmark = pytest.mark.training
+pytestmark = pytest.mark.long
 NAMES = ("BmUp", "CylVels_1", "CylStroke_1", "CylPressures_1", "CylPressures_5")
 """Of the rig's channels, so that logs need no map."""
 

@@ -98,6 +98,7 @@ def test_a_predictor_whose_inputs_the_plant_lacks_is_refused_before_the_start(bu
         CONTROLLERS["inversion"]().build(bare, LoopLimits(), ControlModels(predictor=bundle))
 
 
+@pytest.mark.long
 def test_a_twin_ahead_is_its_free_run_from_what_is_measured():
     twin = sample_excavator_twin()
     names = [channel.name for channel in twin.channels.answers]

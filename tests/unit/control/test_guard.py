@@ -65,6 +65,7 @@ def looped(name, env, task, models, guard=None, **options):
     return run_loop(env, controller, task, 0, guard=guard)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_a_guard_that_sees_nothing_changes_nothing(name, env, task, models):
     guarded = looped(name, env, task, models, Scripted(TRUSTED))
@@ -83,6 +84,7 @@ class FaultySensors(TwinEnvironment):
         return shown, *rest
 
 
+@pytest.mark.long
 def test_ports_of_channels_that_are_not_trusted_run_free(env, task, models):
     faulty = FaultySensors(env.twin, "M22", 20.0)
     guard = Scripted(GuardVerdict(frozenset(VELOCITIES[:2]), reason="their residuals left the limit"))
@@ -104,6 +106,7 @@ def test_a_guard_cannot_change_what_the_controller_reads(env, task, models):
         looped("pi", env, task, models, Writing(TRUSTED))
 
 
+@pytest.mark.long
 def test_without_strokes_the_plan_goes_on_and_the_pi_loop_cannot(env, task, models):
     untrusted = frozenset({STROKES[1]})
     assert looped("nmpc", env, task, models, Scripted(GuardVerdict(untrusted))).events == ()
@@ -117,6 +120,7 @@ def test_without_strokes_the_plan_goes_on_and_the_pi_loop_cannot(env, task, mode
         assert np.abs(levers[UNTIL + 20 :]).max() > 0.0
 
 
+@pytest.mark.long
 def test_where_a_guard_says_so_the_pi_loop_answers_with_the_levers_it_has_alone(env, task, models):
     class Always(Scripted):
         def step(self, observation):
@@ -134,6 +138,7 @@ def test_where_a_guard_says_so_the_pi_loop_answers_with_the_levers_it_has_alone(
     assert falling.events == ()
 
 
+@pytest.mark.long
 def test_after_a_fallback_the_plan_takes_over_again(env, task, models):
     result = looped("nmpc", env, task, models, Scripted(GuardVerdict(fall_back=True)))
     assert [(event.tick, event.ticks) for event in result.events] == [(FROM, UNTIL - FROM)]
@@ -142,6 +147,7 @@ def test_after_a_fallback_the_plan_takes_over_again(env, task, models):
     assert np.hypot(*end) < 5e-3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "options"), [("inversion", {}), ("nmpc", {"fallback": False})])
 def test_without_a_fallback_levers_go_to_neutral(name, options, env, task, models):
     result = looped(name, env, task, models, Scripted(GuardVerdict(fall_back=True, reason="drift")), **options)

@@ -119,6 +119,7 @@ def monitor(env, models):
     return replace(quiet, chain=replace(chain, limit=2.0 * largest + 5.0))
 
 
+@pytest.mark.long
 def test_a_healthy_loop_is_what_it_is_without_the_monitor(env, models, monitor):
     task = drawn(env, 1)
     result = looped("pi", env, task, models, MonitorGuard(monitor))
@@ -126,6 +127,7 @@ def test_a_healthy_loop_is_what_it_is_without_the_monitor(env, models, monitor):
     assert result.warnings == ()
 
 
+@pytest.mark.long
 def test_with_the_monitor_a_faulty_sensor_harms_the_loop_less(env, models, monitor):
     pytest.importorskip("daqp", reason="the solver is an optional package")
     task, faulty = drawn(env, 1), FaultySensor(env)

@@ -111,6 +111,7 @@ def test_the_inverse_map_is_continuous_and_rises_through_the_dead_band(valves):
     assert inverse.levers(inverse.fastest)[1] == pytest.approx(0.6)
 
 
+@pytest.mark.long
 def test_on_its_own_model_it_follows_within_a_millimetre(env, models):
     plant = interface_of(env)
     task = draw_task(TASKS["grade"](length_m=(0.8, 1.0), speed_m_s=0.3), plant.geometry, plant.rate_hz, 4)
@@ -139,6 +140,7 @@ def test_the_disturbance_is_the_speed_that_the_twin_does_not_know_of(env, twin):
     assert strokes[0, -1, 0] - drifted[stroke] == pytest.approx(0.1 * 0.01, abs=2e-4)
 
 
+@pytest.mark.long
 def test_the_compiled_normal_equations_are_those_of_the_weighted_tip_errors(env, models):
     plant = interface_of(env)
     controller = CONTROLLERS["nmpc"](blocks=(2, 3), along=0.3).build(plant, LoopLimits(), models)
@@ -212,6 +214,7 @@ def test_a_soft_limit_gives_way_where_it_cannot_be_met(env, models):
     assert step == pytest.approx(controller._valves.fastest, rel=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fallback", [True, False])
 def test_without_a_solution_the_pi_loop_answers_or_levers_go_to_neutral(fallback, env, models, monkeypatch):
     plant = interface_of(env)
@@ -236,6 +239,7 @@ def test_predictions_that_are_not_finite_are_a_fault(env, models):
         controller._solved(hessian, np.zeros(18), np.zeros((0, 18)), np.zeros(0), np.zeros(0))
 
 
+@pytest.mark.long
 def test_a_reference_beyond_the_margin_is_kept_away_from_the_stop(env, models):
     plant = interface_of(env)
     full = plant.geometry.full_m
@@ -256,6 +260,7 @@ def test_a_reference_beyond_the_margin_is_kept_away_from_the_stop(env, models):
     assert controller.info["constraints"] > 0
 
 
+@pytest.mark.long
 def test_a_plan_that_ends_before_the_machine_has_answered_is_refused(env, models, valves):
     plant = interface_of(env)
     observation, _ = env.reset(seed=0, options={"strokes": (0.3, 0.5, 0.7)})
@@ -272,6 +277,7 @@ def test_a_plan_that_ends_before_the_machine_has_answered_is_refused(env, models
             check(known, 3, 2)
 
 
+@pytest.mark.long
 def test_the_attitude_counts_more_with_a_twin_that_is_told_of_forces(env, models, valves):
     plant, grey = interface_of(env), ControlModels(valves, sample_grey_box().twin)
 

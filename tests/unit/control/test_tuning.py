@@ -65,6 +65,7 @@ def test_seeds_of_the_judgement_never_reach_those_of_the_tuning(tmp_path):
         tune_gains(experiment, tmp_path / "run", ControlSources(), ControlSources(), TuningSpec(trials=1, loops=1))
 
 
+@pytest.mark.long
 def test_a_stopped_tuning_continues_after_its_last_trial_and_a_finished_one_is_read(tmp_path, monkeypatch):
     made = []
 

@@ -22,6 +22,8 @@ from edp.workflows.pretraining import Pretrain, pretrain
 from edp.workflows.train_evaluate import evaluate
 from edp.workflows.transfer import FinetuneRequest, FinetuneSpec, finetune
 
+pytestmark = pytest.mark.processes
+
 SETTINGS = (
     'split.kind="machines"',
     "task.horizons=[10]",

@@ -16,6 +16,8 @@ from edp.sim import data_set, plan
 from edp.sim.data_set import simulate_data_set
 from edp.storage import replacing
 
+pytestmark = pytest.mark.processes
+
 
 def test_simulated_logs_are_the_same_and_a_stopped_set_goes_on(small_logs, small_order, here, tmp_path):
     seen = []

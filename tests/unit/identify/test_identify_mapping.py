@@ -59,6 +59,7 @@ def other_machine(seed=0):
     return with_values(M22, guesses(M22) * np.exp(0.3 * np.array(shift)))
 
 
+@pytest.mark.long
 def test_numbers_of_a_grey_box_made_from_a_machine_map_back_to_it(parts):
     machine = other_machine()
     tie = MachineTie.of(M22, parts, parts.table.nominal[parts.load])

@@ -59,6 +59,7 @@ def test_a_prediction_stands_at_the_tick_for_which_it_was_made(tiny, run):
         forecast_lines(folder, recording, 7)
 
 
+@pytest.mark.processes
 def test_the_animation_of_a_run_and_a_log_shows_both(tiny, run, tmp_path):
     _, folder = run
     log, page = tmp_path / "log.parquet", tmp_path / "page.html"

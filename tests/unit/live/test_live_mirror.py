@@ -43,6 +43,7 @@ def test_without_the_package_one_error_says_what_to_install(monkeypatch):
         RerunMirror(LiveSession(LAYOUT))
 
 
+@pytest.mark.processes
 def test_a_server_that_does_not_start_is_one_error(monkeypatch, tmp_path: Path):
     program = tmp_path / "rerun"
     program.write_text("#!/bin/sh\n[ $1 = analytics ] && exit 0\necho 'the port \a is taken' >&2\nexit 3\n")

@@ -172,6 +172,7 @@ def test_a_twin_runs_free_beside_the_log_and_begins_anew():
     assert {forecast.ticks for forecast in part.forecasts(7)} == {1}
 
 
+@pytest.mark.long
 def test_alarms_are_those_of_the_monitor_and_nothing_else_is_one():
     monitor = fitted_monitor()
     healthy = rig_sessions(1, 1500, seed=9)[0]
@@ -192,6 +193,7 @@ def test_alarms_are_those_of_the_monitor_and_nothing_else_is_one():
         LiveMonitor(monitor, (Channel("x", Kind.VELOCITY),), faulty.rate_hz, lambda *event: None)
 
 
+@pytest.mark.long
 def test_the_simulator_works_on_and_its_operator_sees_what_the_batch_simulation_shows():
     live = run_of(SimSource("M22", 100.0, 3))
     thread = threading.Thread(target=live.play)
@@ -226,6 +228,7 @@ def test_the_simulator_works_on_and_its_operator_sees_what_the_batch_simulation_
         SimSource("M22", 100.0, settings={"excitation": ground})
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("twin_as_plant", [False, True])
 def test_a_loop_is_shown_with_reference_and_levers(twin_as_plant, tmp_path):
     settings: dict[str, object] = {"controller": "pi"}

@@ -28,6 +28,8 @@ from edp.signals import Channel, Kind
 from edp.testing.monitor import rig_sessions
 from edp.workflows.monitor import report_monitor, run_monitor
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.fixture(scope="module")
 def monitor():

@@ -87,7 +87,7 @@ def monitor(machine_logs):
     return fit_to_recordings(machine_logs, load_monitor_experiment(None, (), options)).monitor
 
 
-@pytest.mark.training
+@pytest.mark.long
 def test_a_monitor_of_a_known_machine_has_a_dictionary_that_comes_back(monitor, machine_logs, tmp_path):
     known = monitor.diagnosis
     assert {fault.kind for fault in known.classes} == set(KINDS)
@@ -98,7 +98,7 @@ def test_a_monitor_of_a_known_machine_has_a_dictionary_that_comes_back(monitor, 
     assert load_monitor(save_monitor(replace(monitor, diagnosis=None), tmp_path / "m")).diagnosis is None
 
 
-@pytest.mark.training
+@pytest.mark.long
 def test_an_alarm_is_named_in_batch_and_in_a_stream(monitor):
     recording = simulate(Scenario(duration_s=60.0, seed=300, faults=["velocity_bias:boom:10mm/s@30s"]))
     alarms = [alarm for alarm in monitor.watch(recording).alarms if alarm.raised_s > 30.0]
@@ -112,7 +112,7 @@ def test_an_alarm_is_named_in_batch_and_in_a_stream(monitor):
     assert all(alarm.causes for alarm in raised)
 
 
-@pytest.mark.training
+@pytest.mark.long
 def test_another_machine_without_the_channels_is_refused(fitted, healthy):
     with pytest.raises(ConfigError, match="has none of the monitor's channels"):
         build_dictionary(fitted.monitor, healthy, "M22", DictionarySpec())

@@ -9,6 +9,8 @@ from edp.monitor.alarms import MonitorAlarm
 from edp.testing.monitor import rig_sessions
 from edp.workflows.monitor.event_files import write_event_files
 
+pytestmark = pytest.mark.processes
+
 asammdf = pytest.importorskip("asammdf", reason="needs the package asammdf: the extra mdf has it")
 
 

@@ -15,6 +15,8 @@ from edp.recording import Recording
 from edp.sim import Scenario, simulate
 from edp.wording import figure
 
+pytestmark = pytest.mark.long
+
 SPEC = FlowBalancesSpec(trials=40, rows=20_000)
 
 

@@ -20,6 +20,8 @@ from edp.workflows.monitor.fit_monitor import _healthy_sessions
 
 from .conftest import EXPERIMENT, TICKS
 
+pytestmark = pytest.mark.long
+
 
 def with_bias(recording: Recording, channel: str, size: float, onset: int) -> Recording:
     values = recording.values.copy()

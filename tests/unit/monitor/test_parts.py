@@ -103,6 +103,7 @@ def test_a_temperature_that_jumps_is_seen_and_a_slow_one_is_not():
     assert residual[5990:].mean() < 2.0
 
 
+@pytest.mark.long
 def test_without_a_run_a_look_ahead_network_is_trained():
     sessions = rig_sessions(5, 800, seed=2)
     material = FitMaterial(sessions[:4], sessions[4:], sessions[0].channels, 100.0, minutes=0.02)

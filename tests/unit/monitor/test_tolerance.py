@@ -61,6 +61,7 @@ def alarms(chain, off: float) -> int:
     return count
 
 
+@pytest.mark.long
 def test_a_sister_within_the_tolerance_raises_few_alarms_and_a_stranger_many(chains):
     assert alarms(chains[0.0], 0.02) >= 8
     assert alarms(chains[0.02], 0.015) <= 2

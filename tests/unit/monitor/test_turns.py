@@ -28,6 +28,7 @@ def places(source):
     return np.repeat(np.arange(len(source.bundles)) % EVERY, [len(b.task.targets) for b in source.bundles.values()])
 
 
+@pytest.mark.long
 def test_networks_run_at_the_slower_rate_one_after_the_other(source, sessions):
     assert {bundle.task.rate_hz for bundle in source.bundles.values()} == {100.0 / EVERY}
     # Both spans of less than a run and of two of them.

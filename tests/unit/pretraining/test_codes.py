@@ -19,6 +19,8 @@ from edp.training.pretraining.methods.codes import WithCodes, coded_block
 from edp.workflows.pretraining import Pretrain, pretrain
 from edp.workflows.transfer import FinetuneRequest, FinetuneSpec, finetune
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.fixture(scope="module")
 def fleet(machines, experiment, tmp_path_factory):

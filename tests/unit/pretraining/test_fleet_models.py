@@ -30,6 +30,8 @@ from edp.workflows.fleet.registry import (
 from edp.workflows.pretraining import Pretrain, pretrain
 from edp.workflows.transfer import FinetuneSpec
 
+pytestmark = pytest.mark.processes
+
 HERE = Workers()
 ORDER = PersonalOrder(spec=FinetuneSpec(rounds=3, batch=4, rate=2e-2, patience=0, check_signs=False))
 

@@ -27,6 +27,8 @@ from edp.workflows.pretraining import PRETRAININGS, MetaSpec, Pretrain, pretrain
 from edp.workflows.train_evaluate import evaluate
 from edp.workflows.transfer import FinetuneRequest, FinetuneSpec, finetune
 
+pytestmark = pytest.mark.processes
+
 META = MetaSpec(inner_rate=0.1, inner_steps=2, shots=2)
 
 

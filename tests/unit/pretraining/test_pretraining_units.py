@@ -1,9 +1,13 @@
 """A pretraining as a unit of work leaves the run that this process reads."""
 
+import pytest
+
 from edp.jobs.workers import IN_PROCESS, WorkUnit
 from edp.training import load_bundle
 from edp.training.bundle import weights_digest
 from edp.workflows.pretraining import Pretrain, pretrain
+
+pytestmark = pytest.mark.processes
 
 
 def test_a_pretraining_elsewhere_is_that_of_this_process(machines, experiment, tmp_path):

@@ -12,6 +12,8 @@ import pytest
 from edp.logs import inspect_log
 from edp.workflows.proposal import LogsProposal, propose
 
+pytestmark = pytest.mark.processes
+
 
 def swing(count: int, period: float = 90.0) -> np.ndarray:
     return np.sin(np.arange(count) * 2 * np.pi / period) + 0.1 * np.sin(np.arange(count) * 2 * np.pi / 17)

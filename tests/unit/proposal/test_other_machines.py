@@ -19,6 +19,8 @@ from edp.recording import Recording
 from edp.signals import Channel, ChannelMap, Kind, SignalMap
 from edp.workflows.proposal import LogsProposal, propose
 
+pytestmark = pytest.mark.processes
+
 COUNT = 1500
 TIME = np.arange(COUNT) / 100
 SWING = np.sin(np.arange(COUNT) / 30) + 0.2 * np.sin(np.arange(COUNT) / 7)

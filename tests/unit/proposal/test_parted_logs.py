@@ -15,6 +15,8 @@ from edp.logs.source import DataSource
 from edp.signals import SignalMap
 from edp.workflows.proposal import propose, write_proposal
 
+pytestmark = pytest.mark.processes
+
 ALL = SignalMap(others=True)
 
 

@@ -28,6 +28,8 @@ from edp.workflows.auto import load_auto
 from edp.workflows.proposal import LogsProposal, propose, write_proposal
 from edp.workflows.proposal.files import DATA, MAP, SETTINGS, horizons_for
 
+pytestmark = pytest.mark.processes
+
 Rows = dict[str, np.ndarray]
 
 

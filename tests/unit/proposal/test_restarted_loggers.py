@@ -14,6 +14,8 @@ from edp.logs.source import DataSource
 from edp.signals import SignalMap
 from edp.workflows.proposal import propose
 
+pytestmark = pytest.mark.processes
+
 NAMES = "t,x1,y1,s_boom,s_arm,v_boom,v_arm"
 WHOLE = SignalMap(others=True, time="t", time_unit="ms")
 

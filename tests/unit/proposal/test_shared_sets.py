@@ -12,7 +12,7 @@ from edp.workflows.proposal import propose
 from edp.workflows.proposal.files import MAP, SETTINGS
 
 ROOT = Path(os.environ.get("EDP_SHARED_DATA") or Path(__file__).parents[3].parent / "shared" / "data")
-pytestmark = pytest.mark.shared_data
+pytestmark = [pytest.mark.processes, pytest.mark.shared_data]
 
 NUMBERS = ("generic", "1")
 BAR, CELSIUS, FLOW, SHARE = ("pressure", "bar"), ("temperature", "degC"), ("flow", "L/min"), ("ratio", "%")

@@ -16,6 +16,8 @@ from edp.signals import SignalMap
 from edp.workflows.proposal import LogsProposal, propose, write_proposal
 from edp.workflows.proposal.files import DATA, MAP
 
+pytestmark = pytest.mark.processes
+
 HEADER = "Time,lever_cmd,place_ms\n"
 
 

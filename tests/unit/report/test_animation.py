@@ -20,6 +20,8 @@ from edp.report.animation.page import scene_of, write_animation
 from edp.report.animation.raster import Image
 from edp.sim import Scenario, simulate
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.fixture(scope="module")
 def recording():
@@ -117,6 +119,5 @@ def test_the_command(recording, tmp_path):
     assert ".mp4" in str(wrong.exception)
 
 
-@pytest.mark.processes
 def test_the_page_in_a_browser(browser, recording, tmp_path):
     check_page(browser, write_animation(scene_of(recording), tmp_path / "film.html"), "side view")

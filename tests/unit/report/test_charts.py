@@ -36,6 +36,7 @@ def test_every_kind_of_mark_is_tried():
     assert {type(mark) for mark in MARKS} == set(Mark.__subclasses__())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mark", MARKS, ids=lambda mark: type(mark).__name__)
 def test_a_mark_is_drawn_on_a_page_and_into_a_file(mark, tmp_path):
     chart = Chart("one", (Panel((mark,), ChartAxis("x"), ChartAxis("y")),), file="one", inches=(2.0, 1.5))

@@ -227,6 +227,7 @@ def test_names_stay_text(pair):
     assert page.count("<script>") == 2
 
 
+@pytest.mark.long
 def test_the_command_prints_tables_and_writes_the_page(pair, tmp_path):
     page = tmp_path / "out" / "compare.html"
     result = CliRunner().invoke(app, ["compare", *map(str, pair), "--out", str(page)])

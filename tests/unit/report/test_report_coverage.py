@@ -16,6 +16,8 @@ from edp.report.coverage.charts import coverage_charts
 from edp.report.coverage.page import headline, verdict
 from edp.signals import EXTRA_CHANNELS, TABLE_A1, VOCABULARY, Channel, Kind
 
+pytestmark = pytest.mark.long
+
 
 def machine_like(names=(*TABLE_A1, *EXTRA_CHANNELS), samples=4000):
     rng = np.random.default_rng(0)

@@ -13,6 +13,8 @@ from edp.report.run.page import build_run_page
 from edp.report.run.tables import comparison_tables
 from edp.storage import write_json
 
+pytestmark = pytest.mark.long
+
 OWN = ("Boom cylinder", "Stick cylinder", "Bucket cylinder", "Cylinder velocities", "excavator")
 """Names of parts in the data of the run that `conftest.py` writes."""
 LOADS = {"src", "href", "srcset", "data", "poster", "action", "formaction", "background"}

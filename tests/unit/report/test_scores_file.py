@@ -11,6 +11,8 @@ from edp.report.run.facts import read_facts
 from edp.report.run.page import build_run_page
 from edp.storage import write_json
 
+pytestmark = pytest.mark.long
+
 OTHERS = (None, 10**400, "x", {"x": 5}, {"10": None})
 """What a value may be changed to."""
 

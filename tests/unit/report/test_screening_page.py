@@ -29,6 +29,8 @@ from edp.report.screening.charts import screening_charts
 from edp.report.screening.page import headline, sentence, verdict
 from edp.report.screening.views import lag_ranges, lag_views, matrix_views, stability_views
 
+pytestmark = pytest.mark.long
+
 NAMES = ("v", "u<b>", "late", "noise")
 LAGS = np.arange(-20, 21)
 
@@ -195,6 +197,7 @@ def test_a_screening_of_many_channels_stays_readable_and_small():
     assert len(text) < 8_000_000
 
 
+@pytest.mark.processes
 def test_nothing_but_a_proposal_is_a_page_too():
     found = screening()
     bare = replace(found, lags=(), stability=(), importance=(), values=(), clusters=(), flags=())

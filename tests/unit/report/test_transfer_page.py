@@ -12,6 +12,8 @@ from edp.report.transfer import facts as transfer_facts
 from edp.report.transfer.page import build_transfer_page
 from edp.storage import write_json
 
+pytestmark = pytest.mark.long
+
 EVIL = "</script><script>alert(1)</script><b>&"
 PRINTED = {
     "direct": [(78, 6.6, 0.7862, 16.2, 28.1), (167, 8.3, 0.9476, 27.0, 51.9), (236, 9.1, 0.9097, 32.1, 51.7)],

@@ -18,6 +18,8 @@ from edp.data.screening.spec import ScreeningSpec
 from edp.data.screening.table import CandidateTable, Piece, build_table
 from edp.data.screening.values import _correlations, _Model
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def sample() -> np.ndarray:

@@ -10,6 +10,8 @@ from edp.data.screening import FlagKind, ForestSpec, ScreeningResult, ScreeningS
 from edp.errors import ConfigError, DataError
 from edp.recording import Recording
 
+pytestmark = pytest.mark.long
+
 SPEC = ScreeningSpec(
     trusted=("lever_a", "lever_b", "pressure"),
     max_lag=60,

@@ -20,6 +20,8 @@ from edp.storage.ledger import Ledger, TrainingStatus, read_state
 from edp.workflows.search.plan import load_plan
 from edp.workflows.search.runner import Resources, run_search
 
+pytestmark = pytest.mark.processes
+
 CHANGES = (
     'task={targets=["speed"], horizons=[1]}',
     'model={backbone={kind="lstm", units=4}, window=5, head={hidden=4}}',

@@ -8,7 +8,11 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
 from edp.storage.ledger import Ledger, read_records
+
+pytestmark = pytest.mark.processes
 
 STUDY = """
 import sys

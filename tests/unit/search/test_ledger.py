@@ -29,6 +29,8 @@ from edp.storage.ledger import (
 )
 from edp.storage.provenance import environment
 
+pytestmark = pytest.mark.processes
+
 
 class Mode(StrEnum):
     DELTA = "delta"

@@ -13,6 +13,8 @@ from edp.jobs.base import complete
 from edp.jobs.processes import LocalPool
 from edp.storage.ledger import Ledger, TrainingStatus, claim, leave_arrival
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.fixture(scope="module")
 def pool():

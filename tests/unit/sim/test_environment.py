@@ -329,6 +329,7 @@ def test_the_simulator_needs_no_gymnasium():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+@pytest.mark.long
 def test_the_page_runs_as_it_stands():
     page = (Path(__file__).parents[3] / "docs" / "environment.md").read_text(encoding="utf-8")
     blocks_of_page = re.findall(r"```python\n(.*?)```", page, re.DOTALL)

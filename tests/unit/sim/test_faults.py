@@ -90,6 +90,7 @@ def test_hostile_texts_are_refused_in_one_line(text, words):
     assert len(str(refused.value)) < 1200
 
 
+@pytest.mark.long
 @given(st.one_of(st.text(), st.from_regex(r"[a-z_]{1,20}(:[a-z_]{0,9}){0,2}(:[0-9.e+-]{0,6}[A-Za-z%/]{0,5})?(@.*)?")))
 def test_any_text_is_a_fault_or_one_error(text):
     with contextlib.suppress(ConfigError):

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
+pytestmark = pytest.mark.long
+
 FOLDER = Path(__file__).parents[3] / "benchmarks"
 STUDIES = 80
 

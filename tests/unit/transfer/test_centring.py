@@ -18,6 +18,8 @@ from edp.training.transfer.centring import DEAREST, centre
 from edp.workflows.transfer import FinetuneRequest, finetune
 from edp.workflows.transfer.source import read_source
 
+pytestmark = pytest.mark.processes
+
 
 def errors(net, series):
     """Errors after a whole window, one array a horizon, computed apart from the code that is tested."""

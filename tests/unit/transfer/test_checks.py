@@ -13,6 +13,8 @@ from edp.training.transfer.checks import CONVENTION, PilotPair, check_signs, che
 from edp.workflows.transfer import FinetuneRequest, finetune
 from edp.workflows.transfer.source import read_source
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.fixture
 def refused(run, small, written, tmp_path):

@@ -33,6 +33,8 @@ from edp.workflows.transfer.case import tuned as tuning
 from edp.workflows.transfer.scores import errors_of, measure, skew
 from edp.workflows.transfer.source import read_source, target_experiment, task_settings
 
+pytestmark = pytest.mark.processes
+
 UPDATES = ("training.updates=25",)
 BUFFERS = ("front.offset", "front.width", "code.offset", "code.width")
 

@@ -16,6 +16,8 @@ from edp.workflows import train_evaluate
 from edp.workflows.train_evaluate import evaluate, trained_run
 from edp.workflows.transfer import FinetuneRequest, finetune
 
+pytestmark = pytest.mark.processes
+
 
 def without_times(value):
     """A table without what differs from repeat to repeat."""
@@ -24,7 +26,6 @@ def without_times(value):
     return [without_times(part) for part in value] if isinstance(value, list) else value
 
 
-@pytest.mark.processes
 def test_methods_trained_apart_are_judged_as_if_trained_here(run, target, small, tmp_path):
     order = FinetuneRequest(spec=small, method="full", baselines=("low_rank", "ridge_arx"))
     there = finetune(run, target, order, tmp_path / "there", workers=Workers(count=2)).to_table()
@@ -35,7 +36,6 @@ def test_methods_trained_apart_are_judged_as_if_trained_here(run, target, small,
     assert not (tmp_path / "no").exists()
 
 
-@pytest.mark.processes
 def test_models_run_apart_have_the_scores_of_one_process(run, target, tmp_path):
     shutil.copytree(run, tmp_path / "run")
     names = ("persistence", "ridge_arx", "small_mlp")

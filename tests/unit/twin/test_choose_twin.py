@@ -49,6 +49,7 @@ def run(tmp_path):
         yield folder
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("least_gain", "kept"), [(0.0, "n4sid"), (0.2, "arx"), (0.5, "static")])
 def test_the_simplest_candidate_that_is_as_good_as_the_best_is_kept(run, monkeypatch, least_gain, kept):
     errors = iter([1.0, 0.7, 0.6])
@@ -60,6 +61,7 @@ def test_the_simplest_candidate_that_is_as_good_as_the_best_is_kept(run, monkeyp
     assert result.facts == {"chosen": kept, "folds": 2}
 
 
+@pytest.mark.long
 def test_errors_are_those_of_the_static_map_and_of_free_runs(run, monkeypatch):
     monkeypatch.setattr(choose_twin, "FAR_BEHIND", 1e9)
     _, tried = choice(run, candidates=("static", "arx")).best()
@@ -97,7 +99,7 @@ def judged_by(monkeypatch, errors, behind=1.0):
     return trained
 
 
-@pytest.mark.training
+@pytest.mark.long
 def test_trainings_get_longer_as_long_as_that_helps_and_the_twin_is_the_average_over_the_folds(run, monkeypatch):
     errors = {(True, 1): 0.9, (False, 1): 0.8, (True, 3): 0.85, (False, 3): 0.6, (False, 9): 0.595}
     trained = judged_by(monkeypatch, errors)
@@ -112,7 +114,7 @@ def test_trainings_get_longer_as_long_as_that_helps_and_the_twin_is_the_average_
     assert len(result.unseen) == 5
 
 
-@pytest.mark.training
+@pytest.mark.long
 def test_a_training_far_behind_the_best_one_is_given_up_after_two_folds(run, monkeypatch):
     errors = {(True, 1): 0.9, (True, 3): 0.95}
     trained = judged_by(monkeypatch, errors, behind=1.6)
@@ -135,7 +137,7 @@ def test_a_training_far_behind_the_best_one_is_given_up_after_two_folds(run, mon
     assert "given up after 2 of 5 folds" in tried[-1].why
 
 
-@pytest.mark.training
+@pytest.mark.long
 def test_trainings_that_a_budget_has_no_time_for_are_left_out(run, monkeypatch):
     errors = {(True, 1): 0.9, (False, 1): 0.8, (True, 3): 0.85, (False, 3): 0.6}
     trained = judged_by(monkeypatch, errors)
@@ -178,7 +180,7 @@ def test_every_tick_that_may_be_learned_from_is_left_out_by_one_fit_and_the_twin
         np.testing.assert_array_equal(result.unseen[2][0].arrays()[name], values)
 
 
-@pytest.mark.training
+@pytest.mark.long
 def test_long_recordings_are_judged_by_the_validation_part_and_have_one_wide_network(run, monkeypatch):
     monkeypatch.setattr(choose_twin, "LONG_TICKS", 1)
     one = choice(run, candidates=("static", "recurrent"), least_gain=0.0)
@@ -199,6 +201,7 @@ def test_what_is_too_short_for_folds_keeps_the_division_of_the_settings(run, aut
     assert [fold.validation for fold in one.folds] == [one.fit.data.validation]
 
 
+@pytest.mark.long
 def test_a_training_that_diverges_leaves_the_other_forms_in(run, monkeypatch):
     plain_fit = free_run_members.fit_free_runs
 
@@ -224,7 +227,7 @@ class Stop(Exception):
     """Raised in place of Ctrl-C."""
 
 
-@pytest.mark.training
+@pytest.mark.long
 def test_a_stopped_choice_goes_on_to_the_same_bits(tmp_path):
     training = replace(TINY, updates=(40,))
 
@@ -317,7 +320,7 @@ def test_an_untrained_network_on_a_static_map_that_changes_nothing_is_the_map():
     np.testing.assert_allclose(runs[0], runs[1], atol=1e-5)
 
 
-@pytest.mark.training
+@pytest.mark.long
 def test_members_have_seeds_of_their_own_and_the_first_one_that_of_the_training():
     channels, series = sample_series(4)
     scales = fit_scales(channels, series[:3])
@@ -358,7 +361,7 @@ def test_settings_that_cannot_be_are_refused(change, message):
         load_twin_experiment(None, [change])
 
 
-@pytest.mark.training
+@pytest.mark.long
 def test_trainings_side_by_side_note_how_far_they_are(run):
     channels, series = sample_series(2)
     scales = fit_scales(channels, series)
@@ -417,6 +420,7 @@ def test_known_elements_are_one_more_candidate_before_the_networks(candidates, t
     assert AutoTwin(candidates=candidates, elements=AXES).tried == tried
 
 
+@pytest.mark.long
 def test_known_elements_are_fitted_without_each_fold_and_at_last_to_everything(run, monkeypatch):
     recordings = [sample_actuators(seed=seed, pressures=False) for seed in range(6)]
     fits = []

@@ -20,6 +20,8 @@ from edp.testing.twins import sample_actuators, sample_twin
 from edp.training.twin_bundle import load_twin, twin_hash
 from edp.workflows.twin import continue_twin, train_twin
 
+pytestmark = pytest.mark.processes
+
 SPEC = ("twin.kind=recurrent", "twin.units=6", "twin.members=2", "twin.prefix_ticks=20")
 SETTINGS = (
     *("training.lanes=4", "training.lengths_s=[0.2]", "training.updates=[20]", "training.validate_every=10"),

@@ -16,6 +16,8 @@ from edp.training.twin_bundle import TwinBundle, save_twin
 from edp.workflows.identify import identify
 from edp.workflows.twin import choose_twin, continue_twin, fit_twin, train_twin
 
+pytestmark = pytest.mark.processes
+
 ASTRAY = 1e3
 """Metres by which strokes of a part are moved."""
 

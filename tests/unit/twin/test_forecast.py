@@ -100,6 +100,7 @@ def test_a_start_beyond_an_end_stop_waits_for_one_within(machine):
         forecast(twin, commands, far, AHEAD)
 
 
+@pytest.mark.long
 def test_far_horizons_take_no_more_memory(machine, monkeypatch):
     twin, commands, measured = machine
     blocks = []

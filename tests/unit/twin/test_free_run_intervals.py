@@ -26,6 +26,7 @@ def wandering(runs, rng):
     return size * np.stack([steps[..., 0].cumsum(axis=1), steps[..., 1], rng.standard_t(3, (runs, TICKS))], axis=2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("coverage", [0.5, 0.9])
 def test_fresh_runs_lie_in_them_as_often_as_promised_at_each_horizon(coverage):
     rng = np.random.default_rng(0)

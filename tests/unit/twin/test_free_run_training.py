@@ -28,7 +28,7 @@ def fitted(data, **changes):
     return fit_free_runs(twin, train, validation, FreeRunSpec(**{**SMALL, **changes}))
 
 
-@pytest.mark.training
+@pytest.mark.long
 def test_free_runs_are_learned_far_better_than_the_static_map(data):
     channels, scales, train, _, test = data
     result = fitted(data, validate_every=25, patience=0)
@@ -42,7 +42,7 @@ def test_free_runs_are_learned_far_better_than_the_static_map(data):
     assert result.history[-1]["validation"] < 0.4 * result.history[0]["validation"]
 
 
-@pytest.mark.training
+@pytest.mark.long
 def test_a_seed_settles_every_bit_and_another_one_changes_them(data):
     short = {"lengths_s": (0.2,), "updates": (20,), "validate_every": 10}
     first, again, other = (fitted(data, seed=seed, **short).twin.arrays() for seed in (0, 0, 1))
@@ -54,7 +54,7 @@ class Stop(Exception):
     """Raised in place of Ctrl-C."""
 
 
-@pytest.mark.training
+@pytest.mark.long
 @pytest.mark.parametrize("optimizer", [AdamW(learning_rate=1e-2), Soap()], ids=["adamw", "soap"])
 def test_a_stopped_training_goes_on_to_the_same_bits(data, tmp_path, optimizer):
     channels, scales, train, validation, _ = data
@@ -150,7 +150,7 @@ def test_recordings_that_are_too_short_are_refused(data):
         FreeRunSampler(twin, train, 1000)
 
 
-@pytest.mark.training
+@pytest.mark.long
 def test_a_gradient_that_is_not_finite_ends_the_training(data):
     with pytest.raises(FreeRunDiverged, match=r"the gradient of update \d+ is not finite; lower"):
         fitted(data, optimizer=AdamW(learning_rate=1e38), clip=1e6)

@@ -76,6 +76,7 @@ def errors(twin, numbers, series, starts, full, ticks=8):
     return normal
 
 
+@pytest.mark.long
 def test_tangents_are_those_of_differences(bench):
     machine, runs = bench
     table = machine.table
@@ -111,6 +112,7 @@ def test_oil_holds_a_load_behind_closed_spools_and_moves_it_behind_open_ones(ben
     assert moved[-0.8] < -0.1
 
 
+@pytest.mark.long
 def test_a_fit_finds_a_machine_again(bench):
     machine, runs = bench
     table = machine.table
@@ -155,6 +157,7 @@ def test_finer_opening_curves_answer_as_the_coarser_ones_they_were_made_of(bench
         replace(BENCH, stretches=7)
 
 
+@pytest.mark.long
 def test_free_runs_choose_how_many_stretches_an_opening_curve_has(bench):
     """A machine whose curves bend within the coarse stretches is fitted better by the finer ones."""
     machine, runs = bench
@@ -180,6 +183,7 @@ def test_free_runs_choose_how_many_stretches_an_opening_curve_has(bench):
     assert {"into_extend_5", "into_extend_17.5", "into_extend_100"} <= names
 
 
+@pytest.mark.long
 def test_a_curve_that_gains_too_little_stays_coarse(bench, monkeypatch):
     machine, runs = bench
     monkeypatch.setattr(grey_fit, "LEAST_GAIN", 1.0)
@@ -210,6 +214,7 @@ def test_a_bundle_that_names_no_stretches_has_five(bench, tmp_path):
     np.testing.assert_array_equal(again.numbers, finer.numbers.astype(np.float32))
 
 
+@pytest.mark.long
 def test_what_is_left_out_does_nothing_and_is_not_fitted(bench):
     machine, runs = bench
     parts = ("power_limit", "cushions", "play")

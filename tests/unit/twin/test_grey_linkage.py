@@ -144,6 +144,7 @@ def runs(twin):
     return made
 
 
+@pytest.mark.long
 def test_tangents_are_those_of_differences_with_a_linkage(twin, runs):
     table, rng = twin.table, np.random.default_rng(1)
     moved = np.exp(rng.normal(0, 0.1, len(twin.numbers)))

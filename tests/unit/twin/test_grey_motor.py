@@ -82,6 +82,7 @@ def loss(twin, numbers, commands, truth, columns):
     return normal[2].sum(), normal[1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("by_angle", [False, True])
 def test_tangents_are_those_of_differences_with_a_motor(by_angle):
     twin, commands = arm(replace(ARM, motors=(replace(SWING, load_by_angle=by_angle),)))
@@ -218,7 +219,7 @@ def free_errors(twin, log, ticks=300):
     return np.abs(answers - truth[:, prefix + 1 :]).mean(axis=(0, 1))
 
 
-@pytest.mark.training
+@pytest.mark.long
 def test_a_motor_that_was_simulated_otherwise_is_found():
     """Displacement told: then inertia and supply are within 5 %, and free runs far better than the map's."""
     logs = [motor_log(seed) for seed in range(5)]

@@ -25,6 +25,8 @@ from edp.workflows.deployment import load_exported
 from edp.workflows.twin import train_twin
 from edp.workflows.twin.ground_twin import JUDGED
 
+pytestmark = pytest.mark.processes
+
 GROUND = ("ground=drag", "judge.floors=[]")
 
 

@@ -78,6 +78,7 @@ def test_the_filter_predicts_better_than_the_free_run_where_noise_moves_the_syst
     assert gain[0, 0] == pytest.approx(a * p / (p + r), rel=0.02)
 
 
+@pytest.mark.long
 def test_the_order_is_that_of_the_system():
     series = recordings(count=6, noise=0.05)
     twin = N4sid(orders=(1, 2, 4)).start(CHANNELS, fit_scales(CHANNELS, series), series, 0)

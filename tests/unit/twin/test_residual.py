@@ -120,7 +120,7 @@ def test_untrained_it_is_its_grey_box_to_the_bit():
     assert not np.array_equal(other.rollout(commands[:, prefix:], state)[0], answers[1])
 
 
-@pytest.mark.training
+@pytest.mark.long
 def test_a_network_learns_what_the_equations_lack_and_is_kept(machine):
     twin, runs = machine
     lame = twin.numbers.copy()
@@ -144,6 +144,7 @@ def test_a_network_learns_what_the_equations_lack_and_is_kept(machine):
     np.testing.assert_array_equal(fit.twin.numbers, start.numbers)
 
 
+@pytest.mark.long
 def test_a_network_that_does_not_help_is_not_kept(machine):
     twin, runs = machine
     # The grey box is the machine itself, and a network that was drawn at random has two updates to unlearn.

@@ -38,6 +38,7 @@ def followed(tuned, levers, measured):
     return tuned
 
 
+@pytest.mark.long
 def test_it_finds_a_wider_dead_band_and_forecasts_with_it(bench):
     twin, levers, measured = bench
     tuned = followed(TunedTwin(twin, BAND), levers[:-K], measured[:-K])
@@ -96,6 +97,7 @@ def corrected(correction, levers, measured, predictions):
     return np.stack([correction.step(lever, row, one[None]) for lever, row, one in rows])[:, 0]
 
 
+@pytest.mark.long
 def test_predictions_move_to_what_is_better_and_stay_where_nothing_is(bench):
     twin, levers, measured = bench
     limit = np.full((1, 1), 0.5)

@@ -11,7 +11,6 @@ from edp.errors import ConfigError
 from edp.signals import KINDS, Channel
 from edp.sim.environment.library import gymnasium
 from edp.sim.environment.model import NominalMachine
-from edp.sim.environment.rehearsal import rehearse_episodes
 from edp.sim.environment.spec import EnvironmentSpec, settings_of
 from edp.sim.environment.start import MOST_SEED, checked_seed, episode_start
 from edp.sim.environment.truth import Truth
@@ -52,7 +51,6 @@ class ExcavatorEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         if render_mode is not None:
             raise ConfigError(f"environment: render_mode = {render_mode!r}; there is nothing to render, leave it out")
         self.settings = settings_of(settings, changes)
-        rehearse_episodes()
         self.channels: tuple[Channel, ...] = self.settings.channels
         self.rate_hz, self.render_mode = self.settings.rate_hz, None
         self.observation_space, self.action_space = spaces(self.channels)

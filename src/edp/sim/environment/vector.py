@@ -13,7 +13,6 @@ from edp.settings.bounds import shown
 from edp.signals import Channel
 from edp.sim.environment.library import gymnasium
 from edp.sim.environment.model import NominalMachine
-from edp.sim.environment.rehearsal import rehearse_episodes
 from edp.sim.environment.single import spaces
 from edp.sim.environment.spec import EnvironmentSpec, settings_of
 from edp.sim.environment.start import MOST_SEED, checked_mask, checked_seed, episode_start
@@ -67,7 +66,6 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
             modes = ", ".join(entry.value for entry in AutoresetMode)
             raise ConfigError(f"environment: autoreset_mode = {autoreset_mode!r}; choose one of {modes}") from error
         self.metadata = {"render_modes": [], "autoreset_mode": mode}
-        rehearse_episodes()
         self.channels: tuple[Channel, ...] = self.settings[0].channels
         self.rate_hz, self.render_mode = self.settings[0].rate_hz, None
         self.single_observation_space, self.single_action_space = spaces(self.channels)

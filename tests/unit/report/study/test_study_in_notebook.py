@@ -8,6 +8,8 @@ import pytest
 import edp
 from edp.errors import ConfigError, StorageError
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture
 def folder(tmp_path, sound):

@@ -20,6 +20,8 @@ from edp.report.search.views import PointView, arm_views, forests, front, point_
 from edp.report.search.words import caveats, decided, headline, missing, tiles, verdict
 from edp.workflows.search.modules import MODULES
 
+pytestmark = pytest.mark.long
+
 PHASES = (
     "isolation",
     "calibration",
