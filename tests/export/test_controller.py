@@ -108,15 +108,19 @@ def test_the_solver_leaves_with_its_licence(exported_plan):
     assert "Arnstr" in text
 
 
-def test_a_loop_on_the_simulator_is_as_good_as_that_of_the_controller_in_python(exported_plan, kept, env, task):
+def test_loops_on_the_simulator_are_as_good_as_those_of_the_controller_in_python(exported_plan, kept, env):
     python = built(kept)
     ours = Compiled(exported_plan.library, python.plant, python.reads)
-    expected, found = (run_loop(env, controller, task, 3) for controller in (python, ours))
-    # Whole loops part: rounding decides when a lever leaves a dead band, in Python as well.
-    assert found.score.position_rms_mm == pytest.approx(expected.score.position_rms_mm, rel=0.15, abs=0.5)
-    assert found.score.path_rms_mm == pytest.approx(expected.score.path_rms_mm, rel=0.15, abs=0.5)
+    tasks = {seed: draw_task(kept.experiment.task, interface_of(env).geometry, 100.0, seed) for seed in range(1, 5)}
+    expected, found = (
+        [run_loop(env, controller, task, seed).score for seed, task in tasks.items()] for controller in (python, ours)
+    )
+    # Single loops part by up to a quarter: rounding decides when a lever leaves a dead band, in Python as well.
+    for error in ("position_rms_mm", "path_rms_mm"):
+        means = [np.mean([getattr(score, error) for score in scores]) for scores in (expected, found)]
+        assert means[1] == pytest.approx(means[0], rel=0.15)
     assert set(ours.statuses) == {OK}
-    assert sum(found.score.violations.values()) == 0
+    assert sum(sum(score.violations.values()) for score in found) == 0
 
 
 def test_a_pi_loop_on_the_simulator_is_that_of_the_controller_in_python(exported_loop):

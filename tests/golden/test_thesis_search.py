@@ -16,7 +16,7 @@ from edp.workflows.search.modules import THESIS_MODULES, TOGGLES, fitting
 from edp.workflows.search.phases import PHASES
 from edp.workflows.search.phases.isolation import arm_settings
 from edp.workflows.search.plan import load_plan
-from edp.workflows.search.settings import SearchSpec
+from edp.workflows.search.settings import CalibrationSpec, ExplorationSpec, ScreeningSpec, SearchSpec, SynthesisSpec
 from edp.workflows.search.space import Choice, Real, apply, elastic, halved
 from edp.workflows.search.trainings import SCORES, Outcome, costs_of, settings_of
 
@@ -188,13 +188,19 @@ def test_the_percentages_of_table_4_6_say_how_many_trials_there_were():
     assert denominators("0.0 76.5 23.5")[0] == 17
     assert denominators("68.3 29.3 40.2 79.3 73.2 20.7 14.6 51.2 35.4")[0] == 82
     assert denominators("83.0 73.0 41.1 17.0 42.6 15.6 7.8 18.4 14.9 35.5")[0] == 141
-    assert (PLAN.spec.horizon, PLAN.spec.free_trials, PLAN.spec.joint_trials) == (10, 141, 15)
+    assert (PLAN.spec.horizon, PLAN.spec.exploration.trials, PLAN.spec.synthesis.trials) == (10, 141, 15)
 
 
 def test_budgets_are_the_printed_ones():
     spec = PLAN.spec
-    assert (spec.trials, spec.warm_rounds, spec.module_trials, spec.alpha, spec.power) == (28, 6, 10, 0.05, 0.8)
-    assert (spec.least_effect, spec.most_runs, spec.pruner, spec.sampler.kind) == (0.02, 25, "median", "thesis_tpe")
+    assert spec.calibration == CalibrationSpec(trials=28, warm_rounds=6)
+    assert (spec.screening.trials, spec.confirmation.alpha, spec.planning.power) == (10, 0.05, 0.8)
+    assert (spec.planning.least_effect, spec.planning.most_runs, spec.pruner, spec.sampler.kind) == (
+        0.02,
+        25,
+        "median",
+        "thesis_tpe",
+    )
     assert (spec.epochs, spec.patience, spec.updates, spec.final_updates) == (25, 8, 0, 0)
     training = PLAN.experiment.training
     assert (training.chunks.regime, training.chunks.batch, training.clip_norm) == ("window", 32, 1.0)
@@ -230,8 +236,15 @@ class World:
 @pytest.fixture(scope="module")
 def walked():
     world = World()
-    small = {"module_trials": 2, "free_trials": 4, "joint_trials": 3, "variance_runs": 10, "most_runs": 5, "trials": 6}
-    found = run_phases(context(**small, warm_rounds=1, rungs=(0.5,)), world, until="exploration")
+    small = {
+        "screening": ScreeningSpec(trials=2),
+        "exploration": ExplorationSpec(trials=4),
+        "synthesis": SynthesisSpec(trials=3),
+        "isolation": dataclasses.replace(PLAN.spec.isolation, runs=10),
+        "planning": dataclasses.replace(PLAN.spec.planning, most_runs=5),
+        "calibration": CalibrationSpec(trials=6, warm_rounds=1),
+    }
+    found = run_phases(context(**small, rungs=(0.5,)), world, until="exploration")
     return found, world.orders
 
 

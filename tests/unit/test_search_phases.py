@@ -14,7 +14,16 @@ from edp.workflows.search.context import SearchContext, set_apart
 from edp.workflows.search.engine import run_phases
 from edp.workflows.search.modules import THESIS_MODULES
 from edp.workflows.search.phases import PHASES
-from edp.workflows.search.settings import CompressionSpec, SearchSpec
+from edp.workflows.search.settings import (
+    CalibrationSpec,
+    CompressionSpec,
+    ExplorationSpec,
+    IsolationSpec,
+    PlanningSpec,
+    ScreeningSpec,
+    SearchSpec,
+    SynthesisSpec,
+)
 from edp.workflows.search.smaller import Recipe
 from edp.workflows.search.space import Choice, Real
 from edp.workflows.search.study import SamplerSpec
@@ -27,8 +36,8 @@ SPACE = {"learning_rate": Real(1e-4, 1e-1, log=True), "units": Choice((4, 8, 16)
 SPEC = SearchSpec(
     updates=10,
     folds=3,
-    variance_runs=6,
-    trials=8,
+    isolation=IsolationSpec(runs=6),
+    calibration=CalibrationSpec(trials=8),
     space=SPACE,
     sampler=SamplerSpec(kind="tpe", startup=4),
     backbones=("lstm", "hybrid"),
@@ -265,8 +274,8 @@ def test_sessions_set_apart_are_spread_over_families_and_drawn_by_the_root():
     ("options", "message"),
     [
         ({"mode": "quick"}, "mode = 'quick'"),
-        ({"updates": 0, "alpha": 1.0}, r"updates = 0; .* alpha = 1\.0; 0 < alpha < 1 must hold"),
-        ({"folds": 3, "variance_runs": 4}, "two repeats of them"),
+        ({"updates": 0, "test_share": 1.0}, r"updates = 0; .* test_share = 1\.0; 0 < test_share < 1 must hold"),
+        ({"folds": 3, "isolation": IsolationSpec(runs=4)}, "two repeats of the 3 folds"),
         ({"limits": {"flash": 1.0}}, "limits.flash"),
         ({"cost": "cycles"}, "cost = 'cycles'"),
     ],
@@ -294,10 +303,10 @@ CONFIRMED = dataclasses.replace(
     SPEC,
     backbones=("hybrid",),
     features=("FG1", "FG2"),
-    most_runs=6,
-    trials=6,
-    joint_trials=6,
-    free_trials=16,
+    planning=PlanningSpec(most_runs=6),
+    calibration=CalibrationSpec(trials=6),
+    synthesis=SynthesisSpec(trials=6),
+    exploration=ExplorationSpec(trials=16),
     modules=tuple(THESIS_MODULES),
 )
 
@@ -324,7 +333,9 @@ def test_the_plan_says_how_many_runs_and_why(sound):
 
 
 def test_a_plan_that_no_number_of_runs_meets_makes_the_most_that_are_allowed(sound):
-    small = dataclasses.replace(sound[0], spec=dataclasses.replace(CONFIRMED, least_effect=1e-4))
+    small = dataclasses.replace(
+        sound[0], spec=dataclasses.replace(CONFIRMED, planning=PlanningSpec(most_runs=6, least_effect=1e-4))
+    )
     decision = run_phases(small, World(with_effects), phases=["planning"]).decided["planning"]
     assert decision.facts.runs == 6
     assert decision.facts.enough is None
@@ -349,7 +360,13 @@ def test_what_a_look_drops_is_not_trained_any_more(sound):
 
 
 def test_the_thesis_mode_walks_the_same_phases_by_its_own_rules():
-    spec = dataclasses.replace(CONFIRMED, mode="thesis", module_trials=3, run_seeds=2, most_runs=4)
+    spec = dataclasses.replace(
+        CONFIRMED,
+        mode="thesis",
+        run_seeds=2,
+        screening=ScreeningSpec(trials=3),
+        planning=PlanningSpec(most_runs=4),
+    )
     found = run_phases(context(spec), World(with_effects), until="confirmation")
     screening, confirmation = (found.decided[name].to_json()["facts"] for name in ("screening", "confirmation"))
     assert "squeeze_excitation" in screening["passed"]
@@ -425,7 +442,7 @@ def test_synergies_that_no_module_has_alone_are_found_by_the_exploration():
         kinds = {block["kind"] for block in settings["model"]["blocks"]}
         return by_rate(settings) * (1 - 0.2 * ({"squeeze_excitation", "temporal_difference"} <= kinds))
 
-    spec = dataclasses.replace(CONFIRMED, free_trials=40)
+    spec = dataclasses.replace(CONFIRMED, exploration=ExplorationSpec(trials=40))
     world = World(together)
     found = run_phases(context(spec), world)
     facts = found.decided["exploration"].to_json()["facts"]

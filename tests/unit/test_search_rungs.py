@@ -15,7 +15,7 @@ from edp.evaluation.study_facts import IsolationFacts
 from edp.stats.variance import PairedVariance
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.engine import run_phases
-from edp.workflows.search.settings import SearchSpec
+from edp.workflows.search.settings import CalibrationSpec, IsolationSpec, SearchSpec
 from edp.workflows.search.space import Choice, Real
 from edp.workflows.search.study import SamplerSpec, Study
 from edp.workflows.search.trainings import SCORES, Outcome, TrainingRequest, settings_of
@@ -27,8 +27,8 @@ SPACE = {"learning_rate": Real(1e-4, 1e-1, log=True), "units": Choice((4, 8))}
 SPEC = SearchSpec(
     updates=80,
     folds=3,
-    variance_runs=6,
-    trials=24,
+    isolation=IsolationSpec(runs=6),
+    calibration=CalibrationSpec(trials=24),
     space=SPACE,
     sampler=SamplerSpec(kind="random"),
     backbones=("lstm",),

@@ -61,7 +61,7 @@ def run(
     ] = None,
     changes: Annotated[
         list[str],
-        typer.Option("--set", help="One setting, such as search.trials=30, search.mode=thesis or model.window=40."),
+        typer.Option("--set", help="One setting, such as search.mode=thesis or model.window=40."),
     ] = [],  # noqa: B006
     phase: Annotated[str | None, typer.Option(help="Last phase to run; default: all.")] = None,
     budget: Annotated[

@@ -16,7 +16,7 @@ COMMANDS = {
 """What shortens a command that `edp init` prints; every printed command has an entry."""
 SEARCH = (
     *("--phase", "isolation", "--workers", 1, "--set", 'search.backbones=["lstm"]', "--set", "search.updates=2"),
-    *("--set", "search.variance_seeds=2", "--set", "model.backbone.units=4", "--set", "search.space.units=[4, 6]"),
+    *("--set", "search.isolation.seeds=2", "--set", "model.backbone.units=4", "--set", "search.space.units=[4, 6]"),
 )
 
 

@@ -26,8 +26,8 @@ CHANGES = (
     'task={targets=["speed"], horizons=[1]}',
     'model={backbone={kind="lstm", units=4}, window=5, head={hidden=4}}',
     "training.chunks={length=20, batch=4, burn_in=5}",
-    'search={horizon=1, backbones=["lstm"], features=["all"], updates=3, final_updates=4, folds=2, variance_runs=4}',
-    "search={variance_seeds=2, trials=3}",
+    'search={horizon=1, backbones=["lstm"], features=["all"], updates=3, final_updates=4, folds=2, isolation={runs=4}}',
+    "search={isolation={seeds=2}, calibration={trials=3}}",
     "search.space={units=[2, 4], kernel=false}",
 )
 

@@ -7,7 +7,7 @@ from edp.jobs.processes import LocalPool
 from edp.storage.ledger import Ledger, TrainingStatus
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.engine import Dispatcher, run_phases
-from edp.workflows.search.settings import SearchSpec
+from edp.workflows.search.settings import IsolationSpec, SearchSpec
 from edp.workflows.search.trainings import settings_of
 
 CHANGES = (
@@ -19,7 +19,7 @@ CHANGES = (
     "training.chunks={length=20, batch=4, burn_in=5}",
 )
 SPEC = SearchSpec(
-    updates=5, horizon=1, folds=2, variance_runs=4, variance_seeds=2, backbones=("lstm",), features=("all",)
+    updates=5, horizon=1, folds=2, isolation=IsolationSpec(runs=4, seeds=2), backbones=("lstm",), features=("all",)
 )
 
 

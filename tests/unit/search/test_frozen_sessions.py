@@ -44,9 +44,10 @@ CHANGES = (
     'task={targets=["speed"], horizons=[1]}',
     'model={backbone={kind="lstm", units=4}, window=5, head={hidden=4}}',
     "training.chunks={length=20, batch=4, burn_in=5}",
-    'search={horizon=1, backbones=["lstm"], features=["all"], updates=2, final_updates=3, folds=2, variance_runs=4}',
-    "search={variance_seeds=2, trials=2, screening_runs=16, screening_repeats=1, most_runs=2, run_seeds=1, batch=2}",
-    "search={joint_trials=1, free_trials=1}",
+    'search={horizon=1, backbones=["lstm"], features=["all"], updates=2, final_updates=3, folds=2, isolation={runs=4}}',
+    "search={isolation={seeds=2}, calibration={trials=2}, screening={runs=16, repeats=1}, planning={most_runs=2}}",
+    "search={run_seeds=1, batch=2}",
+    "search={synthesis={trials=1}, exploration={trials=1}}",
     'search.compression={updates=3, units=[2], formats=["float32", "w8a16"]}',
     "search.space={units=[4, 8], kernel=false}",
 )

@@ -41,8 +41,9 @@ TINY = (
 )
 CHANGES = (
     *TINY,
-    'search={horizon=1, backbones=["lstm"], features=["all"], updates=8, final_updates=9, folds=2, variance_runs=4}',
-    'search={variance_seeds=2, trials=16, rungs=[0.25, 0.5], pruner="median", sampler={kind="random"}}',
+    'search={horizon=1, backbones=["lstm"], features=["all"], updates=8, final_updates=9, folds=2, isolation={runs=4}}',
+    'search={isolation={seeds=2}, calibration={trials=16}, rungs=[0.25, 0.5], pruner="median"}',
+    'search.sampler={kind="random"}',
     "search.space={units=[2, 4], layers=false, kernel=false, learning_rate={low=1e-4, high=1.0, log=true}}",
 )
 

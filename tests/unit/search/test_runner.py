@@ -17,15 +17,17 @@ from edp.storage import write_json
 from edp.storage.ledger import Ledger, TrainingStatus
 from edp.workflows.search.plan import SearchPlan, load_plan
 from edp.workflows.search.runner import Resources, run_search
+from edp.workflows.search.settings import MOVED, IsolationSpec, PlanningSpec
 from edp.workflows.search.study_log import look_at
 
 CHANGES = (
     'task={targets=["speed"], horizons=[1]}',
     'model={backbone={kind="lstm", units=4}, window=5, head={hidden=4}}',
     "training.chunks={length=20, batch=4, burn_in=5}",
-    'search={horizon=1, backbones=["lstm"], features=["all"], updates=3, final_updates=4, folds=2, variance_runs=4}',
+    'search={horizon=1, backbones=["lstm"], features=["all"], updates=3, final_updates=4, folds=2, isolation={runs=4}}',
     'search.compression={updates=3, formats=["float32", "w8a16"], shares=[1.0, 0.5]}',
-    "search={variance_seeds=2, trials=3, screening_repeats=1, most_runs=4, run_seeds=1, joint_trials=2, free_trials=2}",
+    "search={isolation={seeds=2}, calibration={trials=3}, screening={repeats=1}, planning={most_runs=4}, run_seeds=1}",
+    "search={synthesis={trials=2}, exploration={trials=2}}",
     "search.space={units=[2, 4], kernel=false}",
 )
 
@@ -162,7 +164,7 @@ def test_phases_up_to_one_and_then_the_rest(six_sessions, plan, tmp_path):
     first = run_search(six_sessions, plan, tmp_path, CREW, until="isolation")
     assert (first.state, list(first.context.decided), first.teacher) == ("stopped", ["isolation"], None)
     second = run_search(six_sessions, plan, tmp_path, CREW, until="calibration")
-    assert second.trained == plan.spec.trials
+    assert second.trained == plan.spec.calibration.trials
 
 
 @pytest.mark.parametrize(
@@ -206,7 +208,7 @@ def test_the_same_session_twice_is_refused_before_anything_is_trained(six_sessio
 
 
 def test_fewer_sessions_than_folds_and_a_test_session_that_is_not_there(six_sessions, plan, tmp_path):
-    many = replace(plan.spec, folds=5, variance_runs=10, most_runs=10)
+    many = replace(plan.spec, folds=5, isolation=IsolationSpec(runs=10), planning=PlanningSpec(most_runs=10))
     named = replace(plan.spec, test=("s9",))
     # A store cannot be divided into more sessions.
     six_sessions.store(tmp_path / "store")
@@ -274,7 +276,8 @@ def test_status_of_no_study_and_of_one_of_another_version(finished, tmp_path):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ("search.trails=3", "did you mean 'trials'"),
+        ("search.calibration.trails=3", "did you mean 'trials'"),
+        ("search.trials=3", "'search.trials' is now called 'search.calibration.trials'"),
         ("search.space.units=[1]", "units: a choice of"),
         ("search.space.untis=[1, 2]", "unknown dimension 'search.space.untis'; did you mean 'units'"),
         ("search.space.units=3", "units = 3; a list of values"),
@@ -298,6 +301,16 @@ def test_presets_can_be_built(preset):
     plan = load_plan(None, preset)
     assert plan.spec.horizon in plan.experiment.task.horizons
     assert plan.to_plain()["search"]["folds"] == plan.spec.folds
+
+
+def test_the_identity_of_a_study_is_that_of_versions_without_tables_for_phases(plan):
+    identity = plan.to_plain()["search"]
+    assert (identity["variance_runs"], identity["free_trials"]) == (
+        plan.spec.isolation.runs,
+        plan.spec.exploration.trials,
+    )
+    assert identity.keys() >= MOVED.keys()
+    assert not {moved.partition(".")[0] for moved in MOVED.values()} & identity.keys()
 
 
 def test_an_own_feature_set_by_its_file(tmp_path):

@@ -30,8 +30,9 @@ CHANGES = (
     'model={backbone={kind="hybrid", channels=[4], kernel=3, units=4}, window=5, head={hidden=2}}',
     'training={chunks={regime="window", length=5, batch=4, burn_in=0}, threads=1}',
     'search={horizon=1, backbones=["hybrid"], features=["all"], updates=6, final_updates=6, epochs=3, patience=1}',
-    "search={folds=2, variance_runs=4, variance_seeds=2, trials=3, warm_rounds=1, module_trials=1, most_runs=2}",
-    "search={run_seeds=2, joint_trials=2, free_trials=3, rungs=[0.3, 0.6]}",
+    "search={folds=2, isolation={runs=4, seeds=2}, calibration={trials=3, warm_rounds=1}, screening={trials=1}}",
+    "search.planning.most_runs=2",
+    "search={run_seeds=2, synthesis={trials=2}, exploration={trials=3}, rungs=[0.3, 0.6]}",
     'search.compression={formats=["float32"], shares=[0.5]}',
     "search.space={units=[2, 4], layers=[1, 2], kernel=[3, 5]}",
 )

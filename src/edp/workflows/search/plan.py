@@ -27,7 +27,7 @@ from edp.evaluation.controller import load_budget
 from edp.settings.tree import combined
 from edp.storage import parse_toml
 from edp.workflows.search.phases.isolation import DEFAULT_BACKBONE, arm_settings
-from edp.workflows.search.settings import SearchSpec
+from edp.workflows.search.settings import MOVED, SearchSpec
 from edp.workflows.search.space import DIMENSIONS, THESIS, WIDTHS, Choice, Range, Real, Space, applicable, apply
 from edp.workflows.search.trainings import settings_of
 
@@ -78,6 +78,9 @@ def load_plan(path: str | Path | None = None, preset: str = "quick", overrides: 
     if not isinstance(search, Mapping):
         raise ConfigError(f"settings {where}: search = {search!r}; expected a table")
     experiment = build(Experiment, merged(preset_table(base), table), where)
+    for key in search:
+        if key in MOVED:
+            raise ConfigError(f"settings {where}: 'search.{key}' is now called 'search.{MOVED[key]}'")
     spec = _spec(_with_task(dict(search), table, experiment), where)
     _check_parts(spec, settings_of(experiment), f"settings {where}: search")
     # Scores exist for the horizons of the task only.
@@ -198,8 +201,13 @@ def _range(entry: Any, where: str) -> Range:
 
 
 def plain_spec(spec: SearchSpec) -> Table:
-    """Return a spec as plain values."""
+    """Return a spec as plain values, with the keys that the identity of a study has (`MOVED`)."""
     table: Table = plain_tree(spec)
+    for key, moved in MOVED.items():
+        phase, name = moved.split(".")
+        table[key] = table[phase].pop(name)
+    for phase in {moved.partition(".")[0] for moved in MOVED.values()}:
+        table |= {f"{phase}.{name}": value for name, value in table.pop(phase).items()}
     table["space"], table["deferred"] = plain_space(spec.space), plain_space(spec.deferred)
     return table
 

@@ -31,7 +31,164 @@ from edp.workflows.search.study import PRUNERS, SamplerSpec
 COSTS = ("parameters", "macs_tick")
 MOST_TRAININGS = 1_000_000
 """Of a phase, in runs, seeds, repeats or questions; of a second each they would take eleven days."""
+COUNT = integer(1, MOST_TRAININGS)
 LIMIT = above(0.0, 1e18)
+MOVED = {
+    "variance_runs": "isolation.runs",
+    "variance_seeds": "isolation.seeds",
+    "trials": "calibration.trials",
+    "warm_rounds": "calibration.warm_rounds",
+    "screening_runs": "screening.runs",
+    "screening_repeats": "screening.repeats",
+    "module_trials": "screening.trials",
+    "least_effect": "planning.least_effect",
+    "power": "planning.power",
+    "most_runs": "planning.most_runs",
+    "alpha": "confirmation.alpha",
+    "least_gain": "confirmation.least_gain",
+    "joint_trials": "synthesis.trials",
+    "free_trials": "exploration.trials",
+}
+"""Keys of earlier versions, without a table for each phase.
+
+The identity of a study keeps them, so that studies which an earlier version began go on.
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class IsolationSpec:
+    """Phase 0: the spread of scores of each backbone with each feature set.
+
+    Attributes:
+        runs: training runs, in whole repeats of the folds.
+        seeds: of each of these runs.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    # Two repeats of five folds, the least from which spread between sessions and runs can be told apart.
+    runs: int = 10
+    seeds: int = 2
+
+    def __post_init__(self) -> None:
+        check_bounds("search.isolation", self, runs=integer(2, MOST_TRAININGS), seeds=COUNT)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationSpec:
+    """Phase 1: the best settings of each backbone.
+
+    Attributes:
+        trials: questions for each backbone.
+        warm_rounds: rounds in which every size is asked once before the sampler is free to choose.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    trials: int = 40
+    warm_rounds: int = 1
+
+    def __post_init__(self) -> None:
+        check_bounds("search.calibration", self, trials=COUNT, warm_rounds=integer(0, MOST_TRAININGS))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScreeningSpec:
+    """Phase 2: the effect of each module.
+
+    Attributes:
+        runs: mode ``sound``: runs of the two-level design, a power of two; more where the modules need more.
+        repeats: mode ``sound``: how often the design is repeated, each time on another fold.
+        trials: mode ``thesis``: questions for each module.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    runs: int = 32
+    repeats: int = 2
+    trials: int = 10
+
+    def __post_init__(self) -> None:
+        check_bounds("search.screening", self, runs=integer(2, MOST_TRAININGS), repeats=COUNT, trials=COUNT)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanningSpec:
+    """Phase 2.5: how many runs the confirmation needs.
+
+    Attributes:
+        least_effect: the effect to be seen, as a share of the baseline's mean score.
+        power: wanted.
+        most_runs: training runs of each arm that may be spent at most.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    least_effect: float = 0.02
+    power: float = 0.80
+    most_runs: int = 20
+
+    def __post_init__(self) -> None:
+        share = between(0.0, 1.0)
+        most = integer(2, MOST_TRAININGS)
+        check_bounds("search.planning", self, least_effect=share, power=share, most_runs=most)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConfirmationSpec:
+    """Phase 3: which modules are better than the baseline.
+
+    Attributes:
+        alpha: significance level, also of the comparisons of later phases.
+        least_gain: least relevant improvement, as a share of the baseline's mean score.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    alpha: float = 0.05
+    least_gain: float = 0.01
+
+    def __post_init__(self) -> None:
+        check_bounds("search.confirmation", self, alpha=between(0.0, 1.0), least_gain=span(0.0, 1.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SynthesisSpec:
+    """Phase 4: the confirmed modules together.
+
+    Attributes:
+        trials: questions about them.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    trials: int = 24
+
+    def __post_init__(self) -> None:
+        check_bounds("search.synthesis", self, trials=COUNT)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExplorationSpec:
+    """Phase 5: all modules together.
+
+    Attributes:
+        trials: questions about them.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    trials: int = 48
+
+    def __post_init__(self) -> None:
+        check_bounds("search.exploration", self, trials=COUNT)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,22 +246,8 @@ class SearchSpec:
         folds: into which the other sessions are dealt.
         backbones: registered backbones that are compared.
         features: feature sets that are compared: names, or sets of one's own.
-        variance_runs: phase 0: training runs of each backbone with each feature set, in whole repeats of the folds.
-        variance_seeds: phase 0: seeds of each of these runs.
-        trials: phase 1: questions for each backbone.
-        warm_rounds: phase 1: rounds in which every size is asked once before the sampler is free to choose.
         trial_runs: runs over which a question of phases 1, 4 and 5 is judged.
-        screening_runs: phase 2, sound: runs of the two-level design, a power of two; more where the modules need more.
-        screening_repeats: phase 2, sound: how often the design is repeated, each time on another fold.
-        module_trials: phase 2, thesis: questions for each module.
-        least_effect: phase 2.5: the effect to be seen, as a share of the baseline's mean score.
-        power: phase 2.5: wanted.
-        most_runs: phase 3: training runs of each arm that may be spent at most.
-        run_seeds: phase 3, thesis: seeds of each split.
-        alpha: level of the confirmation.
-        least_gain: least relevant improvement, as a share of the baseline's mean score.
-        joint_trials: phase 4: questions about the confirmed modules together.
-        free_trials: phase 5: questions about all modules together.
+        run_seeds: seeds of each split in mode ``thesis``, and of the final trainings.
         batch: questions that are asked before the first of them is answered.
         space: dimensions and ranges of phase 1.
         elastic: reach of the window around the baseline in later phases.
@@ -119,6 +262,13 @@ class SearchSpec:
             earlier batches, once five of them were trained to the end (Optuna's median rule with its defaults).
         cost: ``none``, or a cost that is made small beside the score in phases 1, 4 and 5: a Pareto front comes out.
         limits: the most that a cost may be; what exceeds it is not trained.
+        isolation: phase 0.
+        calibration: phase 1.
+        screening: phase 2.
+        planning: phase 2.5.
+        confirmation: phase 3.
+        synthesis: phase 4.
+        exploration: phase 5.
         compression: phase 6.
 
     Raises:
@@ -139,23 +289,8 @@ class SearchSpec:
     folds: int = 5
     backbones: tuple[str, ...] = ("lstm", "tcn", "hybrid")
     features: tuple[str | FeatureSettings, ...] = ("FG1", "FG2")
-    # Ten runs: two repeats of five folds, the least from which spread between sessions and runs can be told apart.
-    variance_runs: int = 10
-    variance_seeds: int = 2
-    trials: int = 40
-    warm_rounds: int = 1
     trial_runs: int = 1
-    screening_runs: int = 32
-    screening_repeats: int = 2
-    module_trials: int = 10
-    least_effect: float = 0.02
-    power: float = 0.80
-    most_runs: int = 20
     run_seeds: int = 3
-    alpha: float = 0.05
-    least_gain: float = 0.01
-    joint_trials: int = 24
-    free_trials: int = 48
     batch: int = 4
     space: Space = field(default_factory=lambda: dict(THESIS))
     elastic: dict[str, float] = field(default_factory=lambda: dict(ELASTIC))
@@ -168,23 +303,24 @@ class SearchSpec:
     pruner: str = "none"
     cost: str = "none"
     limits: dict[str, float] = field(default_factory=dict)
+    isolation: IsolationSpec = field(default_factory=IsolationSpec)
+    calibration: CalibrationSpec = field(default_factory=CalibrationSpec)
+    screening: ScreeningSpec = field(default_factory=ScreeningSpec)
+    planning: PlanningSpec = field(default_factory=PlanningSpec)
+    confirmation: ConfirmationSpec = field(default_factory=ConfirmationSpec)
+    synthesis: SynthesisSpec = field(default_factory=SynthesisSpec)
+    exploration: ExplorationSpec = field(default_factory=ExplorationSpec)
     compression: CompressionSpec = field(default_factory=CompressionSpec)
 
     def __post_init__(self) -> None:
-        counts = (
-            *("variance_seeds", "trials", "trial_runs", "screening_repeats"),
-            *("module_trials", "run_seeds", "joint_trials", "free_trials", "batch"),
-        )
-        bounds = dict.fromkeys(counts, integer(1, MOST_TRAININGS)) | {"seed": SEED, "horizon": integer(0, MOST_TICKS)}
+        bounds = dict.fromkeys(("trial_runs", "run_seeds", "batch"), COUNT)
+        bounds |= {"seed": SEED, "horizon": integer(0, MOST_TICKS), "folds": integer(2, MOST_TRAININGS)}
         bounds |= {"epochs": integer(1, MOST_EPOCHS), "patience": integer(0, MOST_EPOCHS)}
         check_bounds("search", self, epochs=bounds["epochs"])
         # Zero steps stand for passes over the data, which only several epochs know.
         steps = integer(1 if self.epochs == 1 else 0, MOST_UPDATES)  # 0: passes over the data
         bounds |= dict.fromkeys(("updates", "final_updates"), steps)
-        bounds |= dict.fromkeys(("folds", "variance_runs", "most_runs", "screening_runs"), integer(2, MOST_TRAININGS))
-        bounds |= {"warm_rounds": integer(0, MOST_TRAININGS), "least_gain": span(0.0, 1.0)}
-        bounds |= dict.fromkeys(("test_share", "second_share", "least_effect", "power", "alpha"), between(0.0, 1.0))
-        bounds |= {"rungs": between(0.0, 1.0)}
+        bounds |= dict.fromkeys(("test_share", "second_share", "rungs"), between(0.0, 1.0))
         check_bounds("search", self, **bounds)
         wrong = self._wrong_epochs()
         if self.mode not in MODES:
@@ -204,12 +340,10 @@ class SearchSpec:
             for name, reach in self.elastic.items()
             if not LIMIT.holds(reach)
         ]
-        if self.folds < 2 or self.variance_runs < 2 * self.folds or self.variance_runs % self.folds:
-            wrong.append(
-                f"folds = {self.folds} (at least 2), variance_runs = {self.variance_runs} (two repeats of them or more)"
-            )
-        if self.most_runs < self.folds:
-            wrong.append(f"most_runs = {self.most_runs} (at least the {self.folds} folds)")
+        if self.isolation.runs < 2 * self.folds or self.isolation.runs % self.folds:
+            wrong.append(f"isolation.runs = {self.isolation.runs} (two repeats of the {self.folds} folds or more)")
+        if self.planning.most_runs < self.folds:
+            wrong.append(f"planning.most_runs = {self.planning.most_runs} (at least the {self.folds} folds)")
         if not self.backbones or not self.features:
             wrong.append("backbones and features (at least one of each)")
         if len(self.feature_sets) < len(self.features):

@@ -13,7 +13,16 @@ from edp.workflows.search.context import SearchContext
 from edp.workflows.search.engine import run_phases
 from edp.workflows.search.modules import MODULES
 from edp.workflows.search.phases import PHASES
-from edp.workflows.search.settings import SearchSpec
+from edp.workflows.search.plan import plain_spec
+from edp.workflows.search.settings import (
+    CalibrationSpec,
+    ExplorationSpec,
+    IsolationSpec,
+    PlanningSpec,
+    ScreeningSpec,
+    SearchSpec,
+    SynthesisSpec,
+)
 from edp.workflows.search.smaller import Recipe
 from edp.workflows.search.space import Choice, Real
 from edp.workflows.search.study import SamplerSpec
@@ -23,15 +32,13 @@ SESSIONS = tuple(f"s{number:02d}" for number in range(12))
 SPEC = SearchSpec(
     updates=400,
     folds=3,
-    variance_runs=6,
-    trials=8,
-    screening_runs=32,
-    screening_repeats=1,
-    module_trials=2,
-    most_runs=6,
     run_seeds=2,
-    joint_trials=6,
-    free_trials=12,
+    isolation=IsolationSpec(runs=6),
+    calibration=CalibrationSpec(trials=8),
+    screening=ScreeningSpec(runs=32, repeats=1, trials=2),
+    planning=PlanningSpec(most_runs=6),
+    synthesis=SynthesisSpec(trials=6),
+    exploration=ExplorationSpec(trials=12),
     space={"learning_rate": Real(1e-4, 1e-1, log=True), "units": Choice((4, 8, 16, 32))},
     sampler=SamplerSpec(kind="random"),
     backbones=("lstm", "hybrid"),
@@ -131,7 +138,7 @@ def study_of(spec):
         "preset": "quick",
         "unit": "mm/s",
         "data": {"path": "m22.toml", "sessions": len(SESSIONS), "hours": 1.2, "hash": "0123abcd"},
-        "spec": dataclasses.asdict(spec),
+        "spec": plain_spec(spec),
         "sessions": {"development": list(SESSIONS[:9]), "test": list(SESSIONS[9:11]), "second": list(SESSIONS[11:])},
         "modules": {name: module.title for name, module in MODULES.items()},
         "decisions": [held.to_json() for held in context.decided.values()],
@@ -164,7 +171,7 @@ def sound_once():
 
 @pytest.fixture(scope="session")
 def thesis_once():
-    return study_of(dataclasses.replace(SPEC, mode="thesis", least_effect=0.01))
+    return study_of(dataclasses.replace(SPEC, mode="thesis", planning=PlanningSpec(most_runs=6, least_effect=0.01)))
 
 
 @pytest.fixture

@@ -42,7 +42,7 @@ class Calibration:
         """Count every question of every backbone, as if none were too costly, and the final between them."""
         spec = context.spec
         final = spec.folds if spec.mode == "sound" and len(spec.backbones) > 1 else 0
-        return len(spec.backbones) * (spec.trials * spec.trial_runs + final)
+        return len(spec.backbones) * (spec.calibration.trials * spec.trial_runs + final)
 
     def run(self, context: SearchContext) -> Course:
         """Train all backbones in parallel: every size in turn, then the sampler's questions.
@@ -132,10 +132,10 @@ def _quest(context: SearchContext, backbone: str, arm: Table, space: Space) -> Q
     study = new_study(context, f"calibration {backbone}", space)
     sizes = space.get("units")
     # A warm round: every width once, so that no size is left out by chance.
-    for _ in range(spec.warm_rounds):
+    for _ in range(spec.calibration.warm_rounds):
         for size in sizes.options if isinstance(sizes, Choice) else ():
             study.suggest({"units": size})
-    return Quest(study, lambda trial: context.shaped(apply(arm, trial.values)), spec.trials)
+    return Quest(study, lambda trial: context.shaped(apply(arm, trial.values)), spec.calibration.trials)
 
 
 def _final(context: SearchContext, backbones: list[str], outcomes: Sequence[Outcome]) -> FinalRound:

@@ -36,7 +36,7 @@ class Confirmation:
         screening, planning = facts_of_kind(decisions, ScreeningFacts), facts_of_kind(decisions, PlanningFacts)
         half = len(spec.modules or MODULES) // 2
         arms = half if screening is None else len(screening.passed)
-        runs = spec.most_runs if planning is None else planning.runs
+        runs = spec.planning.most_runs if planning is None else planning.runs
         return (1 + arms) * runs * (spec.run_seeds if spec.mode == "thesis" else 1) if arms else 0
 
     def run(self, context: SearchContext) -> Course:
@@ -75,13 +75,14 @@ def _sound(context: SearchContext, passed: list[str], arms: list[Table]) -> Cour
         if len(alive) == 1:
             # Nothing but the baseline is left: further runs would compare it with itself.
             break
+    rules = context.spec.confirmation
     evidence = confirm(
         scores[:, :start],
         passed,
         # All modules that were screened count for the adjustment, not only those that passed.
         context.facts(ScreeningFacts).registered,
         mask[:start],
-        Rule(alpha=context.spec.alpha, least_gain=context.spec.least_gain, interim_analyses=interim_analyses),
+        Rule(alpha=rules.alpha, least_gain=rules.least_gain, interim_analyses=interim_analyses),
     )
     confirmed = tuple(entry.module for entry in evidence if entry.confirmed)
     texts = (f"{MODULES[entry.module].title}: {entry.reason}." for entry in evidence)
@@ -104,7 +105,7 @@ def _thesis(context: SearchContext, passed: list[str], arms: list[Table]) -> Cou
         order for arm in arms for seed in range(seeds) for order in context.orders(arm, range(runs), seed=seed)
     ]
     scores = _by_metric(context, outcomes, len(arms), seeds, runs)
-    evidence = thesis_confirm(scores, passed, METRICS, context.spec.alpha)
+    evidence = thesis_confirm(scores, passed, METRICS, context.spec.confirmation.alpha)
     confirmed = tuple(name for name in passed if any(entry.confirmed for entry in evidence if entry.module == name))
     texts = (_thesis_text(name, [entry for entry in evidence if entry.module == name]) for name in passed)
     facts = ThesisConfirmation(confirmed=confirmed, evidence=tuple(evidence))

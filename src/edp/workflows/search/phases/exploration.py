@@ -29,7 +29,7 @@ class Exploration:
 
     def trainings(self, context: SearchContext) -> int:
         """Count the questions, and the trainings of both winners on fresh folds."""
-        return context.spec.free_trials * context.spec.trial_runs + 2 * len(fresh_runs(context))
+        return context.spec.exploration.trials * context.spec.trial_runs + 2 * len(fresh_runs(context))
 
     def run(self, context: SearchContext) -> Course:
         """Ask about all modules and options of active ones; train both winners on fresh folds with equal seeds."""
@@ -41,7 +41,7 @@ class Exploration:
         starts = [Trial(0, earlier.values, earlier.modules)]
         options = {name: options_of(base, name, context.shaped) for name in free}
         switches = [*free, *spec.toggles]
-        answers = yield from ask_together(context, "exploration", switches, spec.free_trials, starts, options)
+        answers = yield from ask_together(context, "exploration", switches, spec.exploration.trials, starts, options)
         winner = winner_of(context, "exploration", switches, answers)
         runs = fresh_runs(context)
         arms = (earlier.settings, winner.settings)
@@ -67,7 +67,7 @@ class Exploration:
         fresh = [float(own[mask[:, seen]].mean()) for own in filled]
         comparison = relative_change(test, fresh[0])
         # Both: a gain, and one that chance hardly makes.
-        better = comparison.change < 0 and comparison.p < context.spec.alpha
+        better = comparison.change < 0 and comparison.p < context.spec.confirmation.alpha
         names = ", ".join(map(title_of, winner.modules)) or "no module"
         facts = ExplorationFacts(
             **vars(winner),
@@ -91,7 +91,7 @@ class Exploration:
 def fresh_runs(context: SearchContext) -> range:
     """Two repeats of the folds behind all that phases 0 to 4 may have used."""
     spec = context.spec
-    used = max(spec.most_runs, spec.variance_runs, spec.trial_runs, spec.screening_repeats)
+    used = max(spec.planning.most_runs, spec.isolation.runs, spec.trial_runs, spec.screening.repeats)
     # Rounded up to whole repeats, so that the fresh folds are complete.
     start = -(-used // spec.folds) * spec.folds
     return range(start, start + 2 * spec.folds)

@@ -58,7 +58,7 @@ class Isolation:
 
     def trainings(self, context: SearchContext) -> int:
         """All of them at once."""
-        return len(self.arms(context)) * context.spec.variance_runs * context.spec.variance_seeds
+        return len(self.arms(context)) * context.spec.isolation.runs * context.spec.isolation.seeds
 
     def run(self, context: SearchContext) -> Course:
         """All arms on the same folds with the same seeds, in one batch."""
@@ -66,10 +66,10 @@ class Isolation:
         outcomes = yield [
             order
             for backbone, features in self.arms(context)
-            for seed in range(spec.variance_seeds)
+            for seed in range(spec.isolation.seeds)
             for order in context.orders(
                 context.shaped(arm_settings(context.base, backbone, spec.feature_sets[features])),
-                range(spec.variance_runs),
+                range(spec.isolation.runs),
                 seed=seed,
             )
         ]
@@ -100,8 +100,8 @@ class Isolation:
         own = {name: arm_table.mean(axis=0) for (name, f), arm_table in zip(arms, tables, strict=True) if f == chosen}
         facts = IsolationFacts(
             arms=arm_facts,
-            runs=spec.variance_runs,
-            seeds=spec.variance_seeds,
+            runs=spec.isolation.runs,
+            seeds=spec.isolation.seeds,
             features=chosen,
             mean_scores=means,
             comparisons=self._comparisons(context, tables, chosen),
@@ -117,7 +117,7 @@ class Isolation:
             sentences.append(
                 f"{backbone}: {chosen} against {comparison.reference} {percent(comparison.change, signed=True)} "
                 f"(one-sided p {typed(comparison.p, 2)}, two-way clustered t over "
-                f"{count_of(spec.variance_runs, 'run')})."
+                f"{count_of(spec.isolation.runs, 'run')})."
             )
         for backbone, against in facts.backbones.items():
             sentences.append(
@@ -164,18 +164,18 @@ def lowest_against_others(tables: Mapping[str, Array], mask: NDArray[np.bool_]) 
 def _tables(context: SearchContext, outcomes: Sequence[Outcome], arms: int, name: str = "composite") -> list[Array]:
     """Scores of each arm ``(seed, run, session)``; failed trainings count as the worst of all arms."""
     spec = context.spec
-    size = spec.variance_runs
+    size = spec.isolation.runs
     mask, seen = _judged(context)
     raw = np.stack([context.table(outcomes[at : at + size], name)[:, seen] for at in range(0, len(outcomes), size)])
     filled = fill_worst(raw, mask)
     # Cells that no run judges are no scores.
     filled[:, ~mask] = np.nan
-    return list(filled.reshape(arms, spec.variance_seeds, size, -1))
+    return list(filled.reshape(arms, spec.isolation.seeds, size, -1))
 
 
 def _judged(context: SearchContext) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return a mask ``(run, session)`` of the sessions that some run judges, and those sessions."""
-    mask = context.folds(context.spec.variance_runs)
+    mask = context.folds(context.spec.isolation.runs)
     seen = np.asarray(mask.any(axis=0))
     return mask[:, seen], seen
 
@@ -193,7 +193,9 @@ def _proxy(context: SearchContext, tables: list[Array], arms: list[tuple[str, st
     alike = [(i, j) for i, j in pairs if arms[i][0] == arms[j][0]] or pairs
     differences = [tables[i][0] - tables[j][0] for i, j in alike] or [tables[0][0] - own for own in tables[0][1:]]
     if not differences:
-        raise DataError("one backbone, one feature set and one seed show no variance; set variance_seeds = 2 or more")
+        raise DataError(
+            "one backbone, one feature set and one seed show no variance; set search.isolation.seeds = 2 or more"
+        )
     variances = [paired_variance(np.where(mask, difference, 0.0), mask) for difference in differences]
     # The largest variance: planning should not promise too much.
     return max(variances, key=lambda variance: variance.session + variance.run + variance.cell)

@@ -35,18 +35,19 @@ def _sound(context: SearchContext) -> Decision:
     # At least one, so that the level stays defined where nothing is registered.
     modules = max(1, len(context.facts(ScreeningFacts).registered))
     plan = plan_runs(
-        spec.least_effect * mean,
+        spec.planning.least_effect * mean,
         facts.variance,
         len(context.development),
         folds=spec.folds,
         # Bonferroni's level: the strictest that a single true module has to pass.
-        alpha=spec.alpha / modules,
-        target=spec.power,
-        most=spec.most_runs,
+        alpha=spec.confirmation.alpha / modules,
+        target=spec.planning.power,
+        most=spec.planning.most_runs,
     )
     # Whole repeats of the folds, even where the power is not reached.
-    runs = plan.runs or spec.most_runs - spec.most_runs % spec.folds
-    sentences = [f"To see {typed(100 * spec.least_effect)} % of {typed(mean, 3)}{behind(context.unit)}: {plan.reason}."]
+    runs = plan.runs or spec.planning.most_runs - spec.planning.most_runs % spec.folds
+    effect = typed(100 * spec.planning.least_effect)
+    sentences = [f"To see {effect} % of {typed(mean, 3)}{behind(context.unit)}: {plan.reason}."]
     if plan.runs is None:
         sentences.append(
             f"{count_of(runs, 'run')} are made nevertheless; effects below what they can show will be missed."
@@ -60,7 +61,7 @@ def _thesis(context: SearchContext) -> Decision:
     The standard deviation between seeds is the largest of all backbones (3.3.1); the error of which a share is to be
     seen is that of the baseline's backbone in phase 0. Both with the feature set that went on.
     """
-    spec = context.spec
+    spec, wanted = context.spec, context.spec.planning
     isolation, backbone = context.facts(IsolationFacts), context.facts(CalibrationFacts).backbone
     arms = {name: isolation.arms[f"{name} {isolation.features}"].mae for name in spec.backbones}
     sigma = max(arm.seed or 0.0 for arm in arms.values())
@@ -68,13 +69,19 @@ def _thesis(context: SearchContext) -> Decision:
     # Seeds that agree to the last digit leave nothing to plan for; two splits are the least of a mixed model.
     plan = ThesisPlan(splits=2, simulated=None, analytical=0.0)
     if sigma > 0.0:
-        plan = thesis_plan(mean, sigma, spec.run_seeds, share=spec.least_effect, alpha=spec.alpha, power=spec.power)
-    runs = min(plan.splits or 2, spec.most_runs)
+        plan = thesis_plan(
+            mean,
+            sigma,
+            spec.run_seeds,
+            share=wanted.least_effect,
+            alpha=spec.confirmation.alpha,
+            power=wanted.power,
+        )
+    runs = min(plan.splits or 2, wanted.most_runs)
     text = (
         f"J = {plan.splits} splits of {spec.run_seeds} seeds after eq. 3.42 (seeds differ by {typed(sigma, 3)}"
-        f"{behind(context.unit)}, {typed(100 * spec.least_effect)} % of an MAE of {typed(mean, 3)} are to be seen); "
-        f"{runs} "
-        "are made."
+        f"{behind(context.unit)}, {typed(100 * wanted.least_effect)} % of an MAE of {typed(mean, 3)} are to be seen); "
+        f"{runs} are made."
     )
     return Decision("planning", ThesisPlanning(**vars(plan), runs=runs, mae=mean, sigma_seed=sigma), (text,))
 

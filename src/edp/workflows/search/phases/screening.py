@@ -32,8 +32,8 @@ class ModuleScreening:
         """Count the trainings of the design, or the questions of all modules with the baseline's seeds."""
         spec = context.spec
         if spec.mode == "thesis":
-            return spec.run_seeds + len(spec.modules or MODULES) * spec.module_trials * spec.trial_runs
-        return max(spec.screening_runs, least_runs(len(spec.modules or MODULES))) * spec.screening_repeats
+            return spec.run_seeds + len(spec.modules or MODULES) * spec.screening.trials * spec.trial_runs
+        return max(spec.screening.runs, least_runs(len(spec.modules or MODULES))) * spec.screening.repeats
 
     def run(self, context: SearchContext) -> Course:
         """Trainings of the mode, and what passes."""
@@ -54,10 +54,10 @@ def _sound(context: SearchContext) -> Course:
     free = fitting(base, context.channels, spec.modules)
     barred = [sorted(pair) for pair in contradicting(base, free, context.channels)]
     # A design needs more runs than effects.
-    design = two_level_design(free, max(spec.screening_runs, least_runs(len(free))), sorted(barred))
-    drawn = _drawn(context, window, spec.screening_repeats * len(design.levels))
+    design = two_level_design(free, max(spec.screening.runs, least_runs(len(free))), sorted(barred))
+    drawn = _drawn(context, window, spec.screening.repeats * len(design.levels))
     orders, rows = [], []
-    for repeat in range(spec.screening_repeats):
+    for repeat in range(spec.screening.repeats):
         for row, levels in enumerate(design.levels):
             values = drawn[repeat * len(design.levels) + row]
             # Values are drawn anew for each row: main effects are then averages over the window.
@@ -112,7 +112,7 @@ def _passed_by_design(
         scores = np.where(np.isfinite(scores), scores, np.nanmax(scores))
     # Logarithms of rates are the covariates, since they were drawn so.
     drawn = [[np.log10(v) if v > 0 and name != "dropout" else v for name, v in row.values.items()] for row in rows]
-    folds = [[float(row.repeat == repeat) for repeat in range(1, context.spec.screening_repeats)] for row in rows]
+    folds = [[float(row.repeat == repeat) for repeat in range(1, context.spec.screening.repeats)] for row in rows]
     covariates = np.hstack([np.array(drawn), np.array(folds).reshape(len(rows), -1)])
     # A column that never changes would make the regression singular.
     covariates = covariates[:, covariates.std(axis=0) > 0]
@@ -144,7 +144,7 @@ def _thesis(context: SearchContext) -> Course:
     passed = tuple(name for name, row in table.items() if row.gain is not None and row.gain > 0)
     sentences = (
         f"{len(passed)} of {len(free)} modules have a trial below the baseline's median of {typed(reference, 3)}"
-        f"{behind(context.unit)} and go on; by chance alone most do, since the best of {spec.module_trials} is "
+        f"{behind(context.unit)} and go on; by chance alone most do, since the best of {spec.screening.trials} is "
         "compared with a "
         "median.",
     )
@@ -155,7 +155,7 @@ def _thesis(context: SearchContext) -> Course:
 def _quest(context: SearchContext, base: Table, module: str, window: Space) -> Quest:
     settings = context.network(base, [module])
     study = new_study(context, f"screening {module}", window)
-    return Quest(study, lambda trial: apply(settings, trial.values), context.spec.module_trials)
+    return Quest(study, lambda trial: apply(settings, trial.values), context.spec.screening.trials)
 
 
 def _gain(trials: list[Trial], reference: float) -> ModuleGain:

@@ -27,7 +27,7 @@ class Synthesis:
 
     def trainings(self, context: SearchContext) -> int:
         """Count the questions, and the long trainings of both arms."""
-        return context.spec.joint_trials * context.spec.trial_runs + 2 * context.spec.run_seeds
+        return context.spec.synthesis.trials * context.spec.trial_runs + 2 * context.spec.run_seeds
 
     def run(self, context: SearchContext) -> Course:
         """Tune modules and rates together; train the best and the baseline at full length, and judge both once."""
@@ -38,7 +38,7 @@ class Synthesis:
         starts = [Trial(0, values, tuple(modules)) for modules in ([confirmed, []] if confirmed else [[]])]
         if context.spec.mode == "thesis":  # whose phase 4 has no warm start (3.3.5)
             starts = []
-        answers = yield from ask_together(context, "synthesis", switches, context.spec.joint_trials, starts)
+        answers = yield from ask_together(context, "synthesis", switches, context.spec.synthesis.trials, starts)
         winner = winner_of(context, "synthesis", switches, answers)
         arms = {"synthesis": winner.settings, "baseline": base}
         outcomes = yield [order for settings in arms.values() for order in final_orders(context, settings)]
