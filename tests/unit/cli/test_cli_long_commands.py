@@ -1,5 +1,6 @@
 """Long commands divide their loops among workers: the same results for any number of them, and after a kill."""
 
+import contextlib
 import inspect as source_of
 import json
 import re
@@ -57,12 +58,12 @@ class Divided:
     Attributes:
         words: after the name of the command; ``{out}`` is the folder of the result.
         is_slow: takes seconds more than the others.
-        kept: files of the result folder that say that a part of the loop is done, for a kill.
+        writes: whether it writes a folder; otherwise its results are what it prints.
     """
 
     words: tuple[str, ...]
     is_slow: bool = False
-    kept: str = "units/records/*.json"
+    writes: bool = True
 
 
 LONG_COMMANDS = {
@@ -75,21 +76,16 @@ LONG_COMMANDS = {
             "4",
             "--limit",
             *settings(LIMIT),
-        ),
-        kept="*.parquet",
+        )
     ),
-    "store build": Divided(("{logs}", "--out", "{out}"), kept="rows/*.json"),
-    "inspect": Divided(("{logs}", "--json"), kept=""),
-    "screen": Divided(
-        ("{logs}", "--out", "{out}", "--no-pictures", "--trials", *settings(TRIALS)), True, kept="trials/*/bundle"
-    ),
+    "store build": Divided(("{logs}", "--out", "{out}")),
+    "inspect": Divided(("{logs}", "--json"), writes=False),
+    "screen": Divided(("{logs}", "--out", "{out}", "--no-pictures", "--trials", *settings(TRIALS)), True),
     "evaluate": Divided(("{run}", "--baselines", "persistence,ridge_arx,small_mlp")),
-    "finetune": Divided(
-        ("{run}", "{log}", "--out", "{out}", "--baselines", "low_rank", *settings(FLEET)), True, "**/checkpoint*"
-    ),
+    "finetune": Divided(("{run}", "{log}", "--out", "{out}", "--baselines", "low_rank", *settings(FLEET)), True),
     "fleet report": Divided(("{run}", "{fleet}", "--out", "{out}")),
     "train": Divided(("{logs}", "--out", "{out}", "--minutes", "0.02", *settings(AUTO)), True),
-    "twin": Divided(("{actuators}", "--out", "{out}", *settings(TWIN)), True, "parts/*/checkpoint*"),
+    "twin": Divided(("{actuators}", "--out", "{out}", *settings(TWIN)), True),
     "monitor fit": Divided(("{rig}", "--out", "{out}", "--hours-per-false-alarm", "0.06", "--minutes", "0.05"), True),
     "monitor run": Divided(("{monitor}", "{rig}", "--out", "{out}")),
     "control": Divided(("{out}", "--task", "grade", "--controller", "pi", "--seeds", "3", *LINE)),
@@ -236,7 +232,7 @@ def usual(places, tmp_path_factory):
         if command not in found:
             out = tmp_path_factory.mktemp("usual") / "out"
             text = run(*words_of(command, places, out), "--workers", 1)
-            found[command] = text if LONG_COMMANDS[command].kept == "" else results_in(out)
+            found[command] = results_in(out) if LONG_COMMANDS[command].writes else text
         return found[command]
 
     return find
@@ -302,7 +298,7 @@ def with_one_change(content):
     [
         pytest.param(command, marks=pytest.mark.slow if divided.is_slow else ())
         for command, divided in LONG_COMMANDS.items()
-        if divided.kept
+        if divided.writes
     ],
 )
 def test_every_file_of_a_result_is_refused_once_changed(run, edp, places, tmp_path, command):
@@ -338,26 +334,47 @@ def test_every_file_of_a_result_is_refused_once_changed(run, edp, places, tmp_pa
 def test_any_number_of_workers_gives_the_same_results(run, places, usual, tmp_path, command, workers):
     out = tmp_path / "out"
     said = run(*words_of(command, places, out), "--workers", workers)
-    if LONG_COMMANDS[command].kept == "":
+    if not LONG_COMMANDS[command].writes:
         assert without_times(json.loads(said)) == without_times(json.loads(usual(command, run)))
     else:
         assert_same(command, results_in(out), usual(command, run))
         assert not (out / "units").exists()
 
 
+class Changes:
+    """Counts the changes of the files in a folder between looks; true from a number of changes on."""
+
+    def __init__(self, folder, count):
+        self.folder, self.seen, self.count = folder, set(), 0
+        self()
+        self.count = len(self.seen) + count
+
+    def __call__(self):
+        for file in self.folder.rglob("*"):
+            with contextlib.suppress(FileNotFoundError):
+                self.seen.add((file, file.stat().st_mtime_ns))
+        return len(self.seen) >= self.count
+
+
+KILLS = (1, 2, 3, 5, 8, 12, 17, 23, 30, 40)
+"""Changes of files after which a command is killed."""
+
+
 @pytest.mark.parametrize(
-    ("command", "done"),
+    ("command", "changes"),
     [
-        pytest.param(command, done, marks=() if command == "monitor run" and done == 2 else pytest.mark.slow)
+        pytest.param(command, changes, marks=() if command == "monitor run" and changes == 12 else pytest.mark.slow)
         for command, divided in LONG_COMMANDS.items()
-        if divided.kept
-        for done in (1, 2, 3)
+        if divided.writes
+        for changes in KILLS
     ],
 )
-def test_a_killed_command_continues_to_the_same_results(run, places, usual, start, stop_once, tmp_path, command, done):
-    out, kept = tmp_path / "out", LONG_COMMANDS[command].kept
-    words = [*words_of(command, places, out), "--workers", 1 + done % 2]
-    code, said = stop_once(start(*words), lambda: len(list(out.glob(kept))) >= done, signal.SIGKILL)
+def test_a_killed_command_continues_to_the_same_results(
+    run, places, usual, start, stop_once, tmp_path, command, changes
+):
+    out = tmp_path / "out"
+    words = [*words_of(command, places, out), "--workers", 1 + changes % 2]
+    code, said = stop_once(start(*words), Changes(out, changes), signal.SIGKILL)
     # A command that ends before it is looked at is as good as one that was not killed.
     assert code in (-signal.SIGKILL, 0, 3, 5, 6), said
     run(*words)
