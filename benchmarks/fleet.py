@@ -37,7 +37,7 @@ from edp.jobs.workers import WorkUnit
 from edp.logs.source import DataSource
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.training import load_bundle
-from edp.workflows.fleet.personal import PersonalOrder, errors_by_machine, finetune_fleet
+from edp.workflows.fleet.personal import PersonalOrder, finetune_fleet
 from edp.workflows.train_evaluate import evaluate, train
 from edp.workflows.transfer import FinetuneSpec
 
@@ -328,11 +328,11 @@ def deltas(fleet: Fleet) -> dict[str, Any]:
     found: dict[str, Any] = {"parameters": sum(p.numel() for p in load_bundle(base).predictor.parameters())}
     spec = FinetuneSpec(rounds=3 if fleet.quick else 10)
     content = finetune_fleet(Workers(), base, store, PersonalOrder(method="full", spec=spec), fleet.work / "own")
-    rows = errors_by_machine(content)
+    rows = [(name, error.before, error.full, error.delta) for name, error in content.errors.items()]
     found["full"] = {
         "machines": [list(row) for row in rows],
-        "bytes": max(row.get("bytes", 0) for row in content["machines"]),
-        "trained_min": float(np.mean([row["trained_min"] for row in content["machines"] if "mae" in row])),
+        "bytes": max(row.bytes or 0 for row in content.machines),
+        "trained_min": float(np.mean([row.trained_min for row in content.machines if row.trained_min is not None])),
         **{part: float(np.mean([row[1 + n] for row in rows])) for n, part in enumerate(("before", "full", "delta"))},
     }
     print(found, flush=True)

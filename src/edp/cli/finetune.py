@@ -116,23 +116,26 @@ def _finetune_fleet(
     bundle: Path, store: Path, folder: Path, order: PersonalOrder, workers: Workers, as_json: bool
 ) -> None:
     """Fine-tune for every machine of a store with a progress display, and print the results."""
-    from edp.workflows.fleet.personal import errors_by_machine, finetune_fleet
+    from edp.workflows.fleet.personal import finetune_fleet
 
     with shown_progress("finetune", as_json) as progress:
         content = finetune_fleet(workers, bundle, store, order, folder, progress)
 
     def show() -> None:
-        rows = [(name, *(figure(error) for error in errors)) for name, *errors in errors_by_machine(content)]
-        unit = content["unit"]
+        rows = [
+            (name, figure(error.before), figure(error.full), figure(error.delta))
+            for name, error in content.errors.items()
+        ]
+        unit = content.unit
         heads = ["machine", f"before [{unit}]", f"full fine-tune [{unit}]", f"its delta [{unit}]"]
-        table(f"mean absolute error, k = {content['horizon']}, ends of the recordings", heads, rows)
-        for row in content["machines"]:
-            if "failed" in row:
-                out.print(f"'{row['machine']}' has no delta: {row['failed']}")
+        table(f"mean absolute error, k = {content.horizon}, ends of the recordings", heads, rows)
+        for row in content.machines:
+            if row.failed is not None:
+                out.print(f"'{row.machine}' has no delta: {row.failed}")
         out.print(f"deltas in {folder}")
         out.print(f"next: edp fleet report {bundle} {store} --deltas {folder} --out report")
 
-    emit(as_json, content, show)
+    emit(as_json, content.to_table(), show)
 
 
 def _named(baselines: str, every: tuple[str, ...]) -> tuple[str, ...]:

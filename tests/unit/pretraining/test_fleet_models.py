@@ -19,7 +19,7 @@ from edp.training.bundle import weights_digest
 from edp.training.delta import read_delta, with_delta
 from edp.workflows.fleet import personal
 from edp.workflows.fleet.judge_fleet import PAGE, FleetQuestion, drift_of, report_fleet
-from edp.workflows.fleet.personal import FLEET, PersonalOrder, finetune_fleet, network_of, read_fleet
+from edp.workflows.fleet.personal import PersonalOrder, finetune_fleet, network_of, read_fleet
 from edp.workflows.fleet.registry import (
     add_to_registry,
     check_entry,
@@ -60,15 +60,15 @@ def own(run, store, tmp_path_factory):
 
 def test_each_machine_of_a_store_has_a_delta_that_is_nearly_its_fine_tuning(own, run, store):
     content = read_fleet(own)
-    assert [row["machine"] for row in content["machines"]] == [f"Press-{n}" for n in range(6)]
-    assert content["base"] == weights_digest(load_bundle(run).predictor)
-    for row in content["machines"]:
-        file = own / row["delta"]
-        assert file.stat().st_size == row["bytes"] <= 64 * 1024
-        assert read_delta(file).facts["machine"] == row["machine"]
+    assert [row.machine for row in content.machines] == [f"Press-{n}" for n in range(6)]
+    assert content.base == weights_digest(load_bundle(run).predictor)
+    for row in content.machines:
+        file = own / row.delta
+        assert file.stat().st_size == row.bytes <= 64 * 1024
+        assert read_delta(file).facts["machine"] == row.machine
         # A small network within 64 kB loses next to nothing; half precision is the whole difference.
-        assert row["mae"]["delta"] == pytest.approx(row["mae"]["full"], rel=0.02)
-    errors = np.array([[row["mae"]["before"], row["mae"]["delta"]] for row in content["machines"]])
+        assert row.mae.delta == pytest.approx(row.mae.full, rel=0.02)
+    errors = np.array([[row.mae.before, row.mae.delta] for row in content.machines])
     assert errors[:, 1].mean() < errors[:, 0].mean()
 
 
@@ -84,8 +84,8 @@ def test_a_machine_that_is_done_is_not_done_again(own, run, store, monkeypatch, 
 
 def test_the_network_of_one_machine_is_a_bundle(own, run, tmp_path):
     folder = network_of(own, "Press-3", tmp_path / "press3")
-    row = read_fleet(own)["machines"][3]
-    wanted = with_delta(load_bundle(run).predictor, read_delta(own / row["delta"]))
+    row = read_fleet(own).machines[3]
+    wanted = with_delta(load_bundle(run).predictor, read_delta(own / row.delta))
     assert weights_digest(load_bundle(folder).predictor) == weights_digest(wanted)
     with pytest.raises(ConfigError, match=r"no machine 'Press-9'.*Press-"):
         network_of(own, "Press-9", tmp_path / "no")
@@ -103,9 +103,9 @@ def test_machines_whose_logs_do_not_go_are_told_and_the_others_go_on(run, store,
 
     monkeypatch.setattr(personal, "target_data", picky)
     order = PersonalOrder(spec=FinetuneSpec(rounds=1, batch=4, check_signs=False))
-    rows = finetune_fleet(HERE, run, store, order, tmp_path / "own")["machines"]
-    assert rows[1]["failed"] == "lever has another unit"
-    assert [("delta" in row) for row in rows] == [True, False, True, True, True, True]
+    rows = finetune_fleet(HERE, run, store, order, tmp_path / "own").machines
+    assert rows[1].failed == "lever has another unit"
+    assert [row.delta is not None for row in rows] == [True, False, True, True, True, True]
     with pytest.raises(ConfigError, match="has no network of its own: lever has another unit"):
         network_of(tmp_path / "own", "Press-1", tmp_path / "no")
 
@@ -122,7 +122,7 @@ def test_logs_that_are_no_store_or_say_no_machine_are_refused(machines, run, tmp
 def test_a_damaged_fleet_file_is_one_message(own, tmp_path):
     shutil.copytree(own, tmp_path / "own")
     for content in ("[]", "{", '{"schema": 7, "base": "", "source": "", "machines": []}', '{"schema": 1}'):
-        (tmp_path / "own" / FLEET).write_text(content)
+        (tmp_path / "own" / "fleet.json").write_text(content)
         with pytest.raises(EdpError, match=r"fleet\.json"):
             read_fleet(tmp_path / "own")
 
@@ -233,9 +233,9 @@ def test_damage_in_a_registry_is_told(own, run, tmp_path):
     with pytest.raises(ConfigError, match="is no registry"):
         list_registry(tmp_path / "nothing")
     shutil.copytree(own, tmp_path / "own")
-    content = json.loads((tmp_path / "own" / FLEET).read_text())
+    content = json.loads((tmp_path / "own" / "fleet.json").read_text())
     content["machines"][0]["delta"] = "../../secret"
-    write_json(tmp_path / "own" / FLEET, content)
+    write_json(tmp_path / "own" / "fleet.json", content)
     with pytest.raises(StorageError, match="no fine-tuning writes"):
         add_to_registry(top, tmp_path / "own", "hostile")
 

@@ -125,8 +125,7 @@ def _reported(machine: StoredMachine, result: UnitResult) -> ReportedMachine:
 
 def _deltas(folder: Path) -> dict[str, Path]:
     """Files of deltas by machine."""
-    rows = read_fleet(folder)["machines"]
-    return {row["machine"]: folder / row["delta"] for row in rows if "delta" in row}
+    return {row.machine: folder / row.delta for row in read_fleet(folder).machines if row.delta is not None}
 
 
 def _unit(machine: StoredMachine, digest: str, question: FleetQuestion, delta: Path | None) -> WorkUnit:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -14,6 +14,7 @@ from edp import __version__
 from edp.config.experiment import Change
 from edp.data.prepared import Prepared
 from edp.errors import ConfigError, EdpError, StorageError, closest
+from edp.evaluation.fleet_file import FleetFile, MachineDelta
 from edp.evaluation.judge import score_predictions
 from edp.evaluation.scores_file import MEAN, metric
 from edp.jobs import Workers
@@ -21,8 +22,9 @@ from edp.jobs.workers import UNITS, WorkUnit
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
 from edp.progress import SILENT, Progress
+from edp.settings.results import read_part
 from edp.signals import KINDS
-from edp.storage import make_folder, object_with, read_object, write_bytes, write_json
+from edp.storage import make_folder, write_bytes
 from edp.storage.ledger import TrainingIdentity, WithState
 from edp.storage.paths import full_path, is_file_at
 from edp.storage.runs import Run, check_claimable, missing_text, run_key
@@ -34,8 +36,7 @@ from edp.workflows.transfer.case import TransferCase
 from edp.workflows.transfer.finetune import target_data
 from edp.workflows.transfer.source import SourceModel, read_source, target_experiment
 
-FLEET, DELTAS = "fleet.json", "deltas"
-SCHEMA = 1
+DELTAS = "deltas"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +74,7 @@ def finetune_fleet(
     order: PersonalOrder,
     out: str | Path,
     progress: Progress = SILENT,
-) -> dict[str, Any]:
+) -> FleetFile:
     """Fine-tune a network for each machine of a store, and keep what changed.
 
     Each recording is divided by time: its beginning trains, a part validates, its end tests. A machine that is done is
@@ -111,21 +112,20 @@ def finetune_fleet(
             if result.content is not None:
                 row["delta"] = f"{DELTAS}/{file_of(machine.name)}"
                 write_bytes(make_folder(run.file(DELTAS)) / file_of(machine.name), result.content)
-            rows.append(row)
-        content = {
-            "schema": SCHEMA,
-            "edp": __version__,
-            "base": digest,
-            "source": str(full_path(Path(source))),
-            "store": str(full_path(Path(store))),
-            "method": order.method,
-            "most_bytes": order.most_bytes,
-            "unit": _unit_of(base),
-            "horizon": base.bundle.task.horizons[0],
-            "rate_hz": base.bundle.task.rate_hz,
-            "machines": rows,
-        }
-        write_json(run.file(FLEET), content)
+            rows.append(read_part(MachineDelta, row, f"the result of machine '{machine.name}'"))
+        content = FleetFile(
+            edp=__version__,
+            base=digest,
+            source=str(full_path(Path(source))),
+            store=str(full_path(Path(store))),
+            method=order.method,
+            most_bytes=order.most_bytes,
+            unit=_unit_of(base),
+            horizon=base.bundle.task.horizons[0],
+            rate_hz=base.bundle.task.rate_hz,
+            machines=tuple(rows),
+        )
+        content.write(run.path)
     return content
 
 
@@ -146,13 +146,12 @@ def network_of(folder: str | Path, machine: str, out: str | Path, base: str | Pa
         BundleError: the delta is one of another network, or damaged.
     """
     content = read_fleet(folder)
-    rows = {row["machine"]: row for row in content["machines"]}
+    rows = {row.machine: row for row in content.machines}
     if machine not in rows:
         raise ConfigError(f"'{folder}' has no machine '{machine}'{closest(machine, rows)}")
-    row = rows[machine]
-    if "failed" in row:
-        raise ConfigError(f"machine '{machine}' has no network of its own: {row['failed']}")
-    bundle = load_bundle(base or content["source"])
+    if rows[machine].failed is not None:
+        raise ConfigError(f"machine '{machine}' has no network of its own: {rows[machine].failed}")
+    bundle = load_bundle(base or content.source)
     delta = read_delta(Path(folder, DELTAS, file_of(machine)))
     own = with_delta(bundle.predictor, delta)
     strategy = {"method": "delta", "source": {"weights": delta.base}, **delta.facts}
@@ -165,22 +164,15 @@ def file_of(machine: str) -> str:
     return hashlib.blake2b(machine.encode(), digest_size=12).hexdigest() + SUFFIX
 
 
-def read_fleet(folder: str | Path) -> dict[str, Any]:
+def read_fleet(folder: str | Path) -> FleetFile:
     """Return the content of ``fleet.json``.
 
     Raises:
-        StorageError: it is missing or damaged.
-        ConfigError: of another schema.
+        StorageError: it is missing, damaged or of another version.
     """
-    file = Path(folder, FLEET)
-    if not is_file_at(file):
+    if not is_file_at(Path(folder, FleetFile.NAME)):
         raise StorageError(missing_text(folder, "fleet", "a fleet"))
-    content = object_with(read_object(file), ("schema", "base", "source", "machines"), f"'{file}'")
-    if content["schema"] != SCHEMA:
-        raise ConfigError(f"'{file}' has schema {content['schema']}; this version of EDP reads {SCHEMA}: update it")
-    for row in content["machines"]:
-        object_with(row, ("machine",), f"'{file}'")
-    return content
+    return FleetFile.read(folder)
 
 
 def _unit_of(base: SourceModel) -> str:
@@ -248,9 +240,3 @@ def _source(path: str, digest: str) -> SourceModel:
     if weights_digest(source.predictor) != digest:
         raise ConfigError(f"'{path}' holds another network on this node; all nodes must see the same file there")
     return source
-
-
-def errors_by_machine(content: Mapping[str, Any]) -> Sequence[tuple[str, float, float, float]]:
-    """Machine and errors before, after its own fine-tuning, and of its delta, of those that have one."""
-    rows = [row for row in content["machines"] if "mae" in row]
-    return [(row["machine"], row["mae"]["before"], row["mae"]["full"], row["mae"]["delta"]) for row in rows]

@@ -16,6 +16,7 @@ from typing import Any
 
 from edp import __version__
 from edp.errors import ConfigError, EdpError, StorageError, closest
+from edp.evaluation.fleet_file import FleetFile
 from edp.evaluation.scores_file import MEAN, ScoresFile, metric
 from edp.networks.predictor import describe
 from edp.settings.provenance import DataPart, Provenance, read_provenance
@@ -36,7 +37,7 @@ from edp.storage.paths import entries_of, is_file_at, is_folder_at
 from edp.training import Bundle, load_bundle, save_bundle
 from edp.training.bundle import weights_digest
 from edp.training.delta import MOST_BYTES, read_delta
-from edp.workflows.fleet.personal import FLEET, read_fleet
+from edp.workflows.fleet.personal import read_fleet
 
 ENTRIES, FILES, LOCK = "entries", "files", ".lock"
 SCHEMA = 1
@@ -98,7 +99,7 @@ def add_to_registry(registry: str | Path, source: str | Path, name: str) -> Regi
     top = check_writable(registry)
     lock = hold(top / LOCK)
     try:
-        if is_file_at(folder / FLEET):
+        if is_file_at(folder / FleetFile.NAME):
             return _add_fleet(top, folder, name)
         return _add_network(top, folder, name)
     finally:
@@ -127,31 +128,31 @@ def _add_network(top: Path, folder: Path, name: str) -> RegistryEntry:
 
 def _add_fleet(top: Path, folder: Path, name: str) -> RegistryEntry:
     content = read_fleet(folder)
-    names = [_plain_name(row["delta"]) for row in content["machines"] if "delta" in row]
+    names = [_plain_name(row.delta) for row in content.machines if row.delta is not None]
     files = {name: read_bytes(folder / name, MOST_BYTES) for name in names}
     for file in files:
-        if read_delta(folder / file).base != content["base"]:
-            raise StorageError(f"'{folder / file}' is a delta of another network than '{folder / FLEET}' says")
+        if read_delta(folder / file).base != content.base:
+            raise StorageError(f"'{folder / file}' is a delta of another network than '{folder / FleetFile.NAME}' says")
     state = hashlib.blake2b(digest_size=16)
     for file in sorted(files):
         state.update(f"{file}\0".encode() + files[file])
     digest = state.hexdigest()
     if _is_there(top, digest):
         return read_entry(top, digest)
-    errors = [row["mae"] for row in content["machines"] if "mae" in row]
+    errors = list(content.errors.values())
     judge = {} if not errors else {
         "judged": "ends of the machines' recordings, which did not train",
-        "unit": content["unit"],
-        "horizon": content["horizon"],
-        **{part: sum(one[part] for one in errors) / len(errors) for part in ("before", "full", "delta")},
+        "unit": content.unit,
+        "horizon": content.horizon,
+        **{part: sum(getattr(one, part) for one in errors) / len(errors) for part in ("before", "full", "delta")},
     }  # fmt: skip
     entry = RegistryEntry(
         id=digest,
         kind=FLEET_KIND,
         name=name,
-        label=f"{len(files)} deltas, {sum(map(len, files.values())) / 1024:,.0f} kB, method {content['method']}",
-        base=content["base"],
-        data={"source": content["store"], "machines": [row["machine"] for row in content["machines"]]},
+        label=f"{len(files)} deltas, {sum(map(len, files.values())) / 1024:,.0f} kB, method {content.method}",
+        base=content.base,
+        data={"source": content.store, "machines": [row.machine for row in content.machines]},
         judge=judge,
         added=time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         edp=__version__,
@@ -160,7 +161,7 @@ def _add_fleet(top: Path, folder: Path, name: str) -> RegistryEntry:
     for file, data in files.items():
         make_folder((target / file).parent)
         write_bytes(target / file, data)
-    write_json(target / FLEET, content)
+    content.write(target)
     return _entered(top, entry)
 
 
