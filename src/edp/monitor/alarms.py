@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from typing import Protocol, TypeVar
+from typing import Literal, Protocol, TypeVar
 
 from edp.monitor.diagnosis.causes import NONE_OF_THESE, Cause
 from edp.storage.reading import Table
 
-SEVERITIES = ("note", "warning", "stop")
+Severity = Literal["note", "warning", "stop"]
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class MonitorAlarm:
             deviations, the largest first.
         causes: of a diagnosis, the most probable first; empty without one.
         sentence: all of this for a reader.
-        severity: one of `SEVERITIES`.
+        severity: what to do about it.
     """
 
     recording: str
@@ -39,7 +39,7 @@ class MonitorAlarm:
     evidence: tuple[tuple[str, float], ...]
     causes: tuple[Cause, ...] = ()
     sentence: str = ""
-    severity: str = "warning"
+    severity: Severity = "warning"
 
     def to_json(self) -> Table:
         """Plain JSON values, keys as the fields."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Any
@@ -147,6 +147,17 @@ def check_count(what: str, name: str, entries: Sequence[object], most: int, leas
     """
     if not least <= len(entries) <= most:
         raise ConfigError(f"{what}: {name} has {len(entries):,} entries; {least:,} to {most:,} must hold")
+
+
+def check_texts(what: str, texts: Iterable[str], longest: int) -> None:
+    """Refuse a text that is too long.
+
+    Raises:
+        ConfigError: says how long it is and how long it may be.
+    """
+    length = max(map(len, texts), default=0)
+    if length > longest:
+        raise ConfigError(f"{what}: a text of {length:,} characters; at most {longest:,} must hold")
 
 
 def shown(value: Any) -> str:

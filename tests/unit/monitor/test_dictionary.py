@@ -165,7 +165,7 @@ def alarm_line(**changes):
 @pytest.mark.parametrize(
     "changes",
     [
-        {"raised_s": "soon"}, {"severity": "fatal"}, {"evidence": [["x"]]}, {"causes": [{"kind": "k"}]},
+        {"raised_s": "soon"}, {"severity": "fatal"}, {"evidence": [["x"]]}, {"causes": [{"site": "s"}]},
         {"causes": [1] * 99}, {"sentence": 5}, {"recording": "x" * 9999},
     ],
 )  # fmt: skip

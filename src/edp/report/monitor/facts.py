@@ -7,17 +7,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 
-from edp.monitor.alarms import episodes
+from edp.evaluation.monitor_run_file import LONGEST
+from edp.monitor.alarms import Severity, episodes
 from edp.monitor.diagnosis.causes import NONE_OF_THESE, Cause
 from edp.monitor.diagnosis.sentences import clock
 from edp.monitor.diagnosis.structure import Confusion
 from edp.monitor.traces import RecordingTrace, RunTraces
+from edp.settings.bounds import check_count, check_texts
 from edp.table import Column, Table, Value, figures
 from edp.wording import MISSING, count_text, label_by_name, listed, number, short_labels
 
 MOST_ALARMS = 40
 """With evidence each on a page, alarms that say the same as one; all of them stand in the log."""
 MOST_CAUSES = 5
+MOST_ENTRIES = 64
+"""Pieces of evidence, and causes, of an alarm in a file."""
 MOST_SILENT = 6
 MOST_REMARKS = 6
 OUTSIDE = "no alarm, but "
@@ -49,7 +53,13 @@ class AlarmFacts:
     evidence: tuple[tuple[str, float], ...]
     causes: tuple[Cause, ...]
     sentence: str
-    severity: str
+    severity: Severity
+
+    def __post_init__(self) -> None:
+        for name, entries in (("evidence", self.evidence), ("causes", self.causes)):
+            check_count("alarm", name, entries, MOST_ENTRIES)
+        words = (cause.words for cause in self.causes)
+        check_texts("alarm", (self.recording, self.detector, self.sentence, *words), LONGEST)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +179,11 @@ def tiles(facts: MonitorFacts) -> list[tuple[str, str, str]]:
     return rows
 
 
-SEVERITIES = (("stop", "reasons to stop"), ("warning", "warnings"), ("note", "notes"))
+SEVERITIES: tuple[tuple[Severity, str], ...] = (
+    ("stop", "reasons to stop"),
+    ("warning", "warnings"),
+    ("note", "notes"),
+)
 
 
 def alarm_table(facts: MonitorFacts) -> Table:

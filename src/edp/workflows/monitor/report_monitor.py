@@ -2,31 +2,27 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
-from edp.errors import DataError, StorageError
-from edp.monitor.alarms import SEVERITIES
-from edp.monitor.diagnosis.causes import Cause
-from edp.monitor.diagnosis.structure import MOST_PAIRS, confusion_of
+from edp.errors import StorageError
+from edp.evaluation.monitor_run_file import MonitorRunFile
 from edp.monitor.traces import read_traces
 from edp.report.common.provenance import provenance_rows
 from edp.report.monitor.facts import AlarmFacts, MonitorFacts
 from edp.report.monitor.page import build_monitor_page
 from edp.settings.provenance import Provenance
+from edp.settings.results import read_part
 from edp.storage import JSON_BYTES, object_with, parse_json, read_object, read_text
-from edp.storage.headers import FILES, check_files
+from edp.storage.headers import check_files
 from edp.storage.paths import full_path, is_there
 from edp.storage.provenance import PROVENANCE
 from edp.storage.runs import IDENTITY, missing_text
-from edp.workflows.monitor.run_monitor import ALARM_LOG, RESULT
+from edp.workflows.monitor.run_monitor import ALARM_LOG
 
 PAGE = "report.html"
-LONGEST = 4096
-MOST_ALARMS, MOST_EVIDENCE, MOST_CAUSES, MOST_REMARKED = 100_000, 64, 64, 100_000
+MOST_ALARMS = 100_000
 
 
 def report_monitor(
@@ -57,52 +53,30 @@ def read_run(folder: Path, title: str | None = None) -> MonitorFacts:
         StorageError: it is no run of a monitor, or is damaged.
     """
     # Earlier versions wrote the result into the file that states the identity of a run.
-    file = folder / (RESULT if is_there(folder / RESULT) else IDENTITY)
+    file = folder / (MonitorRunFile.NAME if is_there(folder / MonitorRunFile.NAME) else IDENTITY)
     if not is_there(folder / ALARM_LOG):
         raise StorageError(missing_text(folder, "monitor run"))
-    content = read_object(file, ("promise", "monitor", "classes", "confusions"))
-    check_files(content.get(FILES, {}), folder, "run the monitor again")
-    where = f"'{file}'"
-    pairs, classes = content["confusions"], content["classes"]
-    if not isinstance(pairs, list) or len(pairs) > MOST_PAIRS or type(classes) is not int or classes < 0:
-        raise StorageError(f"{where} is damaged: confusions or classes; run the monitor again")
-    try:
-        confusions = tuple(confusion_of(entry, where) for entry in pairs)
-    except DataError as error:
-        raise StorageError(f"{error}; run the monitor again") from error
+    content = read_object(file)
+    names = {entry.name for entry in fields(MonitorRunFile)}
+    table = {name: value for name, value in content.items() if name in names}
+    result = MonitorRunFile.from_table(table, f"'{file}'")
+    check_files(result.files, folder, "run the monitor again")
     return MonitorFacts(
         title or full_path(folder).name,
         read_traces(folder),
         read_alarms(folder / ALARM_LOG),
-        _text(content["promise"], where),
-        confusions,
-        classes,
+        result.promise,
+        result.confusions,
+        result.classes,
         provenance_rows(_provenance(folder, content)),
-        _remarks(content, where),
-        _text(content.get("unseen", ""), where),
+        result.remarks,
+        result.unseen,
     )
 
 
 def _provenance(folder: Path, content: Mapping[str, object]) -> Provenance:
     file = folder / PROVENANCE
     return Provenance.from_table({**content, **(read_object(file) if is_there(file) else {})}, f"'{file}'")
-
-
-def _remarks(content: Mapping[str, object], where: str) -> dict[str, list[str]]:
-    """Return remarks by recording; runs of earlier versions have fewer of them.
-
-    Raises:
-        StorageError: it is damaged.
-    """
-    remarks: dict[str, list[str]] = {}
-    for key in ("outside", "unlike", "unlearned"):
-        entries = content.get(key, {})
-        if not isinstance(entries, dict) or len(entries) > MOST_REMARKED:
-            raise StorageError(f"{where}: {key} must be an object of at most {MOST_REMARKED}; run the monitor again")
-        for name, texts in entries.items():
-            for remark in texts if isinstance(texts, list) else [texts]:
-                remarks.setdefault(_text(remark, where), []).append(_text(name, where))
-    return remarks
 
 
 def read_alarms(file: Path) -> list[AlarmFacts]:
@@ -117,45 +91,5 @@ def read_alarms(file: Path) -> list[AlarmFacts]:
     return [_alarm(parse_json(line, f"'{file}', line {n}"), f"'{file}', line {n}") for n, line in enumerate(lines, 1)]
 
 
-def _alarm(value: Any, where: str) -> AlarmFacts:
-    entry = object_with(value, [field.name for field in fields(AlarmFacts)], where)
-    evidence, causes = entry["evidence"], entry["causes"]
-    if entry["severity"] not in SEVERITIES:
-        raise StorageError(f"{where}: severity must be one of {', '.join(SEVERITIES)}; run the monitor again")
-    for name, part, most in (("evidence", evidence, MOST_EVIDENCE), ("causes", causes, MOST_CAUSES)):
-        if not isinstance(part, list) or len(part) > most:
-            raise StorageError(f"{where}: {name} must be a list of at most {most}; run the monitor again")
-    if any(not isinstance(pair, list) or len(pair) != 2 for pair in evidence):
-        raise StorageError(f"{where}: evidence must be names with numbers; run the monitor again")
-    recording, detector, sentence = (_text(entry[name], where) for name in ("recording", "detector", "sentence"))
-    raised, since, statistic, limit = (
-        _number(entry[name], where) for name in ("raised_s", "since_s", "statistic", "limit")
-    )
-    shown = tuple((_text(name, where), _number(number, where)) for name, number in evidence)
-    named = tuple(_cause(cause, where) for cause in causes)
-    return AlarmFacts(recording, raised, since, detector, statistic, limit, shown, named, sentence, entry["severity"])
-
-
-def _cause(value: Any, where: str) -> Cause:
-    names = [entry.name for entry in fields(Cause)]
-    entry: Mapping[str, object] = object_with(value, names, where)
-    if entry["at_fault"] not in ("sensor", "machine", "none") or not isinstance(entry["grave"], bool):
-        raise StorageError(f"{where}: a cause is damaged; run the monitor again")
-    kind, site, component, unit, words = (
-        _text(entry[name], where) for name in ("kind", "site", "component", "unit", "words")
-    )
-    size, grade = (None if entry[name] is None else _number(entry[name], where) for name in ("size", "grade"))
-    probability = _number(entry["probability"], where)
-    return Cause(kind, site, component, entry["at_fault"], size, unit, probability, words, grade, entry["grave"])
-
-
-def _text(value: Any, where: str) -> str:
-    if not isinstance(value, str) or len(value) > LONGEST:
-        raise StorageError(f"{where}: a text of at most {LONGEST} characters must be there; run the monitor again")
-    return value
-
-
-def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise StorageError(f"{where}: a finite number must be there; run the monitor again")
-    return float(value)
+def _alarm(value: object, where: str) -> AlarmFacts:
+    return read_part(AlarmFacts, object_with(value, (), where), where, "alarm", MonitorRunFile.ADVICE)

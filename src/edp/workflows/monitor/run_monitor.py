@@ -7,13 +7,14 @@ import io
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from edp.evaluation.monitor_run_file import MonitorRunFile
 from edp.jobs import IN_PROCESS, Workers
 from edp.jobs.packing import pack, unpack
 from edp.jobs.workers import UNITS, WorkUnit, forget_units
@@ -28,13 +29,13 @@ from edp.recording import Recording
 from edp.report.monitor.facts import start_time
 from edp.settings.provenance import new_provenance
 from edp.storage import write_bytes, write_json
-from edp.storage.headers import FILES, digests_of, model_digest
+from edp.storage.headers import digests_of, model_digest
 from edp.storage.ledger import TrainingIdentity, WithState
 from edp.storage.paths import full_path
 from edp.storage.provenance import PROVENANCE
 from edp.storage.runs import Run, check_claimable, run_key
 
-ALARM_LOG, RESULT = "alarms.jsonl", "monitor_run.json"
+ALARM_LOG = "alarms.jsonl"
 START = "start"
 """Where the meta of a recording says when it began, as ISO 8601 text."""
 
@@ -266,19 +267,19 @@ def _write(run: MonitorRun, folder: Path, monitor: str) -> None:
     dictionary = run.monitor.diagnosis
     write_alarms(run.alarms, folder / ALARM_LOG)
     write_traces(folder, run.traces)
-    facts = {
-        "monitor": monitor,
-        "promise": run.monitor.limit.sentence(),
-        "recordings": len(run.recordings),
-        "silent": {name: list(channels) for name, channels in run.silent.items()},
-        "unlearned": {name: list(reasons) for name, reasons in run.unlearned.items()},
-        "unlike": dict(run.unlike),
-        "outside": {name: f"no alarm, but {reason}" for name, reason in run.outside.items()},
-        "unseen": unseen_line(found_sizes(run.monitor.provenance)),
-        "classes": 0 if dictionary is None else len(dictionary.classes),
-        "confusions": [] if dictionary is None else [asdict(pair) for pair in dictionary.confusions],
-    }
-    write_json(folder / RESULT, facts | {FILES: digests_of(folder, ALARM_LOG)})
+    MonitorRunFile(
+        monitor=monitor,
+        promise=run.monitor.limit.sentence(),
+        recordings=len(run.recordings),
+        silent=run.silent,
+        unlearned=run.unlearned,
+        unlike=run.unlike,
+        outside={name: f"no alarm, but {reason}" for name, reason in run.outside.items()},
+        unseen=unseen_line(found_sizes(run.monitor.provenance)),
+        classes=0 if dictionary is None else len(dictionary.classes),
+        confusions=() if dictionary is None else dictionary.confusions,
+        files=digests_of(folder, ALARM_LOG),
+    ).write(folder)
 
 
 def write_alarms(alarms: tuple[MonitorAlarm, ...], out: str | Path) -> tuple[Path, Path]:
