@@ -79,7 +79,7 @@ def main(bench: Bench) -> object:
     order = SimulationOrder(minutes=minutes, recordings=6 if quick else round(minutes / 3), seed=seed + 1)
     simulate_data_set(logs, order)
     spec = LimitSpec(horizons=HORIZONS, **({"moments": 8, "branches": 4} if quick else {}))
-    limit = bench.part("limit", lambda: find_data_set_limit(logs, order, spec))
+    limit = bench.part("limit", lambda: find_data_set_limit(logs, order, spec).to_table())
     limits = {k: float(row[-1]) for k, row in zip(limit["horizons"], limit["commands_unknown"]["mae"], strict=True)}
     twin = bench.part("twin", lambda: forecasts(logs, ahead, work / "grey", seed, quick))
     settings, settings_ahead = experiment(seed, quick), experiment(seed, quick, ahead=True)

@@ -16,7 +16,13 @@ from edp.workflows.search.modules import THESIS_MODULES, TOGGLES, fitting
 from edp.workflows.search.phases import PHASES
 from edp.workflows.search.phases.isolation import arm_settings
 from edp.workflows.search.plan import load_plan
-from edp.workflows.search.settings import CalibrationSpec, ExplorationSpec, ScreeningSpec, SearchSpec, SynthesisSpec
+from edp.workflows.search.settings import (
+    CalibrationSpec,
+    ExplorationSpec,
+    ModuleScreeningSpec,
+    SearchSpec,
+    SynthesisSpec,
+)
 from edp.workflows.search.space import Choice, Real, apply, elastic, halved
 from edp.workflows.search.trainings import SCORES, Outcome, costs_of, settings_of
 
@@ -237,7 +243,7 @@ class World:
 def walked():
     world = World()
     small = {
-        "screening": ScreeningSpec(trials=2),
+        "screening": ModuleScreeningSpec(trials=2),
         "exploration": ExplorationSpec(trials=4),
         "synthesis": SynthesisSpec(trials=3),
         "isolation": dataclasses.replace(PLAN.spec.isolation, runs=10),

@@ -19,8 +19,8 @@ from edp.workflows.search.settings import (
     CompressionSpec,
     ExplorationSpec,
     IsolationSpec,
+    ModuleScreeningSpec,
     PlanningSpec,
-    ScreeningSpec,
     SearchSpec,
     SynthesisSpec,
 )
@@ -364,7 +364,7 @@ def test_the_thesis_mode_walks_the_same_phases_by_its_own_rules():
         CONFIRMED,
         mode="thesis",
         run_seeds=2,
-        screening=ScreeningSpec(trials=3),
+        screening=ModuleScreeningSpec(trials=3),
         planning=PlanningSpec(most_runs=4),
     )
     found = run_phases(context(spec), World(with_effects), until="confirmation")

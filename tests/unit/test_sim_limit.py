@@ -45,32 +45,32 @@ def found():
 
 def test_with_commands_known_only_sensors_are_left_in_free_air(found):
     noise = NOISE_MAE * load_machine("M22").sensors.velocity
-    known = np.array(found["commands_known"]["mae"])
+    known = np.array(found.commands_known.mae)
     assert known.shape == (3, 4)
     np.testing.assert_allclose(known.mean(), noise, rtol=0.1)
     # The valves answer after more than 10 samples: until then nothing that is commanded later can be felt.
-    np.testing.assert_allclose(np.array(found["commands_unknown"]["mae"])[0, 3], noise, rtol=0.2)
+    np.testing.assert_allclose(np.array(found.commands_unknown.mae)[0, 3], noise, rtol=0.2)
 
 
 def test_the_limit_rises_and_lies_below_persistence(found):
-    unknown, persistence = (np.array(found[kind]["mae"])[:, 3] for kind in ("commands_unknown", "persistence"))
+    unknown, persistence = (np.array(getattr(found, kind).mae)[:, 3] for kind in ("commands_unknown", "persistence"))
     assert (unknown < persistence).all()
     assert unknown[2] > 5 * unknown[0]
-    low, high = (np.array(found["commands_unknown"][key])[:, 3] for key in ("low", "high"))
+    low, high = (np.array(getattr(found.commands_unknown, key))[:, 3] for key in ("low", "high"))
     assert ((low <= unknown) & (unknown <= high)).all()
-    assert found["targets"] == ["CylVels_1", "CylVels_2", "CylVels_3"]
-    assert (found["moments"], found["recordings"], found["unit"]) == (8, 4, "mm/s")
+    assert found.targets == ("CylVels_1", "CylVels_2", "CylVels_3")
+    assert (found.moments, found.recordings, found.unit) == (8, 4, "mm/s")
 
 
 def test_the_same_for_any_number_of_workers_and_none_without_noise(found):
     assert find_limit(spec_of().scenarios(), SMALL, workers=Workers(count=2)) == found
     quiet = find_limit(spec_of(sensor_noise=False, recordings=2, minutes=0.4).scenarios(), SMALL)
-    assert np.abs(quiet["commands_known"]["mae"]).max() < 1e-9
+    assert np.abs(quiet.commands_known.mae).max() < 1e-9
 
 
 def test_soil_is_not_known_beforehand():
     soil = spec_of(mix={"dig": 1.0}, materials={"gravel": 1.0}, sensor_noise=False, minutes=2.0)
-    known = np.array(find_limit(soil.scenarios(), SMALL)["commands_known"]["mae"])
+    known = np.array(find_limit(soil.scenarios(), SMALL).commands_known.mae)
     assert known[2, 3] > 0.1
 
 
@@ -84,7 +84,7 @@ def test_it_is_kept_beside_the_logs_until_something_changes(tmp_path):
     assert len(told.steps) == 2
     assert not (tmp_path / "units").exists()
     other = find_data_set_limit(tmp_path, order, dataclasses.replace(SMALL, seed=5), IN_PROCESS)
-    assert other["commands_unknown"] != first["commands_unknown"]
+    assert other.commands_unknown != first.commands_unknown
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from edp.wording import figure, number
 if TYPE_CHECKING:
     from edp.jobs import Workers
     from edp.sim.data_set import SimulationOrder
+    from edp.sim.limit_file import LimitFile
     from edp.sim.predictability import LimitSpec
     from edp.sim.scenario import Scenario
 
@@ -115,7 +116,9 @@ def simulate(
     facts: Table = {"folder": str(folder), "recordings": len(paths), "minutes": order.minutes}
     if order.faults:
         facts["faults"] = [fault_text(entry) for entry in order.faults]
-    facts |= {"machine": what_simulated, "seed": order.seed} | ({} if limit_facts is None else {"limit": limit_facts})
+    facts |= {"machine": what_simulated, "seed": order.seed}
+    if limit_facts is not None:
+        facts["limit"] = limit_facts.to_table()
 
     def show() -> None:
         if limit_facts is not None:
@@ -150,7 +153,7 @@ def run(folder: Path, order: SimulationOrder, workers: Workers | None = None, qu
         return simulate_data_set(folder, order, workers or ONE_PER_CORE, on_done)
 
 
-def run_limit(folder: Path, order: SimulationOrder, spec: LimitSpec, workers: Workers, quiet: bool) -> Table:
+def run_limit(folder: Path, order: SimulationOrder, spec: LimitSpec, workers: Workers, quiet: bool) -> LimitFile:
     """Find the limit of predictability with a progress display."""
     from edp.sim.data_set import find_data_set_limit
 
@@ -158,31 +161,31 @@ def run_limit(folder: Path, order: SimulationOrder, spec: LimitSpec, workers: Wo
         return find_data_set_limit(folder, order, spec, workers, progress)
 
 
-def limit_table(limit: Table) -> None:
+def limit_table(limit: LimitFile) -> None:
     """Print the limit together with persistence."""
     names = [
         target.replace("CylVels_1", "boom").replace("CylVels_2", "arm").replace("CylVels_3", "bucket")
-        for target in limit["targets"]
+        for target in limit.targets
     ]
     rows = []
-    for n, samples in enumerate(limit["horizons"]):
-        unknown, commands_known = limit["commands_unknown"], limit["commands_known"]
-        spread = f"{number(unknown['low'][n][-1], 2)}-{number(unknown['high'][n][-1], 2)}"
+    for n, samples in enumerate(limit.horizons):
+        unknown, commands_known = limit.commands_unknown, limit.commands_known
+        spread = f"{number(unknown.low[n][-1], 2)}-{number(unknown.high[n][-1], 2)}"
         row = [
-            f"{samples} ({figure(1000 * samples / limit['rate_hz'])} ms)",
-            *(number(v, 2) for v in unknown["mae"][n]),
+            f"{samples} ({figure(1000 * samples / limit.rate_hz)} ms)",
+            *(number(v, 2) for v in unknown.mae[n]),
         ]
         rows.append(
             [
                 *row,
                 spread,
-                number(commands_known["mae"][n][-1], 2),
-                number(limit["persistence"]["mae"][n][-1], 2),
+                number(commands_known.mae[n][-1], 2),
+                number(limit.persistence.mae[n][-1], 2),
             ]
         )
     title = (
-        f"Least mean absolute error of any predictor, {limit['unit']} "
-        f"({limit['moments']} moments of {count_of(limit['recordings'], 'recording')}, {limit['branches']} futures "
+        f"Least mean absolute error of any predictor, {limit.unit} "
+        f"({limit.moments} moments of {count_of(limit.recordings, 'recording')}, {limit.branches} futures "
         "each)"
     )
     table(title, ["k", *names, "mean", "95 %", "commands known", "persistence"], rows)

@@ -7,7 +7,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from edp.logs import LAYOUTS, WriteOptions, known_suffixes, read_recording, writ
 from edp.progress import SILENT, Progress
 from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, MOTOR_CHANNELS, TABLE_A1
 from edp.sim.excitation import EXCITATIONS
+from edp.sim.limit_file import LimitFile
 from edp.sim.plan import DataSetSpec, machine_hash, scenario_of_unit
 from edp.sim.predictability import LimitSpec, find_limit
 from edp.sim.scenario import Scenario, plain
@@ -39,7 +40,6 @@ from edp.storage.paths import full_path, is_entry_at, is_folder_at, is_there
 from edp.wording import typed
 
 MANIFEST = "data_set.json"
-LIMIT = "limit.json"
 LOCK = ".lock"
 ONE_PER_CORE = Workers(count=0)
 BYTES_PER_VALUE = {".parquet": 3.0, ".csv": 10.0, ".mat": 3.0}
@@ -251,7 +251,7 @@ def find_data_set_limit(
     spec: LimitSpec | None = None,
     workers: Workers = ONE_PER_CORE,
     progress: Progress = SILENT,
-) -> dict[str, Any]:
+) -> LimitFile:
     """Estimate the predictability limit of a simulated data set, and write it to ``limit.json`` next to its logs.
 
     A limit that is there already from the same order and settings is kept.
@@ -270,15 +270,15 @@ def find_data_set_limit(
     spec = spec or LimitSpec()
     plan = order.scenarios()
     key = _digest([identity_of(plan, WriteOptions()), asdict(spec)])
-    target = make_folder(folder) / LIMIT
-    if is_entry_at(target):
-        stored_limit = read_json(target)
-        if isinstance(stored_limit, dict) and stored_limit.get("key") == key:
+    top = make_folder(folder)
+    if is_entry_at(top / LimitFile.NAME):
+        stored_limit = LimitFile.read(top)
+        if stored_limit.key == key:
             return stored_limit
-    check_writable(target.parent)
-    units = target.parent / UNITS
-    limit = find_limit(plan, spec, workers, progress, units) | {"key": key}
-    write_json(target, limit)
+    check_writable(top)
+    units = top / UNITS
+    limit = replace(find_limit(plan, spec, workers, progress, units), key=key)
+    limit.write(top)
     forget_units(units)
     return limit
 

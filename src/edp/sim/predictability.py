@@ -25,6 +25,7 @@ from edp.jobs.workers import WorkUnit
 from edp.progress import SILENT, Progress
 from edp.settings.bounds import MOST_HORIZONS, MOST_NAMES, SEED, check_bounds, check_count, integer, shown
 from edp.signals import TABLE_A1
+from edp.sim.limit_file import LimitErrors, LimitFile, Rows
 from edp.sim.machine import layout as at
 from edp.sim.plan import machine_hash, scenario_of_unit
 from edp.sim.scenario import Scenario, plain
@@ -204,8 +205,8 @@ def find_limit(
     workers: Workers = IN_PROCESS,
     progress: Progress = SILENT,
     folder: Path | None = None,
-) -> Table:
-    """Return the predictability limit of a data set as plain data in mm/s, equal for any number of workers.
+) -> LimitFile:
+    """Return the predictability limit of a data set in mm/s, equal for any number of workers.
 
     Args:
         scenarios: of the recordings.
@@ -213,11 +214,6 @@ def find_limit(
         workers: who simulates the branches.
         progress: receiver of the progress; its units are recordings.
         folder: of the errors of each recording, so that a stopped call continues; None keeps none.
-
-    Returns:
-        ``commands_unknown``, ``commands_known`` and ``persistence`` (the present value as the guess, at the same
-        moments), each with ``mae``, ``low`` and ``high`` (95 % by resampling whole recordings): a row a horizon, a
-        column for each of ``targets`` and one for their mean.
 
     Raises:
         ConfigError: the recordings are too short.
@@ -232,23 +228,27 @@ def find_limit(
         parts.append(1e3 * np.concatenate((part, part.mean(axis=-1, keepdims=True)), axis=-1))
     low, high = _confidence(parts, np.random.default_rng([spec.seed, 2]))
     mean = np.concatenate(parts).mean(axis=0)
-    tables = {
-        kind: {name: np.round(table[n], 5).tolist() for name, table in (("mae", mean), ("low", low), ("high", high))}
-        for n, kind in enumerate(KINDS)
-    }
-    return {
-        "schema": 1,
-        "unit": "mm/s",
-        "rate_hz": jobs[0].scenario.rate_hz,
-        "horizons": list(spec.horizons),
-        "targets": list(TARGETS),
-        "confidence": CONFIDENCE,
-        "moments": spec.moments,
-        "branches": spec.branches,
-        "recordings": len(jobs),
-        "seed": spec.seed,
-        **tables,
-    }
+    commands_unknown, commands_known, persistence = (
+        LimitErrors(mae=_rows(mean[n]), low=_rows(low[n]), high=_rows(high[n])) for n in range(len(KINDS))
+    )
+    return LimitFile(
+        unit="mm/s",
+        rate_hz=jobs[0].scenario.rate_hz,
+        horizons=tuple(spec.horizons),
+        targets=tuple(TARGETS),
+        confidence=CONFIDENCE,
+        moments=spec.moments,
+        branches=spec.branches,
+        recordings=len(jobs),
+        seed=spec.seed,
+        commands_unknown=commands_unknown,
+        commands_known=commands_known,
+        persistence=persistence,
+    )
+
+
+def _rows(table: Array) -> Rows:
+    return tuple(tuple(row) for row in np.round(table, 5).tolist())
 
 
 def _unit(job: LimitJob) -> WorkUnit:

@@ -225,10 +225,11 @@ def test_figures_stay_on_the_line_of_their_unit_and_name():
 def limit_of(**changes):
     table = {"mae": [[1, 1, 1, 0.32], [6, 5, 4, 5.04]], "low": [[0, 0, 0, 0.3], [4, 4, 4, 4.1]]}
     table["high"] = [[1, 1, 1, 0.35], [7, 7, 7, 6.2]]
-    known = {"mae": [[0, 0, 0, 0.3], [0, 0, 0, 0.33]]}
+    known = {name: [[0, 0, 0, 0.3], [0, 0, 0, 0.33]] for name in ("mae", "low", "high")}
     tables = {"commands_unknown": table, "commands_known": known, "persistence": known}
     targets = ["CylVels_1", "CylVels_2", "CylVels_3"]
-    return {"unit": "mm/s", "rate_hz": 100.0, "horizons": [1, 10], "targets": targets, **tables, **changes}
+    counts = {"schema": 1, "confidence": 0.95, "moments": 8, "branches": 4, "recordings": 2, "seed": 0}
+    return {"unit": "mm/s", "rate_hz": 100.0, "horizons": [1, 10], "targets": targets, **counts, **tables, **changes}
 
 
 def test_the_limit_of_the_data_becomes_a_line(run_folder, tmp_path):
@@ -246,7 +247,7 @@ def test_the_limit_of_the_data_becomes_a_line(run_folder, tmp_path):
     assert any("limit of predictability" in line for line in verdict_lines(read_facts(run_folder)))
 
 
-@pytest.mark.parametrize("change", [{"horizons": [1, 20]}, {"rate_hz": 50.0}, {"targets": ["CylVels_1"]}])
+@pytest.mark.parametrize("change", [{"horizons": [1, 20]}, {"rate_hz": 50.0}, {"targets": ["a", "b", "c"]}])
 def test_a_limit_of_other_signals_or_horizons_is_not_shown(run_folder, tmp_path, change):
     path = tmp_path / "limit.json"
     write_json(path, limit_of(**change))
@@ -256,5 +257,5 @@ def test_a_limit_of_other_signals_or_horizons_is_not_shown(run_folder, tmp_path,
 def test_a_file_that_is_no_limit_is_refused(run_folder, tmp_path):
     path = tmp_path / "limit.json"
     path.write_text("{}")
-    with pytest.raises(StorageError, match="holds no limit of predictability"):
+    with pytest.raises(StorageError, match="'horizons' is missing"):
         read_facts(run_folder, path)

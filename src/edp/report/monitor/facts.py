@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 
-from edp.evaluation.monitor_run_file import LONGEST
 from edp.monitor.alarms import Severity, episodes
 from edp.monitor.diagnosis.causes import NONE_OF_THESE, Cause
 from edp.monitor.diagnosis.sentences import clock
 from edp.monitor.diagnosis.structure import Confusion
+from edp.monitor.run_file import LONGEST
 from edp.monitor.traces import RecordingTrace, RunTraces
 from edp.settings.bounds import check_count, check_texts
 from edp.table import Column, Table, Value, figures

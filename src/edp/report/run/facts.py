@@ -16,7 +16,8 @@ from edp.evaluation.guard import MEASURE, MEASURE_NAME, network_verdict
 from edp.evaluation.scores_file import MEAN, ModelScores, ScoredTarget, ScoresFile, error_at
 from edp.report.run.outputs import by_output, judged_line, losses_line, minutes_of, situation_line
 from edp.settings.provenance import DataOrigin, Provenance
-from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, parse_toml, read_json, read_object, read_text
+from edp.sim.limit_file import LimitFile
+from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, parse_toml, read_object, read_text
 from edp.storage.headers import check_files
 from edp.storage.paths import is_file_at, is_folder_at
 from edp.storage.provenance import PROVENANCE
@@ -41,8 +42,6 @@ MAKERS = {
     "predictions.safetensors": "edp evaluate",
     "footprint.json": "edp evaluate",
 }
-LIMIT_FILE = "limit.json"
-LIMIT_KINDS = ("commands_unknown", "commands_known", "persistence")
 METRICS = ("rmse", "mae", "p95", "p99", "r2", "bias", "composite")
 
 
@@ -66,7 +65,7 @@ class Facts:
     footprint: FootprintFile | None = None
     predictions: Mapping[str, Mapping[str, NDArray[np.floating]]] = field(default_factory=dict)
     absent: tuple[str, ...] = ()
-    limit: Mapping[str, Any] | None = None
+    limit: LimitFile | None = None
     foundation: Mapping[str, Any] | None = None
 
     @property
@@ -193,7 +192,7 @@ def read_history(path: Path) -> tuple[Mapping[str, Any], ...]:
     return tuple(epochs)
 
 
-def read_limit(path: Path | None, provenance: Provenance | None) -> Table | None:
+def read_limit(path: Path | None, provenance: Provenance | None) -> LimitFile | None:
     """Return the limit in a file, or in the folder of the run's data; None if there is none.
 
     Raises:
@@ -202,16 +201,12 @@ def read_limit(path: Path | None, provenance: Provenance | None) -> Table | None
     if path is None:
         origin = DataOrigin() if provenance is None else provenance.origin
         source = Path(str(origin.reader.get("path") or origin.source or ""))
-        path = source / LIMIT_FILE
+        path = source / LimitFile.NAME
         if not is_folder_at(source) or not is_file_at(path):
             return None
     elif is_folder_at(path):
-        path = path / LIMIT_FILE
-    limit = read_json(path)
-    complete = isinstance(limit, dict) and {"unit", "rate_hz", "horizons", "targets", *LIMIT_KINDS} <= limit.keys()
-    if not complete:
-        raise StorageError(f"'{path}' holds no limit of predictability; `edp simulate FOLDER --limit` writes one")
-    return dict(limit)
+        path = path / LimitFile.NAME
+    return LimitFile.from_file(path)
 
 
 def _read_foundation(folder: Path) -> Table | None:
@@ -381,15 +376,15 @@ def _figures(facts: Facts, rows: Sequence[ComparisonRow], samples: int) -> str:
 def limit_line(facts: Facts, samples: int | None) -> str:
     """State the limit at `samples` ahead; empty if it belongs to other signals or is unknown there."""
     limit = facts.limit
-    if limit is None or samples is None or facts.rate_hz != limit["rate_hz"] or samples not in limit["horizons"]:
+    if limit is None or samples is None or facts.rate_hz != limit.rate_hz or samples not in limit.horizons:
         return ""
-    if [target.name for target in facts.targets] != list(limit["targets"]) or facts.unit != limit["unit"]:
+    if tuple(target.name for target in facts.targets) != limit.targets or facts.unit != limit.unit:
         return ""
-    row = list(limit["horizons"]).index(samples)
-    unknown = limit["commands_unknown"]
-    least, low, high = (unknown[key][row][-1] for key in ("mae", "low", "high"))
+    row = limit.horizons.index(samples)
+    unknown = limit.commands_unknown
+    least, low, high = unknown.mae[row][-1], unknown.low[row][-1], unknown.high[row][-1]
     least_error = number(least, interval_decimals(low, high))
-    error_with_commands = number(limit["commands_known"]["mae"][row][-1], 2)
+    error_with_commands = number(limit.commands_known.mae[row][-1], 2)
     return (
         f"The limit of predictability here is {least_error} {facts.unit} (95 %: {interval(low, high)}): even a "
         "predictor that "

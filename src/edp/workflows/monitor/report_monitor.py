@@ -7,7 +7,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from edp.errors import StorageError
-from edp.evaluation.monitor_run_file import MonitorRunFile
+from edp.monitor.run_file import MonitorRunFile
 from edp.monitor.traces import read_traces
 from edp.report.common.provenance import provenance_rows
 from edp.report.monitor.facts import AlarmFacts, MonitorFacts

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from edp.evaluation.monitor_run_file import MonitorRunFile
 from edp.jobs import IN_PROCESS, Workers
 from edp.jobs.packing import pack, unpack
 from edp.jobs.workers import UNITS, WorkUnit, forget_units
@@ -23,6 +22,7 @@ from edp.monitor.alarms import MonitorAlarm, episodes
 from edp.monitor.detectable import found_sizes, outside_line, unseen_line
 from edp.monitor.monitor import Monitor, Watched
 from edp.monitor.monitor_file import load_monitor
+from edp.monitor.run_file import MonitorRunFile
 from edp.monitor.traces import RecordingTrace, RunTraces, write_traces
 from edp.progress import SILENT, Progress
 from edp.recording import Recording

@@ -95,7 +95,7 @@ class CalibrationSpec:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScreeningSpec:
+class ModuleScreeningSpec:
     """Phase 2: the effect of each module.
 
     Attributes:
@@ -305,7 +305,7 @@ class SearchSpec:
     limits: dict[str, float] = field(default_factory=dict)
     isolation: IsolationSpec = field(default_factory=IsolationSpec)
     calibration: CalibrationSpec = field(default_factory=CalibrationSpec)
-    screening: ScreeningSpec = field(default_factory=ScreeningSpec)
+    screening: ModuleScreeningSpec = field(default_factory=ModuleScreeningSpec)
     planning: PlanningSpec = field(default_factory=PlanningSpec)
     confirmation: ConfirmationSpec = field(default_factory=ConfirmationSpec)
     synthesis: SynthesisSpec = field(default_factory=SynthesisSpec)

@@ -18,8 +18,8 @@ from edp.workflows.search.settings import (
     CalibrationSpec,
     ExplorationSpec,
     IsolationSpec,
+    ModuleScreeningSpec,
     PlanningSpec,
-    ScreeningSpec,
     SearchSpec,
     SynthesisSpec,
 )
@@ -35,7 +35,7 @@ SPEC = SearchSpec(
     run_seeds=2,
     isolation=IsolationSpec(runs=6),
     calibration=CalibrationSpec(trials=8),
-    screening=ScreeningSpec(runs=32, repeats=1, trials=2),
+    screening=ModuleScreeningSpec(runs=32, repeats=1, trials=2),
     planning=PlanningSpec(most_runs=6),
     synthesis=SynthesisSpec(trials=6),
     exploration=ExplorationSpec(trials=12),

@@ -61,7 +61,7 @@ def _thesis(context: SearchContext) -> Decision:
     The standard deviation between seeds is the largest of all backbones (3.3.1); the error of which a share is to be
     seen is that of the baseline's backbone in phase 0. Both with the feature set that went on.
     """
-    spec, wanted = context.spec, context.spec.planning
+    spec, planning = context.spec, context.spec.planning
     isolation, backbone = context.facts(IsolationFacts), context.facts(CalibrationFacts).backbone
     arms = {name: isolation.arms[f"{name} {isolation.features}"].mae for name in spec.backbones}
     sigma = max(arm.seed or 0.0 for arm in arms.values())
@@ -73,15 +73,15 @@ def _thesis(context: SearchContext) -> Decision:
             mean,
             sigma,
             spec.run_seeds,
-            share=wanted.least_effect,
+            share=planning.least_effect,
             alpha=spec.confirmation.alpha,
-            power=wanted.power,
+            power=planning.power,
         )
-    runs = min(plan.splits or 2, wanted.most_runs)
+    runs = min(plan.splits or 2, planning.most_runs)
     text = (
         f"J = {plan.splits} splits of {spec.run_seeds} seeds after eq. 3.42 (seeds differ by {typed(sigma, 3)}"
-        f"{behind(context.unit)}, {typed(100 * wanted.least_effect)} % of an MAE of {typed(mean, 3)} are to be seen); "
-        f"{runs} are made."
+        f"{behind(context.unit)}, {typed(100 * planning.least_effect)} % of an MAE of {typed(mean, 3)} are to be "
+        f"seen); {runs} are made."
     )
     return Decision("planning", ThesisPlanning(**vars(plan), runs=runs, mae=mean, sigma_seed=sigma), (text,))
 
