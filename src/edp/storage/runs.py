@@ -21,7 +21,7 @@ from edp.storage.paths import entries_of, files_below, full_path, is_file_at, is
 from edp.storage.reading import read_object
 from edp.storage.run_kinds import RUN_KINDS, RunKind
 from edp.storage.seals import sealed_line
-from edp.storage.writing import make_folder, remove_unfinished, write_bytes, write_json
+from edp.storage.writing import TEMPORARY, make_folder, remove_unfinished, write_bytes, write_json
 
 IDENTITY, STATUS = "run.json", "status.json"
 FINISHED = "finished"
@@ -306,7 +306,8 @@ def check_free(path: str | Path, what: str) -> None:
         return
     if not is_folder_at(folder):
         raise StorageError(f"'{folder}' is a file; {what} writes a folder: choose another name")
-    others = sorted(entry.name for entry in entries_of(folder) if entry.name not in LEFT)
+    names = sorted(entry.name for entry in entries_of(folder))
+    others = [name for name in names if name not in LEFT and TEMPORARY.fullmatch(name) is None]
     if others:
         raise StorageError(
             f"folder '{folder}' is not empty and holds no run ('{others[0][:60]}'); nothing was changed. Choose a new "

@@ -3,11 +3,13 @@
 import contextlib
 import inspect as source_of
 import json
+import os
 import re
 import shutil
 import signal
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 from typer.main import get_command
@@ -350,9 +352,10 @@ class Changes:
         self.count = len(self.seen) + count
 
     def __call__(self):
-        for file in self.folder.rglob("*"):
-            with contextlib.suppress(FileNotFoundError):
-                self.seen.add((file, file.stat().st_mtime_ns))
+        for folder, _, names in os.walk(self.folder):  # passes over what vanishes meanwhile
+            for name in names:
+                with contextlib.suppress(FileNotFoundError):
+                    self.seen.add((folder, name, Path(folder, name).stat().st_mtime_ns))
         return len(self.seen) >= self.count
 
 

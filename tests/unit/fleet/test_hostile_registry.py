@@ -43,11 +43,11 @@ def test_a_base_that_is_no_identifier_is_damage(registry, base):
     entries, damaged = list_registry(registry)
     assert [entry.id for entry in entries] == [GOOD]
     assert len(damaged) == 1
-    assert "identifier is none" in damaged[0]
+    assert "is no identifier" in damaged[0]
 
 
 def test_an_identifier_that_is_a_path_is_refused(registry):
-    with pytest.raises(StorageError, match="identifier is none"):
+    with pytest.raises(StorageError, match="is no identifier"):
         read_entry(registry, "../../secret")
 
 

@@ -10,9 +10,9 @@ import hashlib
 import re
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 from edp import __version__
 from edp.errors import ConfigError, EdpError, StorageError, closest
@@ -20,14 +20,13 @@ from edp.evaluation.fleet_file import FleetFile
 from edp.evaluation.scores_file import MEAN, ScoresFile, metric
 from edp.networks.predictor import describe
 from edp.settings.provenance import DataPart, Provenance, read_provenance
+from edp.settings.results import ResultFile
 from edp.settings.tree import Table
 from edp.storage import (
     check_writable,
     hold,
     make_folder,
-    object_with,
     read_bytes,
-    read_object,
     release,
     write_bytes,
     write_json,
@@ -40,17 +39,15 @@ from edp.training.delta import MOST_BYTES, read_delta
 from edp.workflows.fleet.personal import read_fleet
 
 ENTRIES, FILES, LOCK = "entries", "files", ".lock"
-SCHEMA = 1
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 IDENTIFIER = re.compile(r"[0-9a-f]{32}")
 PART = re.compile(r"\[\d+:\d+\]$")
 """Ticks of a recording behind its name, where a part holds some of it."""
 SCORES = "scores.json"
-NETWORK, FLEET_KIND = "network", "fleet"
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegistryEntry:
+class RegistryEntry(ResultFile):
     """A network, or the deltas of a fleet, in a registry.
 
     Attributes:
@@ -64,17 +61,31 @@ class RegistryEntry:
             nobody judged it.
         added: when it entered.
         edp: version that entered it.
+
+    Raises:
+        ConfigError: an identifier that is none.
     """
 
+    NAME = "entries/ID.json"
+    SCHEMA = 1
+    WHAT = "entry"
+    ADVICE = "restore it from a copy of the registry"
+
     id: str
-    kind: str
+    kind: Literal["network", "fleet"]
     name: str
     label: str
     base: str
-    data: Mapping[str, Any]
-    judge: Mapping[str, Any]
+    data: Mapping[str, object]
+    judge: Mapping[str, object]
     added: str
     edp: str
+
+    def __post_init__(self) -> None:
+        # A base names the next file that is read; a path in its place would lead out of the registry.
+        for name in (self.id, *filter(None, [self.base])):
+            if not IDENTIFIER.fullmatch(name):
+                raise ConfigError(f"entry: '{name[:40]}' is no identifier")
 
 
 def add_to_registry(registry: str | Path, source: str | Path, name: str) -> RegistryEntry:
@@ -113,7 +124,7 @@ def _add_network(top: Path, folder: Path, name: str) -> RegistryEntry:
         return read_entry(top, digest)
     entry = RegistryEntry(
         id=digest,
-        kind=NETWORK,
+        kind="network",
         name=name,
         label=describe(bundle.predictor.spec),
         base=_base_of(bundle.provenance),
@@ -148,7 +159,7 @@ def _add_fleet(top: Path, folder: Path, name: str) -> RegistryEntry:
     }  # fmt: skip
     entry = RegistryEntry(
         id=digest,
-        kind=FLEET_KIND,
+        kind="fleet",
         name=name,
         label=f"{len(files)} deltas, {sum(map(len, files.values())) / 1024:,.0f} kB, method {content.method}",
         base=content.base,
@@ -178,7 +189,7 @@ def _is_there(top: Path, digest: str) -> bool:
 
 def _entered(top: Path, entry: RegistryEntry) -> RegistryEntry:
     """Write an entry after all its files."""
-    write_json(make_folder(top / ENTRIES) / f"{entry.id}.json", {"schema": SCHEMA, **asdict(entry)})
+    write_json(make_folder(top / ENTRIES) / f"{entry.id}.json", entry.to_table())
     return entry
 
 
@@ -211,7 +222,7 @@ def _recordings(parts: Sequence[DataPart]) -> int:
     return len(names) or sum(part.recordings for part in parts)
 
 
-def _judge_of(folder: Path, bundle: Bundle) -> dict[str, Any]:
+def _judge_of(folder: Path, bundle: Bundle) -> Table:
     """Return the errors of the run's own test part and the best baseline's, from ``scores.json``."""
     file = folder / SCORES
     if not is_file_at(file):
@@ -263,22 +274,13 @@ def read_entry(registry: str | Path, digest: str) -> RegistryEntry:
     Raises:
         StorageError: missing or damaged.
     """
+    if not IDENTIFIER.fullmatch(digest):
+        raise StorageError(f"'{digest[:40]}' is no identifier of an entry in '{registry}'")
     file = Path(registry, ENTRIES, f"{digest}.json")
-    names = [field.name for field in fields(RegistryEntry)]
-    content = object_with(read_object(file), ("schema", *names), f"'{file}'")
-    if content["schema"] != SCHEMA:
-        raise StorageError(f"'{file}' has schema {content['schema']}, {SCHEMA} is read here: update EDP")
-    texts = ("id", "kind", "name", "label", "base", "added", "edp")
-    if content["id"] != digest or not all(isinstance(content[name], str) for name in texts):
-        raise StorageError(f"'{file}' is damaged: it is no entry of '{digest}'; restore it")
-    # A base names the next file that is read; a path in its place would lead out of the registry.
-    if not IDENTIFIER.fullmatch(digest) or not (content["base"] == "" or IDENTIFIER.fullmatch(content["base"])):
-        raise StorageError(f"'{file}' is damaged: what it calls an identifier is none; restore it")
-    if content["kind"] not in (NETWORK, FLEET_KIND):
-        raise StorageError(f"'{file}' is damaged: there is no kind '{content['kind'][:40]}' of entries; restore it")
-    if not isinstance(content["data"], dict) or not isinstance(content["judge"], dict):
-        raise StorageError(f"'{file}' is damaged: data and judge must be tables; restore it")
-    return RegistryEntry(**{name: content[name] for name in names})
+    entry = RegistryEntry.from_file(file)
+    if entry.id != digest:
+        raise StorageError(f"'{file}' is damaged: it is no entry of '{digest}'; {RegistryEntry.ADVICE}")
+    return entry
 
 
 def find_entry(registry: str | Path, asked: str) -> RegistryEntry:
@@ -320,7 +322,7 @@ def check_entry(registry: str | Path, entry: RegistryEntry) -> None:
         EdpError: they are missing, damaged, or others.
     """
     folder = Path(registry, FILES, entry.id)
-    if entry.kind == NETWORK:
+    if entry.kind == "network":
         if weights_digest(load_bundle(folder).predictor) != entry.id:
             raise StorageError(f"'{folder}' holds another network than its entry; restore it")
         return
