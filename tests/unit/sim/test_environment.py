@@ -252,6 +252,7 @@ def test_episodes_without_a_seed_go_on_with_the_generator():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
+        ({"settings": "M22"}, "got 'M22' as settings, expected an EnvironmentSpec"),
         ({"machin": "M22"}, "setting 'machin' is unknown; did you mean 'machine'"),
         ({"machine": "M23"}, "unknown machine 'M23'"),
         ({"material": "mud"}, "unknown material 'mud'"),

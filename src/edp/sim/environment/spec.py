@@ -153,8 +153,14 @@ def settings_of(settings: EnvironmentSpec | None, changes: Table) -> Environment
     """Return the settings (default if None) with the changes applied.
 
     Raises:
-        ConfigError: a change names no setting (the closest is offered), or is out of range.
+        ConfigError: `settings` is something else, a change names no setting (the closest is offered), or is out of
+            range.
     """
+    if not isinstance(settings, EnvironmentSpec | None):
+        raise ConfigError(
+            f"environment: got {shown(settings)} as settings, expected an EnvironmentSpec; give settings by name, such "
+            "as machine='M22'"
+        )
     names = [entry.name for entry in fields(EnvironmentSpec)]
     for name in changes:
         if name not in names:
