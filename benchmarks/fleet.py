@@ -335,7 +335,6 @@ def deltas(fleet: Fleet) -> dict[str, Any]:
         "trained_min": float(np.mean([row.trained_min for row in content.machines if row.trained_min is not None])),
         **{part: float(np.mean([row[1 + n] for row in rows])) for n, part in enumerate(("before", "full", "delta"))},
     }
-    print(found, flush=True)
     return found
 
 

@@ -278,7 +278,7 @@ def main(bench: Bench) -> object:
         bench.verdicts.append(Verdict(n, v, b, ratio, goal, v <= b, "count", bench.quick))
     bench.check("comments per 100 lines", house.comments, 3.0, ">= 1", "comments")
     if not bench.quick:
-        for target, bound in (("check", 150.0), ("test", 300.0)):
+        for target, bound in (("check", 120.0), ("test", 600.0)):
             seconds = _processor_seconds(target)
             rows.append((f"make {target}, processor seconds", seconds, f"<= {bound:g}"))
             bench.check(f"make {target}", seconds, bound, "<= 1", "s")
