@@ -19,7 +19,7 @@ def test_an_open_cluster_is_refused_before_anything_is_sent(address, mode, monke
         monkeypatch.setenv("RAY_AUTH_MODE", mode)
     monkeypatch.setattr(cluster, "_ray", lambda: pytest.fail("Ray was reached"))
     with pytest.raises(ConfigError, match=r"without a token.*RAY_AUTH_MODE=token.*--open-cluster"):
-        Resources(cluster=address).gather()
+        Resources(cluster=address).open()
 
 
 class Reached(Exception):
@@ -46,4 +46,4 @@ def test_a_token_loopback_or_a_word_opens_the_way(address, mode, allowed, monkey
         monkeypatch.setenv("RAY_AUTH_MODE", mode)
     monkeypatch.setattr(cluster, "_ray", reached)
     with pytest.raises(Reached):
-        Resources(cluster=address, open_cluster=allowed).gather()
+        Resources(cluster=address, open_cluster=allowed).open()

@@ -104,7 +104,7 @@ def run(
     plan = load_plan(config, preset, changes)
     check_effects(context, {"budget": plan.spec.compression.on})
     resources = Resources(
-        workers=workers,
+        count=workers,
         threads=threads,
         seconds=seconds,
         memory_mb=memory,

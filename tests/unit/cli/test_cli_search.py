@@ -59,8 +59,8 @@ def test_ctrl_c_leaves_a_study_that_goes_on(edp, command, tmp_path, start, stop_
         (("--preset", "quik"), "did you mean 'quick'"),
         (("--phase", "screning"), "did you mean 'screening'"),
         (("--set", "search.mode=fast"), "sound or thesis"),
-        (("--workers", "-1"), "0 <= workers <= 4,096 must hold"),
-        (("--set", "search.trails=3"), "did you mean 'trials'"),
+        (("--workers", "-1"), "0 <= count <= 4,096 must hold"),
+        (("--set", "search.calibration.trails=3"), "did you mean 'trials'"),
         (("--set", "search.limits={flops=3}"), "limits.flops"),
     ],
 )

@@ -53,7 +53,7 @@ def test_a_study_on_three_nodes_of_which_one_is_killed_finds_what_one_machine_fi
     resources = Resources(cluster=cluster.address)
     there = run_search(six_sessions, plan, tmp_path / "there", resources, "calibration", NotedProgress(kill_one))
     assert done == [3]
-    here = run_search(six_sessions, plan, tmp_path / "here", Resources(workers=1), "calibration")
+    here = run_search(six_sessions, plan, tmp_path / "here", Resources(count=1), "calibration")
     assert there.digest == here.digest
     assert there.trained == here.trained == 11
     assert there.context.decided == here.context.decided
@@ -81,19 +81,19 @@ def test_caps_failures_and_cancelling_are_those_of_the_local_pool(cluster, job_o
 @needs_ray
 def test_no_cluster_at_an_address_is_told_at_once():
     with pytest.raises(ConfigError, match=r"nothing answers at '127\.0\.0\.1:9'.*ray start --head"):
-        Resources(cluster="127.0.0.1:9").gather()
+        Resources(cluster="127.0.0.1:9").open()
 
 
 def test_without_ray_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ConfigError, match=r"\[cluster\]"):
-        Resources(cluster="auto", open_cluster=True).gather()
+        Resources(cluster="auto", open_cluster=True).open()
 
 
 def test_workers_of_two_kinds_are_refused():
-    with pytest.raises(ConfigError, match="give one of the two"):
-        Resources(cluster="auto", workers=2)
-    assert isinstance(Resources(workers=1).gather(), LocalPool)
+    with pytest.raises(ConfigError, match="expected one of the two"):
+        Resources(cluster="auto", count=2)
+    assert isinstance(Resources(count=1).open(), LocalPool)
 
 
 class OneNode:

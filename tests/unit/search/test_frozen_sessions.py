@@ -86,7 +86,7 @@ class Inline:
 
 
 class Here(Resources):
-    def gather(self):
+    def open(self):
         return Inline()
 
 
@@ -102,7 +102,7 @@ def plan():
 @pytest.fixture(scope="module")
 def explored(six_sessions, plan, tmp_path_factory):
     folder = tmp_path_factory.mktemp("frozen") / "study"
-    run_search(six_sessions, plan, folder, Here(workers=1), until="exploration")
+    run_search(six_sessions, plan, folder, Here(count=1), until="exploration")
     return folder
 
 
@@ -116,7 +116,7 @@ def seen():
 def study(explored, six_sessions, plan, seen, tmp_path_factory):
     folder = shutil.copytree(explored, tmp_path_factory.mktemp("finished") / "study")
     with watching(seen):
-        return run_search(six_sessions, plan, folder, Here(workers=1))
+        return run_search(six_sessions, plan, folder, Here(count=1))
 
 
 @pytest.fixture(scope="module")
@@ -276,7 +276,7 @@ def test_phase_6_killed_after_each_training_comes_to_the_same(
 
     for _ in range(20):
         try:
-            found = run_search(six_sessions, plan, folder, Here(workers=1), progress=NotedProgress(kill))
+            found = run_search(six_sessions, plan, folder, Here(count=1), progress=NotedProgress(kill))
         except Killed:
             sittings += 1
             if harm != "none":

@@ -81,7 +81,7 @@ class Inline:
 
 
 class Here(Resources):
-    def gather(self):
+    def open(self):
         return Inline()
 
 
@@ -89,7 +89,7 @@ class Stop(Exception):
     """Stands for Ctrl-C."""
 
 
-CREW = Here(workers=1)
+CREW = Here(count=1)
 
 
 @pytest.fixture(scope="module")

@@ -64,11 +64,11 @@ class Inline:
 
 
 class Here(Resources):
-    def gather(self):
+    def open(self):
         return Inline()
 
 
-CREW = Here(workers=1)
+CREW = Here(count=1)
 
 
 class Stop(Exception):
@@ -255,11 +255,11 @@ def test_a_lost_training_stops_the_search_and_is_tried_again(six_sessions, plan,
             )
 
     class Unlucky(Resources):
-        def gather(self):
+        def open(self):
             return Killed()
 
     with pytest.raises(LostError, match=r"8 trainings lost.*signal 9.*same command again") as told:
-        run_search(six_sessions, plan, tmp_path, Unlucky(workers=1), "isolation")
+        run_search(six_sessions, plan, tmp_path, Unlucky(count=1), "isolation")
     assert told.value.exit_code == 75
     assert run_search(six_sessions, plan, tmp_path, CREW, "isolation").trained == 8
 

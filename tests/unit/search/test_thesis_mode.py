@@ -70,11 +70,11 @@ class Inline:
 
 
 class Here(Resources):
-    def gather(self):
+    def open(self):
         return Inline()
 
 
-CREW = Here(workers=1)
+CREW = Here(count=1)
 
 
 class Stop(Exception):

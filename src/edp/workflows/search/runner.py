@@ -17,15 +17,14 @@ from edp.data.frozen import SECOND_TEST_SET, ByFrozen
 from edp.errors import ConfigError, DataError
 from edp.evaluation.study import Decision, SessionSets, StudyData, StudyFile, facts_of_kind
 from edp.evaluation.study_facts import ExplorationFacts, SynthesisFacts
-from edp.jobs import Executor, LocalPool, RayPool
+from edp.jobs import Workers
 from edp.logs.source import DataSource
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
-from edp.settings.bounds import MOST_THREADS, above, check_bounds, integer
+from edp.settings.bounds import above, check_bounds
 from edp.signals import KINDS
 from edp.storage import make_folder, write_bytes
 from edp.storage.ledger import Ledger, Record, check_uncoordinated
-from edp.storage.portable import cores
 from edp.wording import typed
 from edp.workflows.search.context import SearchContext, is_enough, set_apart
 from edp.workflows.search.engine import Dispatcher, run_phases
@@ -42,49 +41,25 @@ MOST_SECONDS, MOST_MB = 31_557_600.0, 1e9  # a year, a petabyte: caps beyond cap
 
 
 @dataclass(frozen=True, kw_only=True)
-class Resources:
-    """Who does the trainings.
+class Resources(Workers):
+    """Processes that execute the trainings of a search, and limits of each training.
 
     Attributes:
-        workers: processes of this machine; 0 for one to each of its cores (of those that this process may use) over
-            `threads`.
-        threads: of each training; another number gives other bits, and is another training.
-        seconds: cap on the time of a training.
-        memory_mb: cap on its memory.
-        cluster: address of a Ray cluster that does them instead; empty for this machine.
-        open_cluster: take a cluster without a token at an address that other computers may reach.
+        count: number of processes of this machine; 0 for the number of cores divided by `threads`.
+        seconds: limit of the time of a training, s.
+        memory_mb: limit of its memory, MB.
 
     Raises:
         ConfigError: a number out of range, or workers of this machine and a cluster.
     """
 
-    workers: int = 0
-    threads: int = 1
+    count: int = 0
     seconds: float | None = None
     memory_mb: float | None = None
-    cluster: str = ""
-    open_cluster: bool = False
 
     def __post_init__(self) -> None:
-        check_bounds(
-            "search",
-            self,
-            workers=integer(0, MOST_THREADS),
-            threads=integer(1, MOST_THREADS),
-            seconds=above(0.0, MOST_SECONDS),
-            memory_mb=above(0.0, MOST_MB),
-        )
-        if self.cluster and self.workers:
-            raise ConfigError(
-                f"workers = {self.workers} and the cluster '{self.cluster}' came; a cluster has its own number of "
-                "workers, as many as its cores hold: give one of the two"
-            )
-
-    def gather(self) -> Executor:
-        """Return the executor of the trainings."""
-        if self.cluster:
-            return RayPool(self.cluster, self.threads, open_cluster=self.open_cluster)
-        return LocalPool(self.workers or max(1, cores() // self.threads), self.threads)
+        super().__post_init__()
+        check_bounds("search", self, seconds=above(0.0, MOST_SECONDS), memory_mb=above(0.0, MOST_MB))
 
 
 @dataclass(frozen=True)
@@ -167,7 +142,7 @@ def run_search(
             plan.spec, settings, source.to_plain(), development, test, data.channels, data.unit, second=second
         )
         study_log = StudyLog(target, _study(plan, data, source, context), context)
-        executor = open_things.enter_context(resources.gather())
+        executor = open_things.enter_context(resources.open())
         study_log.workers = executor.workers
         observer = _Observer(ledger, study_log, context, progress)
         dispatcher = Dispatcher(
