@@ -110,7 +110,8 @@ def _keep_if_possible(fast: Any, folder: Path) -> None:
         # RuntimeError: Numba has no machine code yet to store, where another thread compiles the same function.
         with contextlib.suppress(OSError, RuntimeError), (folder / "lock").open("w") as stream:
             # Numba numbers the files of a function by its index: two processes would give two signatures one file.
-            lock_file(stream, wait=True)
+            with contextlib.suppress(OSError):  # a file system without locks
+                lock_file(stream, wait=True)
             save(signature, data)
 
     cache.save_overload = save_if_possible

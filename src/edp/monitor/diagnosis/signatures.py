@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from edp.errors import DataError, StorageError
 from edp.monitor.diagnosis.causes import FaultClass, class_of
 from edp.monitor.diagnosis.evidence import Scatter
-from edp.monitor.diagnosis.structure import Confusion, confusion_of
+from edp.monitor.diagnosis.structure import Confusion
 from edp.monitor.stored_arrays import read_stored, shaped, write_stored
+from edp.settings.results import read_part
 from edp.storage.paths import is_there
 
 Array = NDArray[np.float64]
@@ -140,7 +141,7 @@ def load_dictionary(folder: Path, summaries: Sequence[str]) -> Dictionary | None
         raise StorageError(f"{where}: signatures must be a number from 1 to {MOST_SIGNATURES}; fit the monitor again")
     try:
         classes = tuple(class_of(entry, where) for entry in entries)
-        pairs = tuple(confusion_of(entry, where) for entry in header.get("confusions", []))
+        pairs = tuple(read_part(Confusion, entry, where) for entry in header.get("confusions", []))
     except (DataError, TypeError) as error:
         raise StorageError(f"{where} is damaged: {error}; fit the monitor again") from error
     width = 2 * len(summaries)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.errors import DataError
+from edp.settings.bounds import SHARE, check_bounds, check_texts
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -30,6 +29,9 @@ class Confusion:
         error: share of wrong answers between the two on sessions that nothing was fitted to.
         sensor: channel that would separate them best; empty where none does.
         sensor_error: the same share with it; None without one.
+
+    Raises:
+        ConfigError: a share outside of 0 to 1, or a name that is too long.
     """
 
     first: str
@@ -38,23 +40,9 @@ class Confusion:
     sensor: str = ""
     sensor_error: float | None = None
 
-
-def confusion_of(entry: Any, where: str) -> Confusion:
-    """Create a pair from plain data.
-
-    Raises:
-        DataError: it is none.
-    """
-    if not isinstance(entry, Mapping) or set(entry) != {field.name for field in fields(Confusion)}:
-        raise DataError(f"{where}: a pair of faults that cannot be told apart is damaged")
-    pair = Confusion(**entry)
-    texts, shares = (pair.first, pair.second, pair.sensor), (pair.error, pair.sensor_error or 0.0)
-    if not all(isinstance(text, str) and len(text) <= LONGEST_NAME for text in texts):
-        raise DataError(f"{where}: a name of a fault that cannot be told apart is no text")
-    for share in shares:
-        if isinstance(share, bool) or not isinstance(share, int | float) or not 0.0 <= share <= 1.0:
-            raise DataError(f"{where}: an error of faults that cannot be told apart is no share")
-    return pair
+    def __post_init__(self) -> None:
+        check_bounds("confusion", self, error=SHARE, sensor_error=SHARE)
+        check_texts("confusion", (self.first, self.second, self.sensor), LONGEST_NAME)
 
 
 def confusions(
