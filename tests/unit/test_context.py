@@ -46,16 +46,16 @@ def test_errors_are_those_of_streams_that_were_reset_before_each_block(network, 
     each = found.errors[:, :, 0].mean(axis=2)
     gain = each[1] / each[0] - 1
     np.testing.assert_allclose(found.gain()[1], [gain.mean(), gain.std(ddof=1) / np.sqrt(2)])
-    rows = found.to_json()["contexts"]
-    assert [row["seconds"] for row in rows] == [1.0, 4.0]
-    assert rows[0]["change"] == 0.0
+    rows = found.unseen_errors().contexts
+    assert [row.seconds for row in rows] == [1.0, 4.0]
+    assert rows[0].change == 0.0
 
 
 def test_contexts_that_are_too_long_are_dropped_and_said(network, tiny):
     found = context_errors(network, tiny.validation, KINDS, (1.0, 60.0))
     assert found.seconds == (1.0,)
     assert found.dropped == (60.0,)
-    assert found.to_json()["contexts"][0]["change_error"] is None
+    assert found.unseen_errors().contexts[0].change_error is None
     with pytest.raises(DataError, match=r"allows a context of 19.35 s"):
         context_errors(network, tiny.validation, KINDS, (60.0,))
 

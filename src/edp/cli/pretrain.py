@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -20,6 +20,9 @@ from edp.cli.options import (
     workers_of,
 )
 from edp.cli.progress import shown_progress
+
+if TYPE_CHECKING:
+    from edp.evaluation.foundation_file import FoundationFile
 
 
 def pretrain(
@@ -70,10 +73,10 @@ def pretrain(
         _tables(result)
         out.print(f"next: edp finetune {folder} LOGS --out RUN, or edp evaluate {folder}")
 
-    emit(as_json, result | {"run": str(folder)}, show)
+    emit(as_json, result.to_table() | {"run": str(folder)}, show)
 
 
-def _tables(result: dict[str, object]) -> None:
+def _tables(result: FoundationFile) -> None:
     """Machines of each part, and the errors on those that test."""
     from edp.report.run.tables import contexts_table, machine_parts_table
 

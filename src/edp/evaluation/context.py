@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError
+from edp.evaluation.foundation_file import ContextError, UnseenErrors
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
 from edp.signals import KINDS, Kind
@@ -52,20 +53,20 @@ class Contexts:
         error = change.std(axis=1, ddof=1) / np.sqrt(count) if count > 1 else np.full(len(change), np.nan)
         return np.stack([change.mean(axis=1), error], axis=1)
 
-    def to_json(self) -> dict[str, object]:
-        """Plain values; the errors are means over targets of the first horizon."""
-        gains = self.gain()
-        rows = [
-            {
-                "seconds": seconds,
-                "mae": float(self.mean()[i]),
-                "change": float(gains[i, 0]),
-                "change_error": None if np.isnan(gains[i, 1]) else float(gains[i, 1]),
-            }
+    def unseen_errors(self) -> UnseenErrors:
+        """Return means over targets at the first horizon."""
+        gains, means = self.gain(), self.mean()
+        rows = tuple(
+            ContextError(
+                seconds=seconds,
+                mae=float(means[i]),
+                change=float(gains[i, 0]),
+                change_error=None if np.isnan(gains[i, 1]) else float(gains[i, 1]),
+            )
             for i, seconds in enumerate(self.seconds)
-        ]
+        )
         each = {name: float(self.errors[-1, i, 0].mean()) for i, name in enumerate(self.machines)}
-        return {"contexts": rows, "machines": each, "ticks": self.ticks, "dropped": list(self.dropped)}
+        return UnseenErrors(contexts=rows, machines=each, ticks=self.ticks, dropped=self.dropped)
 
 
 def context_errors(

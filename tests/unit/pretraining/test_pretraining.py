@@ -13,6 +13,7 @@ from edp.config.experiment import load_experiment
 from edp.data.chunks import stack
 from edp.data.episodes import EpisodeSampler
 from edp.errors import BundleError, ConfigError, DataError, StorageError
+from edp.evaluation.foundation_file import FoundationFile
 from edp.networks.decomposition import decompose
 from edp.networks.predictor import build_model
 from edp.report import build_report
@@ -71,15 +72,15 @@ def gradient(strategy, episode):
 
 def test_every_method_leaves_a_run_and_errors_on_machines_that_it_never_saw(made, machines):
     folder, found = made
-    assert found == read_json(folder / "foundation.json")
-    assert {part: held["machines"] for part, held in found["data"].items()} == {"train": 4, "validation": 1, "test": 1}
+    assert found == FoundationFile.read(folder)
+    assert {part: size.machines for part, size in found.data.items()} == {"train": 4, "validation": 1, "test": 1}
     names = read_json(folder / "provenance.json")["data"]
     seen = [{name.split("_")[0] for name in names[part]["names"]} for part in ("train", "validation", "test")]
     assert not seen[0] & seen[1] | seen[0] & seen[2] | seen[1] & seen[2]
-    contexts = found["unseen"]["contexts"]
-    assert [row["seconds"] for row in contexts] == [0.5, 2.0, 5.0]
-    assert found["unseen"]["dropped"] == [10.0, 30.0, 60.0]
-    assert all(np.isfinite(row["mae"]) for row in contexts)
+    contexts = found.unseen.contexts
+    assert [row.seconds for row in contexts] == [0.5, 2.0, 5.0]
+    assert found.unseen.dropped == (10.0, 30.0, 60.0)
+    assert all(np.isfinite(row.mae) for row in contexts)
     assert (evaluate(folder, baselines=()) / "scores.json").is_file()
 
 
@@ -89,11 +90,11 @@ def test_the_report_shows_the_machines_that_were_never_seen(made, tmp_path):
     shutil.copytree(folder, copied)
     page = build_report(copied).read_text()
     assert '<section id="unseen">' in page
-    for name, mae in found["unseen"]["machines"].items():
+    for name, mae in found.unseen.machines.items():
         shown = re.search(rf"<td>{name}</td><td>([\d.]+)</td>", page)
         assert float(shown[1]) == pytest.approx(mae, rel=5e-3), name
-    for row in found["unseen"]["contexts"]:
-        assert f"<td>{number(row['mae'])}</td>" in page
+    for row in found.unseen.contexts:
+        assert f"<td>{number(row.mae)}</td>" in page
     (copied / "foundation.json").write_text('{"label": "Joint"}')
     with pytest.raises(StorageError, match="edp pretrain"):
         build_report(copied)
@@ -103,7 +104,7 @@ def test_the_report_shows_the_machines_that_were_never_seen(made, tmp_path):
 
 def test_a_stopped_pretraining_goes_on_to_the_same_bits(made, machines, experiment, tmp_path):
     folder, found = made
-    order = Pretrain(method=found["method"], meta=META)
+    order = Pretrain(method=found.method, meta=META)
 
     def pull(done, **values):
         if "validation_mae" in values and done == 1:
@@ -251,7 +252,7 @@ def test_a_start_is_a_candidate_and_another_start_another_run(machines, experime
 
 def test_streams_are_carried_for_a_minute_unless_the_settings_say_otherwise(made, experiment):
     _, found = made
-    assert found["carried"] == (150 if found["method"] in ("joint", "codes") else 0)
+    assert found.carried == (150 if found.method in ("joint", "codes") else 0)
 
 
 def test_what_cannot_be_is_refused(machines, experiment, tmp_path, prepared_machines):

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from edp.errors import DataError, StorageError, count_of
 from edp.evaluation.footprint_file import FootprintFile
+from edp.evaluation.foundation_file import FoundationFile
 from edp.evaluation.guard import MEASURE, MEASURE_NAME, network_verdict
 from edp.evaluation.scores_file import MEAN, ModelScores, ScoredTarget, ScoresFile, error_at
 from edp.report.run.outputs import by_output, judged_line, losses_line, minutes_of, situation_line
 from edp.settings.provenance import DataOrigin, Provenance
 from edp.sim.limit_file import LimitFile
-from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, parse_toml, read_object, read_text
+from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, parse_toml, read_text
 from edp.storage.headers import check_files
 from edp.storage.paths import is_file_at, is_folder_at
 from edp.storage.provenance import PROVENANCE
@@ -66,7 +67,7 @@ class Facts:
     predictions: Mapping[str, Mapping[str, NDArray[np.floating]]] = field(default_factory=dict)
     absent: tuple[str, ...] = ()
     limit: LimitFile | None = None
-    foundation: Mapping[str, Any] | None = None
+    foundation: FoundationFile | None = None
 
     @property
     def targets(self) -> tuple[ScoredTarget, ...]:
@@ -142,7 +143,7 @@ def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts
         predictions={} if "predictions.safetensors" in absent else _read_predictions(folder),
         absent=absent,
         limit=read_limit(None if limit is None else Path(limit), provenance),
-        foundation=_read_foundation(folder),
+        foundation=FoundationFile.read(folder) if is_file_at(folder / FoundationFile.NAME) else None,
     )
     if facts.scores is not None and facts.predictions:
         check_files(facts.scores.files, folder, f"write it again with `edp evaluate {folder}`")
@@ -207,18 +208,6 @@ def read_limit(path: Path | None, provenance: Provenance | None) -> LimitFile | 
     elif is_folder_at(path):
         path = path / LimitFile.NAME
     return LimitFile.from_file(path)
-
-
-def _read_foundation(folder: Path) -> Table | None:
-    """Return the result of `edp pretrain`; None for another run."""
-    path = folder / "foundation.json"
-    if not is_file_at(path):
-        return None
-    foundation = read_object(path)
-    unseen = foundation.get("unseen")
-    if not {"label", "horizon", "data"} <= foundation.keys() or not {"contexts", "machines"} <= set(unseen or ()):
-        raise StorageError(f"'{path}' does not hold what `edp pretrain` writes; run that command once more")
-    return foundation
 
 
 def _read_predictions(folder: Path) -> dict[str, dict[str, NDArray[np.floating]]]:

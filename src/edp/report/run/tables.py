@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from markupsafe import Markup
 
 from edp.errors import count_of
+from edp.evaluation.foundation_file import FoundationFile
 from edp.evaluation.guard import MEASURE_NAME
 from edp.evaluation.scores_file import MEAN, ModelScores, ScoresFile, error_at
 from edp.report.run.facts import (
@@ -279,22 +279,21 @@ def _ratio(ours: list[float | None], theirs: list[float | None]) -> float | None
     return math.exp(sum(logs) / len(logs)) if logs else None
 
 
-def machine_parts_table(foundation: Mapping[str, Any]) -> Table:
+def machine_parts_table(foundation: FoundationFile) -> Table:
     """Machines, recordings and minutes of each part."""
     heads = ("machines", "recordings", "minutes")
-    rows = tuple((part, *(facts[key] for key in heads)) for part, facts in foundation["data"].items())
+    rows = tuple((part, size.machines, size.recordings, size.minutes) for part, size in foundation.data.items())
     columns = (Column("Part"), *(Column(head.capitalize(), show=_short) for head in heads))
-    return Table(f"{foundation['label']} over many machines", columns, rows, name="parts")
+    return Table(f"{foundation.label} over many machines", columns, rows, name="parts")
 
 
-def contexts_table(foundation: Mapping[str, Any], unit: str = "report units") -> Table:
+def contexts_table(foundation: FoundationFile, unit: str = "report units") -> Table:
     """Error by the time since the state was reset, always on the same ticks."""
-    unseen = foundation["unseen"]
+    unseen = foundation.unseen
     rows: list[tuple[Value, ...]] = []
-    for row in unseen["contexts"]:
-        spread = row["change_error"]
-        half_width = None if spread is None else 196 * spread
-        rows.append((row["seconds"], row["mae"], 100 * row["change"], half_width))
+    for row in unseen.contexts:
+        half_width = None if row.change_error is None else 196 * row.change_error
+        rows.append((row.seconds, row.mae, 100 * row.change, half_width))
     columns = (
         Column("Since reset", "s", _short),
         Column("MAE", unit, figures([row[1] for row in rows], decimals=3)),
@@ -302,8 +301,8 @@ def contexts_table(foundation: Mapping[str, Any], unit: str = "report units") ->
         Column("95 %", "+- %", figures([row[3] for row in rows], decimals=1)),
     )
     caption = (
-        f"Machines that were never seen ({len(unseen['machines'])}), k = {foundation['horizon']}: error by the time "
-        f"since the state was reset, {unseen['ticks']} ticks"
+        f"Machines that were never seen ({len(unseen.machines)}), k = {foundation.horizon}: error by the time "
+        f"since the state was reset, {unseen.ticks} ticks"
     )
     return Table(caption, columns, tuple(rows), name="contexts")
 
@@ -312,8 +311,8 @@ def _short(value: Value) -> str:
     return figure(value) if isinstance(value, int | float) else plainly(value)
 
 
-def machines_table(foundation: Mapping[str, Any], unit: str = "report units") -> Table:
+def machines_table(foundation: FoundationFile, unit: str = "report units") -> Table:
     """Each machine that tests, the hardest first."""
-    each = sorted(foundation["unseen"]["machines"].items(), key=lambda entry: -entry[1])
+    each = sorted(foundation.unseen.machines.items(), key=lambda entry: -entry[1])
     columns = (Column("Machine"), Column("MAE", unit, figures([mae for _, mae in each])))
     return Table("Machines that were never seen, the hardest first", columns, tuple(each), name="machines")

@@ -12,12 +12,12 @@ from edp.data.prepared import Prepared
 from edp.data.splits import ByMachine
 from edp.errors import BundleError, ConfigError
 from edp.evaluation.context import Contexts, context_errors
+from edp.evaluation.foundation_file import FoundationFile, PartSize
 from edp.jobs import IN_PROCESS, Workers
 from edp.jobs.workers import WorkUnit
 from edp.logs.source import DataSource
 from edp.networks.predictor import Predictor
 from edp.progress import SILENT, Progress
-from edp.storage import write_json
 from edp.storage.ledger import TrainingIdentity
 from edp.storage.paths import full_path
 from edp.storage.reading import Table
@@ -30,7 +30,6 @@ from edp.training.pretraining.spec import MetaSpec
 from edp.training.progress_steps import training_steps
 from edp.workflows.train_evaluate import StrategyFactory, prepare_data, train
 
-RESULT = "foundation.json"
 CARRIED_S = 60.0
 """How long joint training carries a stream where the settings leave it open: what is to be identified takes time."""
 
@@ -64,7 +63,7 @@ def pretrain(
     out: str | Path,
     progress: Progress = SILENT,
     workers: Workers = IN_PROCESS,
-) -> Table:
+) -> FoundationFile:
     """Train one network for many machines and judge it on others; a stopped training continues.
 
     What comes out is a run like any other, with ``foundation.json`` beside it.
@@ -112,7 +111,7 @@ def pretrain(
         progress.note("judging on machines that were never seen")
         contexts = context_errors(network, data.test, data.target_kinds)
         result = _result(order, experiment, data, contexts)
-        write_json(run.file(RESULT), result)
+        result.write(run.path)
         run.finish()
     return result
 
@@ -168,24 +167,23 @@ def _carrying(experiment: Experiment, episodic: bool, rate_hz: float) -> Experim
     return replace(experiment, training=replace(experiment.training, chunks=replace(chunks, carried=carried)))
 
 
-def _result(order: Pretrain, experiment: Experiment, data: Prepared, contexts: Contexts) -> Table:
+def _result(order: Pretrain, experiment: Experiment, data: Prepared, contexts: Contexts) -> FoundationFile:
     parts = {part: by_machine(getattr(data, part)) for part in ("train", "validation", "test")}
-    return {
-        "schema": 1,
-        "edp": __version__,
-        "method": order.method,
-        "label": PRETRAININGS[order.method].label,
-        "meta": asdict(order.meta) if PRETRAININGS[order.method].episodic else None,
-        "horizon": data.task.horizons[0],
-        "rate_hz": data.task.rate_hz,
-        "carried": experiment.training.chunks.carried,
-        "data": {
-            part: {
-                "machines": len(owned),
-                "recordings": len(getattr(data, part)),
-                "minutes": round(sum(s.samples for s in getattr(data, part)) / data.task.rate_hz / 60, 2),
-            }
+    return FoundationFile(
+        edp=__version__,
+        method=order.method,
+        label=PRETRAININGS[order.method].label,
+        meta=asdict(order.meta) if PRETRAININGS[order.method].episodic else None,
+        horizon=data.task.horizons[0],
+        rate_hz=data.task.rate_hz,
+        carried=experiment.training.chunks.carried,
+        data={
+            part: PartSize(
+                machines=len(owned),
+                recordings=len(getattr(data, part)),
+                minutes=round(sum(s.samples for s in getattr(data, part)) / data.task.rate_hz / 60, 2),
+            )
             for part, owned in parts.items()
         },
-        "unseen": contexts.to_json(),
-    }
+        unseen=contexts.unseen_errors(),
+    )
