@@ -45,6 +45,7 @@ TAKEN = {
 }
 """By table and key: the slips that are taken, and why."""
 EXAMPLES = {
+    "TrialsSpec": {"trials": 24},
     "FeatureSettings": {"channels": ["a"]},
     "RefusedLog": {"log": "a.csv", "why": "b"},
     "Channel": {"name": "a", "kind": "pressure"},

@@ -18,10 +18,9 @@ from edp.workflows.search.phases.isolation import arm_settings
 from edp.workflows.search.plan import load_plan
 from edp.workflows.search.settings import (
     CalibrationSpec,
-    ExplorationSpec,
     ModuleScreeningSpec,
     SearchSpec,
-    SynthesisSpec,
+    TrialsSpec,
 )
 from edp.workflows.search.space import Choice, Real, apply, elastic, halved
 from edp.workflows.search.trainings import SCORES, Outcome, costs_of, settings_of
@@ -244,8 +243,8 @@ def walked():
     world = World()
     small = {
         "screening": ModuleScreeningSpec(trials=2),
-        "exploration": ExplorationSpec(trials=4),
-        "synthesis": SynthesisSpec(trials=3),
+        "exploration": TrialsSpec(trials=4),
+        "synthesis": TrialsSpec(trials=3),
         "isolation": dataclasses.replace(PLAN.spec.isolation, runs=10),
         "planning": dataclasses.replace(PLAN.spec.planning, most_runs=5),
         "calibration": CalibrationSpec(trials=6, warm_rounds=1),

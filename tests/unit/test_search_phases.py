@@ -17,12 +17,11 @@ from edp.workflows.search.phases import PHASES
 from edp.workflows.search.settings import (
     CalibrationSpec,
     CompressionSpec,
-    ExplorationSpec,
     IsolationSpec,
     ModuleScreeningSpec,
     PlanningSpec,
     SearchSpec,
-    SynthesisSpec,
+    TrialsSpec,
 )
 from edp.workflows.search.smaller import Recipe
 from edp.workflows.search.space import Choice, Real
@@ -305,8 +304,8 @@ CONFIRMED = dataclasses.replace(
     features=("FG1", "FG2"),
     planning=PlanningSpec(most_runs=6),
     calibration=CalibrationSpec(trials=6),
-    synthesis=SynthesisSpec(trials=6),
-    exploration=ExplorationSpec(trials=16),
+    synthesis=TrialsSpec(trials=6),
+    exploration=TrialsSpec(trials=16),
     modules=tuple(THESIS_MODULES),
 )
 
@@ -442,7 +441,7 @@ def test_synergies_that_no_module_has_alone_are_found_by_the_exploration():
         kinds = {block["kind"] for block in settings["model"]["blocks"]}
         return by_rate(settings) * (1 - 0.2 * ({"squeeze_excitation", "temporal_difference"} <= kinds))
 
-    spec = dataclasses.replace(CONFIRMED, exploration=ExplorationSpec(trials=40))
+    spec = dataclasses.replace(CONFIRMED, exploration=TrialsSpec(trials=40))
     world = World(together)
     found = run_phases(context(spec), world)
     facts = found.decided["exploration"].to_json()["facts"]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
+from edp.errors import ConfigError
 from edp.settings.bounds import check_bounds, integer, span
 from edp.settings.results import ResultFile
 
 ERROR = span(0.0, 1e30)
+DELTA_FILE = re.compile(r"deltas/[0-9a-f]{24}\.delta")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +44,9 @@ class MachineDelta:
         trained_min: length of the recordings that trained.
         mae: errors.
         delta: name of the file with the change, relative to the folder.
+
+    Raises:
+        ConfigError: `delta` is not the name of a file that a fine-tuning writes.
     """
 
     machine: str
@@ -51,6 +57,13 @@ class MachineDelta:
     trained_min: float | None = None
     mae: DeltaErrors | None = None
     delta: str | None = None
+
+    def __post_init__(self) -> None:
+        # Readers open this file: a path could lead out of the folder.
+        if self.delta is not None and not DELTA_FILE.fullmatch(self.delta):
+            raise ConfigError(
+                f"machine: got '{self.delta[:80]}' as delta, expected deltas/<24 hexadecimal digits>.delta"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

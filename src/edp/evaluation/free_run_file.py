@@ -80,7 +80,7 @@ class FreeRunErrors:
 
 @dataclass(frozen=True, kw_only=True)
 class RunSummary(FreeRunErrors):
-    """Errors of some of the free runs, `runs` of them."""
+    """Mean errors over `runs` free-run simulations."""
 
     runs: int
 

@@ -23,7 +23,7 @@ class ErrorChange:
 
     @property
     def relative(self) -> float:
-        """Change as a fraction of the error before; zero if one of the errors is zero."""
+        """Relative change of the error, as a fraction of `before`; 0 if an error is 0."""
         return self.after / self.before - 1.0 if self.before > 0 < self.after else 0.0
 
 

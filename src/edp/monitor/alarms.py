@@ -27,7 +27,7 @@ class MonitorAlarm:
             deviations, the largest first.
         causes: of a diagnosis, the most probable first; empty without one.
         sentence: all of this for a reader.
-        severity: what to do about it.
+        severity: grade of the alarm.
     """
 
     recording: str

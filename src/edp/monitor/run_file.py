@@ -1,4 +1,4 @@
-"""Content of ``monitor_run.json``: what a monitor says of the logs that it watched, beside its alarms."""
+"""Content of ``monitor_run.json``: summary of a monitor run, without its alarms."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from edp.monitor.diagnosis.structure import MOST_PAIRS, Confusion
 from edp.settings.bounds import check_bounds, check_count, check_texts, integer
 from edp.settings.results import ResultFile
 
-LONGEST = 4096
-"""Characters of a text in a file of a monitor run."""
+MAX_TEXT = 4096
+"""Maximum number of characters of a text in the files of a monitor run."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,8 +24,8 @@ class MonitorRunFile(ResultFile):
         recordings: number of recordings.
         silent: channels without a value, by recording.
         unlearned: reasons why a monitor has learned nothing for a recording, by recording.
-        unlike: how a recording differs from those of the fit, by recording.
-        outside: which residuals lie outside of their healthy range without an alarm, by recording.
+        unlike: sentence about the difference from the recordings of the fit, by recording.
+        outside: sentence about residuals outside of their healthy range without an alarm, by recording.
         unseen: sentence about faults that silence does not exclude.
         classes: number of faults of the dictionary; 0 without a dictionary.
         confusions: pairs of faults that cannot be told apart.
@@ -51,7 +51,7 @@ class MonitorRunFile(ResultFile):
     def __post_init__(self) -> None:
         check_bounds("monitor run", self, recordings=integer(0, 10**9), classes=integer(0, 10**6))
         check_count("monitor run", "confusions", self.confusions, MOST_PAIRS)
-        check_texts("monitor run", (self.promise, self.unseen, *self.remarks, *chain(*self.remarks.values())), LONGEST)
+        check_texts("monitor run", (self.promise, self.unseen, *self.remarks, *chain(*self.remarks.values())), MAX_TEXT)
 
     @property
     def remarks(self) -> dict[str, list[str]]:

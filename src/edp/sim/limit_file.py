@@ -45,7 +45,7 @@ class LimitFile(ResultFile):
         commands_unknown: errors of a predictor that knows the state and not the commands to come.
         commands_known: errors of a predictor that knows both.
         persistence: errors of the present value as prediction.
-        key: hash of the data set and of the settings; None if the limit is of no data set on disk.
+        key: hash of the data set and of the settings; None without a data set on disk.
 
     Raises:
         ConfigError: a number is out of range, or a table has another shape.

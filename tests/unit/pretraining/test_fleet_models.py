@@ -218,7 +218,7 @@ def test_a_registry_keeps_networks_fleets_and_their_lineage(own, run, tmp_path):
         find_entry(top, "pres")
 
 
-def test_damage_in_a_registry_is_told(own, run, tmp_path):
+def test_damage_in_a_registry_is_told(own, run, store, tmp_path):
     top = tmp_path / "registry"
     base, fleet = add_to_registry(top, run, "foundation"), add_to_registry(top, own, "presses")
     next((top / "files" / fleet.id / "deltas").iterdir()).unlink()
@@ -236,8 +236,10 @@ def test_damage_in_a_registry_is_told(own, run, tmp_path):
     content = json.loads((tmp_path / "own" / "fleet.json").read_text())
     content["machines"][0]["delta"] = "../../secret"
     write_json(tmp_path / "own" / "fleet.json", content)
-    with pytest.raises(StorageError, match="no fine-tuning writes"):
+    with pytest.raises(StorageError, match=r"got '\.\./\.\./secret' as delta"):
         add_to_registry(top, tmp_path / "own", "hostile")
+    with pytest.raises(StorageError, match=r"got '\.\./\.\./secret' as delta"):
+        report_fleet(HERE, FleetQuestion(network=run, store=store, deltas=tmp_path / "own"), tmp_path / "report")
 
 
 @pytest.fixture

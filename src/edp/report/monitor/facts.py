@@ -11,7 +11,7 @@ from edp.monitor.alarms import Severity, episodes
 from edp.monitor.diagnosis.causes import NONE_OF_THESE, Cause
 from edp.monitor.diagnosis.sentences import clock
 from edp.monitor.diagnosis.structure import Confusion
-from edp.monitor.run_file import LONGEST
+from edp.monitor.run_file import MAX_TEXT
 from edp.monitor.traces import RecordingTrace, RunTraces
 from edp.settings.bounds import check_count, check_texts
 from edp.table import Column, Table, Value, figures
@@ -20,8 +20,8 @@ from edp.wording import MISSING, count_text, label_by_name, listed, number, shor
 MOST_ALARMS = 40
 """With evidence each on a page, alarms that say the same as one; all of them stand in the log."""
 MOST_CAUSES = 5
-MOST_ENTRIES = 64
-"""Pieces of evidence, and causes, of an alarm in a file."""
+MAX_ENTRIES = 64
+"""Maximum number of causes, and of pieces of evidence, per alarm."""
 MOST_SILENT = 6
 MOST_REMARKS = 6
 OUTSIDE = "no alarm, but "
@@ -57,9 +57,9 @@ class AlarmFacts:
 
     def __post_init__(self) -> None:
         for name, entries in (("evidence", self.evidence), ("causes", self.causes)):
-            check_count("alarm", name, entries, MOST_ENTRIES)
+            check_count("alarm", name, entries, MAX_ENTRIES)
         words = (cause.words for cause in self.causes)
-        check_texts("alarm", (self.recording, self.detector, self.sentence, *words), LONGEST)
+        check_texts("alarm", (self.recording, self.detector, self.sentence, *words), MAX_TEXT)
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,19 +49,19 @@ MOVED = {
     "joint_trials": "synthesis.trials",
     "free_trials": "exploration.trials",
 }
-"""Keys of earlier versions, without a table for each phase.
+"""Current setting by the key of earlier versions.
 
-The identity of a study keeps them, so that studies which an earlier version began go on.
+The identity of a study keeps the earlier keys, so that studies of earlier versions continue.
 """
 
 
 @dataclass(frozen=True, kw_only=True)
 class IsolationSpec:
-    """Phase 0: the spread of scores of each backbone with each feature set.
+    """Phase 0: size of the variance estimate for each backbone and feature set.
 
     Attributes:
-        runs: training runs, in whole repeats of the folds.
-        seeds: of each of these runs.
+        runs: number of training runs, a multiple of the number of folds.
+        seeds: number of random seeds per run.
 
     Raises:
         ConfigError: a value out of range.
@@ -77,11 +77,11 @@ class IsolationSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrationSpec:
-    """Phase 1: the best settings of each backbone.
+    """Phase 1: size of the hyperparameter search for each backbone.
 
     Attributes:
-        trials: questions for each backbone.
-        warm_rounds: rounds in which every size is asked once before the sampler is free to choose.
+        trials: number of trials per backbone.
+        warm_rounds: number of initial rounds that try each network size once. The sampler chooses the later trials.
 
     Raises:
         ConfigError: a value out of range.
@@ -96,12 +96,12 @@ class CalibrationSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class ModuleScreeningSpec:
-    """Phase 2: the effect of each module.
+    """Phase 2: size of the module screening.
 
     Attributes:
-        runs: mode ``sound``: runs of the two-level design, a power of two; more where the modules need more.
-        repeats: mode ``sound``: how often the design is repeated, each time on another fold.
-        trials: mode ``thesis``: questions for each module.
+        runs: minimum number of runs of the two-level design, a power of two (mode ``sound``).
+        repeats: number of repetitions of the design, each on another fold (mode ``sound``).
+        trials: number of trials per module (mode ``thesis``).
 
     Raises:
         ConfigError: a value out of range.
@@ -117,12 +117,12 @@ class ModuleScreeningSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class PlanningSpec:
-    """Phase 2.5: how many runs the confirmation needs.
+    """Phase 2.5: power analysis for the confirmation.
 
     Attributes:
-        least_effect: the effect to be seen, as a share of the baseline's mean score.
-        power: wanted.
-        most_runs: training runs of each arm that may be spent at most.
+        least_effect: smallest effect to detect, as a fraction of the baseline's mean score.
+        power: probability of detecting this effect.
+        most_runs: maximum number of training runs per arm.
 
     Raises:
         ConfigError: a value out of range.
@@ -140,11 +140,11 @@ class PlanningSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class ConfirmationSpec:
-    """Phase 3: which modules are better than the baseline.
+    """Phase 3: acceptance criteria of a module.
 
     Attributes:
         alpha: significance level, also of the comparisons of later phases.
-        least_gain: least relevant improvement, as a share of the baseline's mean score.
+        least_gain: minimum improvement, as a fraction of the baseline's mean score.
 
     Raises:
         ConfigError: a value out of range.
@@ -158,37 +158,20 @@ class ConfirmationSpec:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SynthesisSpec:
-    """Phase 4: the confirmed modules together.
+class TrialsSpec:
+    """Size of a phase that combines modules: the confirmed modules in phase 4, all modules in phase 5.
 
     Attributes:
-        trials: questions about them.
+        trials: number of trials.
 
     Raises:
-        ConfigError: a value out of range.
+        ConfigError: the number is out of range.
     """
 
-    trials: int = 24
+    trials: int
 
     def __post_init__(self) -> None:
-        check_bounds("search.synthesis", self, trials=COUNT)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExplorationSpec:
-    """Phase 5: all modules together.
-
-    Attributes:
-        trials: questions about them.
-
-    Raises:
-        ConfigError: a value out of range.
-    """
-
-    trials: int = 48
-
-    def __post_init__(self) -> None:
-        check_bounds("search.exploration", self, trials=COUNT)
+        check_bounds("search", self, trials=COUNT)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -308,8 +291,8 @@ class SearchSpec:
     screening: ModuleScreeningSpec = field(default_factory=ModuleScreeningSpec)
     planning: PlanningSpec = field(default_factory=PlanningSpec)
     confirmation: ConfirmationSpec = field(default_factory=ConfirmationSpec)
-    synthesis: SynthesisSpec = field(default_factory=SynthesisSpec)
-    exploration: ExplorationSpec = field(default_factory=ExplorationSpec)
+    synthesis: TrialsSpec = field(default_factory=lambda: TrialsSpec(trials=24))
+    exploration: TrialsSpec = field(default_factory=lambda: TrialsSpec(trials=48))
     compression: CompressionSpec = field(default_factory=CompressionSpec)
 
     def __post_init__(self) -> None:

@@ -16,12 +16,11 @@ from edp.workflows.search.phases import PHASES
 from edp.workflows.search.plan import plain_spec
 from edp.workflows.search.settings import (
     CalibrationSpec,
-    ExplorationSpec,
     IsolationSpec,
     ModuleScreeningSpec,
     PlanningSpec,
     SearchSpec,
-    SynthesisSpec,
+    TrialsSpec,
 )
 from edp.workflows.search.smaller import Recipe
 from edp.workflows.search.space import Choice, Real
@@ -37,8 +36,8 @@ SPEC = SearchSpec(
     calibration=CalibrationSpec(trials=8),
     screening=ModuleScreeningSpec(runs=32, repeats=1, trials=2),
     planning=PlanningSpec(most_runs=6),
-    synthesis=SynthesisSpec(trials=6),
-    exploration=ExplorationSpec(trials=12),
+    synthesis=TrialsSpec(trials=6),
+    exploration=TrialsSpec(trials=12),
     space={"learning_rate": Real(1e-4, 1e-1, log=True), "units": Choice((4, 8, 16, 32))},
     sampler=SamplerSpec(kind="random"),
     backbones=("lstm", "hybrid"),
