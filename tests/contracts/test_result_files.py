@@ -6,8 +6,11 @@ import pkgutil
 
 import pytest
 
+import edp.control
 import edp.evaluation
+import edp.monitor
 import edp.report
+import edp.sim
 from edp.errors import StorageError
 from edp.settings.results import ResultFile
 from edp.storage import write_json
@@ -18,7 +21,7 @@ ODD = (None, "", "text", -1, 0.5, 10**30, True, [], [[]], [None], {}, {"a": 1}, 
 
 def result_files():
     """Every class of result files."""
-    for package in (edp.evaluation, edp.report):
+    for package in (edp.control, edp.evaluation, edp.monitor, edp.report, edp.sim):
         for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             importlib.import_module(found.name)
     return sorted(ResultFile.__subclasses__(), key=lambda kind: kind.__name__)
@@ -28,7 +31,9 @@ CLASSES = result_files()
 
 
 def test_the_result_files_are_found():
-    assert {"ScoresFile", "FreeRunFile", "TransferFile", "FootprintFile", "TuningFile"} <= {c.__name__ for c in CLASSES}
+    assert {"AdaptationFile", "ControlFile", "LimitFile", "MonitorRunFile", "ScoresFile", "TuningFile"} <= {
+        c.__name__ for c in CLASSES
+    }
     assert all(dataclasses.is_dataclass(kind) for kind in CLASSES)
 
 

@@ -57,11 +57,11 @@ def run(lever_sessions, tmp_path_factory):
 @pytest.fixture(scope="module")
 def adapted(run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("adapted") / "run"
-    return folder, *adapt(run, folder, SPEC)
+    return folder, adapt(run, folder, SPEC).adaptation
 
 
 def test_its_numbers_are_those_of_the_runs_recordings(run, adapted):
-    _, made, _ = adapted
+    _, made = adapted
     bundle, _, _, data = trained_run(run)
     inputs = np.concatenate([part.inputs for part in data.train])
     np.testing.assert_allclose(made.offset, inputs.mean(axis=0), rtol=1e-4)
@@ -74,7 +74,7 @@ def test_its_numbers_are_those_of_the_runs_recordings(run, adapted):
 
 
 def test_a_bundle_keeps_it_and_a_damaged_one_is_refused(run, adapted, tmp_path):
-    folder, made, _ = adapted
+    folder, made = adapted
     bundle = load_bundle(folder)
     assert bundle.adaptation.digest == made.digest
     header = read_json(folder / "bundle" / "bundle.json")
@@ -97,7 +97,7 @@ def test_a_bundle_keeps_it_and_a_damaged_one_is_refused(run, adapted, tmp_path):
 
 
 def test_an_adapted_bundle_of_the_former_words_is_upgraded_and_keeps_its_digest(adapted, tmp_path):
-    folder, made, _ = adapted
+    folder, made = adapted
     copy = save_bundle(load_bundle(folder), tmp_path / "copy")
     held = read_json(copy / "bundle.json") | {"schema": 7}
     spec = held["adaptation"]["spec"]
@@ -111,7 +111,7 @@ def test_an_adapted_bundle_of_the_former_words_is_upgraded_and_keeps_its_digest(
 
 
 def test_a_stream_and_a_replay_give_the_same_numbers(run, adapted):
-    folder, made, _ = adapted
+    folder, made = adapted
     bundle, data = load_bundle(folder), trained_run(run)[3]
     part = data.test[0]
     held = replay(bundle.predictor, made, [part]).recordings[0]
@@ -133,7 +133,7 @@ def test_a_stream_and_a_replay_give_the_same_numbers(run, adapted):
 
 
 def test_what_was_learned_can_be_carried_from_one_recording_to_the_next(run, adapted):
-    _, made, _ = adapted
+    _, made = adapted
     bundle, _, _, data = trained_run(run)
     alone, carried = (replay(bundle.predictor, made, data.train[:2], carry=carry) for carry in (False, True))
     np.testing.assert_array_equal(alone.recordings[0].adapted, carried.recordings[0].adapted)
@@ -143,7 +143,7 @@ def test_what_was_learned_can_be_carried_from_one_recording_to_the_next(run, ada
 
 
 def test_an_adapted_run_is_judged_and_counted_and_stays_adapted(run, adapted):
-    folder, made, _ = adapted
+    folder, made = adapted
     evaluate(folder)
     assert load_bundle(folder).adaptation.digest == made.digest
     with_, without = footprint_of(folder)[0], footprint_of(run)[0]
@@ -153,7 +153,7 @@ def test_an_adapted_run_is_judged_and_counted_and_stays_adapted(run, adapted):
 
 
 def test_commands_say_what_it_is_worth(run, adapted, lever_sessions, tmp_path):
-    folder, _, _ = adapted
+    folder, _ = adapted
     runner = CliRunner(env={"COLUMNS": "200"})
     done = runner.invoke(app, ["adapt", str(run), "--out", str(tmp_path / "a"), "--set", "adapt.rank=1", "--json"])
     assert done.exit_code == 0, done.output

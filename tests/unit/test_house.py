@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-OPEN_DICTIONARIES = 403
+OPEN_DICTIONARIES = 388
 WIDE_FUNCTIONS = 43
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 
@@ -44,7 +44,8 @@ def test_rooms_are_few_and_imports_go_down(house):
     # 190 before `edp.table`, which cli, workflows and report import.
     # 190 before logs, simulator and training divided their loops among workers of `edp.jobs`.
     # 198 before report read the provenance of results in `edp.settings`.
-    assert house.arrows <= 199
+    # 199 before report read the results of closed loops by their class in `edp.control`.
+    assert house.arrows <= 200
     assert house.circles == []
 
 

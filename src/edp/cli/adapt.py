@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,8 +11,10 @@ from edp.cli.console import JsonFlag, emit, out, table
 from edp.cli.options import LogsArgument, MapOption, RepairOption, SettingsOption, source_of
 from edp.cli.progress import shown_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
-from edp.storage.reading import Table
 from edp.wording import figure, percent
+
+if TYPE_CHECKING:
+    from edp.evaluation.adaptation_file import AdaptationFile, ReplayErrors
 
 
 def adapt(
@@ -38,19 +40,20 @@ def adapt(
     from edp.workflows.adaptation import adapt as make
 
     spec, _ = command_settings("adapt", AdaptationSpec, config, changes)
-    correction, facts = make(run, folder, spec)
-    verdict = adaptation_verdict(facts)
+    adapted = make(run, folder, spec)
+    correction, content = adapted.adaptation, adapted.content
+    verdict = adaptation_verdict(content)
 
     def show() -> None:
         show_verdict(verdict)
         out.print(f"{correction.features} features, {correction.macs:,} multiply-accumulates a tick; {folder}")
         out.print("its test recordings, each from nothing:")
-        replay_tables(facts)
+        replay_tables(content)
         out.print(f"next: edp replay {folder} LOGS, edp export {folder} --to c --out firmware/predictor")
 
     emit(
         as_json,
-        {"folder": str(folder), "features": correction.features, "macs": correction.macs, "replay": facts}
+        {"folder": str(folder), "features": correction.features, "macs": correction.macs, "replay": content.to_table()}
         | verdict_facts(verdict),
         show,
     )
@@ -82,38 +85,33 @@ def replay(
     from edp.workflows.adaptation import replay_run
 
     with shown_progress("replay", as_json, "done") as progress:
-        facts = replay_run(run, source_of(logs, signal_map, repair), carry, not frozen, progress, twin)
+        content = replay_run(run, source_of(logs, signal_map, repair), carry, not frozen, progress, twin)
 
-    verdict = adaptation_verdict(facts)
+    verdict = adaptation_verdict(content)
 
     def show() -> None:
         show_verdict(verdict)
-        replay_tables(facts)
+        replay_tables(content)
 
-    emit(as_json, facts | verdict_facts(verdict), show)
+    emit(as_json, content.to_table() | verdict_facts(verdict), show)
     end_with(verdict)
 
 
-def replay_tables(facts: Table) -> None:
+def replay_tables(content: AdaptationFile) -> None:
     """Print one table per horizon: MAE with and without adaptation over time in motion, and by target."""
-    units = {target["unit"] for target in facts["targets"]}
+    units = {target.unit for target in content.targets}
     unit = units.pop() if len(units) == 1 else "mixed units"
-    heads = ["seconds of motion", "without", "adapted", "change", *(target["name"] for target in facts["targets"])]
-    for horizon in sorted({row["horizon"] for row in facts["mae"]}):
-        rows = []
-        for row in facts["mae"]:
-            if row["horizon"] == horizon:
-                rows.append(_line(row))
+    heads = ["seconds of motion", "without", "adapted", "change", *(target.name for target in content.targets)]
+    for horizon in sorted({row.horizon for row in content.mae}):
+        rows = [_line(row) for row in content.mae if row.horizon == horizon]
         table(f"MAE k = {horizon} ahead, {unit}; by target: without / adapted", heads, rows)
-    out.print(f"taken back in {percent(facts['fallback'])} of the ticks; {facts['taught']:,} ticks taught")
+    out.print(f"taken back in {percent(content.fallback)} of the ticks; {content.taught:,} ticks taught")
 
 
-def _line(row: Table) -> list[str]:
-    base, adapted = (sum(row[of]) / len(row[of]) for of in ("base", "adapted"))
-    when = (
-        f"over {figure(row['from_s'])}" if row["to_s"] is None else f"{figure(row['from_s'])} to {figure(row['to_s'])}"
-    )
+def _line(row: ReplayErrors) -> list[str]:
+    base, adapted = (sum(errors) / len(errors) for errors in (row.base, row.adapted))
+    when = f"over {figure(row.from_s)}" if row.to_s is None else f"{figure(row.from_s)} to {figure(row.to_s)}"
     # Nothing to relate to where the error is zero.
     change = percent(adapted / base - 1, signed=True) if base else "-"
-    pairs = [f"{figure(b, 3)} / {figure(a, 3)}" for b, a in zip(row["base"], row["adapted"], strict=True)]
+    pairs = [f"{figure(b, 3)} / {figure(a, 3)}" for b, a in zip(row.base, row.adapted, strict=True)]
     return [when, f"{figure(base)}", f"{figure(adapted)}", change, *pairs]

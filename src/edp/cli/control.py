@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,8 +13,10 @@ from edp.cli.options import MOST_LOOPS, ClusterOption, OpenOption, WorkersOption
 from edp.cli.progress import shown_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.storage.paths import full_path
-from edp.storage.reading import Table
 from edp.wording import figure, number
+
+if TYPE_CHECKING:
+    from edp.control.run_file import ControlFile
 
 TaskOption = Annotated[str, typer.Option("--task", help="What to follow: grade, corners, level, point or dig.")]
 MachineOption = Annotated[str, typer.Option("--machine", help="Machine name or file (.toml).")]
@@ -83,14 +85,14 @@ def control(
         run = control_loops(experiment, folder, sources, progress, guard, divided)
 
     def show() -> None:
-        out.print(run.content["sentence"])
+        out.print(run.content.sentence)
         score_table(run.content)
-        for loop in run.content["loops"]:
-            for warning in loop["warnings"]:
-                out.print(f"{loop['name']}: monitor from tick {warning['tick']}: {warning['text']}")
+        for loop in run.content.loops:
+            for warning in loop.warnings:
+                out.print(f"{loop.name}: monitor from tick {warning.tick}: {warning.text}")
         out.print(f"page: {full_path(run.page)}")
 
-    emit(as_json, {"run": str(folder), "page": str(run.page), **run.content}, show)
+    emit(as_json, {"run": str(folder), "page": str(run.page), **run.content.to_table()}, show)
 
 
 def tune(
@@ -156,16 +158,17 @@ def _options(task: str, machine: str, controller: str, seeds: int | None) -> dic
     return options | ({"controller": {"kind": controller}} if controller else {})
 
 
-def score_table(content: Table) -> None:
+def score_table(content: ControlFile) -> None:
     """Print one row per loop."""
     rows = []
-    for loop in content["loops"]:
-        score = loop["score"]
-        cells = [number(score[key], 1) for key in ("position_rms_mm", "position_max_mm", "path_rms_mm", "path_max_mm")]
-        arrived = "-" if score["arrived_s"] is None else number(score["arrived_s"], 2)
-        energy = "-" if score["energy_kj"] is None else number(score["energy_kj"], 0)
-        cells += [number(score["attitude_rms_deg"], 2), arrived, energy, number(score["lever_travel"], 1)]
-        rows.append([loop["name"], *cells, sum(score["violations"].values())])
+    for loop in content.loops:
+        score = loop.score
+        cells = [number(error, 1) for error in (score.position_rms_mm, score.position_max_mm)]
+        cells += [number(error, 1) for error in (score.path_rms_mm, score.path_max_mm)]
+        arrived = "-" if score.arrived_s is None else number(score.arrived_s, 2)
+        energy = "-" if score.energy_kj is None else number(score.energy_kj, 0)
+        cells += [number(score.attitude_rms_deg, 2), arrived, energy, number(score.lever_travel, 1)]
+        rows.append([loop.name, *cells, sum(score.violations.values())])
     # Short: the table fits into 80 columns.
     heads = ["tip, mm", "max", "path, mm", "max", "deg", "s", "kJ", "levers", "over"]
     title = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,10 +75,6 @@ class LoopScore:
     violations: Mapping[str, int]
     missed: int
     finished: bool
-
-    def plain(self) -> dict[str, object]:
-        """Convert to JSON types."""
-        return {**asdict(self), "violations": dict(self.violations)}
 
 
 def scored(trace: LoopTrace, reference: TipReference, limits: LoopLimits, missed: int = 0) -> LoopScore:

@@ -21,11 +21,11 @@ from enum import StrEnum
 import numpy as np
 
 from edp.errors import count_of
+from edp.evaluation.adaptation_file import AdaptationFile
 from edp.evaluation.free_run_file import FreeRunErrors, FreeRunScores
 from edp.evaluation.scores_file import ByHorizon, ModelScores, ScoresFile, error_at
 from edp.evaluation.tuning_file import TipErrors
 from edp.stats.resampled import paired_t
-from edp.storage.reading import Table
 from edp.wording import figure, percent, percent_interval
 
 NETWORK = "network"
@@ -360,13 +360,9 @@ def _free_run_logs_by_recording(own: FreeRunScores, scores: FreeRunScores) -> di
     }
 
 
-def adaptation_verdict(facts: Table) -> ErrorVerdict:
-    """Return the verdict on an adaptation against the same network without it.
-
-    Args:
-        facts: see `edp.workflows.adaptation.replay.Replay.to_json`.
-    """
-    return change_verdict(facts["change"], facts["change_by_recording"], UNADAPTED)
+def adaptation_verdict(content: AdaptationFile) -> ErrorVerdict:
+    """Return the verdict on an adaptation against the same network without it."""
+    return change_verdict(content.change, content.change_by_recording, UNADAPTED)
 
 
 def tuning_verdict(errors: TipErrors) -> ErrorVerdict:

@@ -5,6 +5,7 @@ import pytest
 from browser import check_page
 from page_text import check_text
 
+from edp.control.run_file import ControlFile
 from edp.recording import Recording
 from edp.report.animation.page import scene_of
 from edp.report.control.charts import control_charts, errors_chart, path_chart
@@ -37,30 +38,31 @@ def facts():
     recordings = [recording("grade_0", 0.010), recording(HOSTILE, 0.003)]
     score = {
         "position_rms_mm": 10.0, "position_p95_mm": 10.0, "position_max_mm": 10.0, "path_rms_mm": 10.0,
-        "path_max_mm": 10.0, "attitude_rms_deg": 0.1, "arrived_s": None, "energy_kj": 12.0, "lever_travel": 3.0,
-        "violations": {"lever": 0, "slew": 0, "stroke": 4, "pressure": 0},
+        "path_p95_mm": 10.0, "path_max_mm": 10.0, "attitude_rms_deg": 0.1, "arrived_s": None, "energy_kj": 12.0,
+        "lever_travel": 3.0, "violations": {"lever": 0, "slew": 0, "stroke": 4, "pressure": 0}, "missed": 0,
+        "finished": True,
     }  # fmt: skip
     loops = [
         {
-            "name": r.name,
-            "seed": n,
-            "score": score,
+            "name": r.name, "seed": n, "seconds": 1.2, "score": score, "events": [], "warnings": [],
             "solve_us": {"median": 50.0, "p99": 60.0, "max": 70.0},
-            "events": [],
         }
         for n, r in enumerate(recordings)
-    ]
+    ]  # fmt: skip
     loops[1]["events"] = [{"tick": 7, "ticks": 3, "text": f"{HOSTILE} is missing"}]
     content = {
-        "sentence": f"pi keeps {HOSTILE}", "task": {"kind": "grade"}, "controller": {"kind": "pi"}, "machine": "M22",
-        "plant": "the simulator", "loops": loops,
+        "schema": 1, "edp": "0", "sentence": f"pi keeps {HOSTILE}", "task": {"kind": "grade"},
+        "controller": {"kind": "pi"}, "machine": "M22", "plant": "the simulator", "loops": loops,
         "summary": {
-            "position_rms_mm": 10.0, "position_worst_mm": 10.0, "path_rms_mm": 10.0, "attitude_rms_deg": 0.1,
-            "lever_travel": 3.0, "energy_kj": None, "violations": 8, "missed": 3, "solve_us_median": 50.0,
+            "position_rms_mm": 10.0, "position_worst_mm": 10.0, "path_rms_mm": 10.0, "path_worst_mm": 10.0,
+            "attitude_rms_deg": 0.1, "lever_travel": 3.0, "energy_kj": None, "violations": 8, "missed": 3,
+            "solve_us_median": 50.0,
         },
     }  # fmt: skip
     times = [np.linspace(40.0, 70.0, TICKS)] * 2
-    return ControlFacts("run", content, recordings, times, scene_of(recordings[0], "M22"))
+    return ControlFacts(
+        "run", ControlFile.from_table(content, "the file"), recordings, times, scene_of(recordings[0], "M22")
+    )
 
 
 def test_the_page_says_what_was_violated_and_missed(facts):

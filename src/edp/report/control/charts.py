@@ -31,7 +31,7 @@ AXES = ("Boom", "Arm", "Bucket")
 
 def control_charts(facts: ControlFacts) -> list[Chart]:
     """Every figure of the page: ``path``, ``errors``, ``strokes``, ``levers`` and ``solver``."""
-    choice = Control(LOOP, "Loop", tuple((str(n), loop["name"]) for n, loop in enumerate(facts.loops)))
+    choice = Control(LOOP, "Loop", tuple((str(n), loop.name) for n, loop in enumerate(facts.content.loops)))
     return [
         path_chart(facts, choice),
         errors_chart(facts, choice),

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from edp.control.run_file import ControlFile
 from edp.errors import count_of
 from edp.recording import Recording
 from edp.report.animation.page import Scene
@@ -19,8 +20,7 @@ class ControlFacts:
 
     Attributes:
         title: of the page.
-        content: as ``results.json`` has it: ``sentence``, ``task``, ``controller``, ``plant``, ``machine``, ``loops``
-            (each with ``name``, ``seed``, ``score``, ``solve_us`` and ``events``), ``summary``.
+        content: of ``results.json``.
         recordings: of the loops, in their order: see `edp.control.loop.LoopResult`.
         solve_us: times of the controller's steps, microseconds, in the order of the recordings.
         scene: side view of the first loop.
@@ -28,50 +28,41 @@ class ControlFacts:
     """
 
     title: str
-    content: Mapping[str, Any]
+    content: ControlFile
     recordings: Sequence[Recording]
     solve_us: Sequence[Any]
     scene: Scene
     provenance: Sequence[tuple[str, str]] = ()
 
-    @property
-    def loops(self) -> Sequence[Mapping[str, Any]]:
-        """Name, seed, score, times and events of each loop."""
-        loops: Sequence[Mapping[str, object]] = self.content["loops"]
-        return loops
-
 
 def verdict(facts: ControlFacts) -> list[str]:
     """Describe the loops in sentences after the headline."""
-    content = facts.content
-    summary = content["summary"]
+    content, summary = facts.content, facts.content.summary
     lines = [
-        f"{count_of(len(facts.loops), 'loop')} of the task {content['task']['kind']} on {content['plant']}.",
+        f"{count_of(len(content.loops), 'loop')} of the task {content.task['kind']} on {content.plant}.",
         "The position error is the distance of the tip to where the reference is at that time; the path error is its "
         "distance to the nearest point of the path, which alone would reward standing still.",
     ]
-    if summary["violations"]:
-        lines.append(f"Limits were violated at {count_of(summary['violations'], 'tick')}.")
-    if summary["missed"]:
-        lines.append(
-            f"The controller had no answer at {count_of(summary['missed'], 'tick')} and gave the safe command."
-        )
+    if summary.violations:
+        lines.append(f"Limits were violated at {count_of(summary.violations, 'tick')}.")
+    if summary.missed:
+        lines.append(f"The controller had no answer at {count_of(summary.missed, 'tick')} and gave the safe command.")
     return lines
 
 
 def tiles(facts: ControlFacts) -> list[tuple[str, str, str]]:
     """Return key figures: value, unit, description."""
-    summary = facts.content["summary"]
+    summary = facts.content.summary
     rows = [
-        (number(summary["position_rms_mm"]), "mm", "position error of the tip (rms, mean over the loops)"),
-        (number(summary["position_worst_mm"]), "mm", "position error in the worst loop (rms)"),
-        (number(summary["path_rms_mm"]), "mm", "distance to the path (rms, mean over the loops)"),
-        (number(summary["attitude_rms_deg"]), "deg", "attitude error of the bucket (rms)"),
-        (number(summary["lever_travel"]), "", "lever travel, in full positions"),
-        (number(summary["solve_us_median"], 0), "µs", "median time of a step of the controller"),
+        (number(summary.position_rms_mm), "mm", "position error of the tip (rms, mean over the loops)"),
+        (number(summary.position_worst_mm), "mm", "position error in the worst loop (rms)"),
+        (number(summary.path_rms_mm), "mm", "distance to the path (rms, mean over the loops)"),
+        (number(summary.attitude_rms_deg), "deg", "attitude error of the bucket (rms)"),
+        (number(summary.lever_travel), "", "lever travel, in full positions"),
+        (number(summary.solve_us_median, 0), "µs", "median time of a step of the controller"),
     ]
-    if summary["energy_kj"] is not None:
-        rows.insert(4, (number(summary["energy_kj"], 0), "kJ", "hydraulic energy of the pumps"))
+    if summary.energy_kj is not None:
+        rows.insert(4, (number(summary.energy_kj, 0), "kJ", "hydraulic energy of the pumps"))
     return rows
 
 
@@ -89,10 +80,10 @@ def loop_table(facts: ControlFacts) -> Table:
         ("Lever travel", "", "lever_travel"),
     )
     rows: list[tuple[Value, ...]] = []
-    for loop in facts.loops:
-        score = loop["score"]
-        violated = ", ".join(f"{name} {ticks}" for name, ticks in score["violations"].items() if ticks) or MISSING
-        rows.append((loop["name"], *(score[key] for _, _, key in heads), violated))
+    for loop in facts.content.loops:
+        score = loop.score
+        violated = ", ".join(f"{name} {ticks}" for name, ticks in score.violations.items() if ticks) or MISSING
+        rows.append((loop.name, *(getattr(score, key) for _, _, key in heads), violated))
     shown = [Column(title, unit, figures(row[1 + n] for row in rows)) for n, (title, unit, _) in enumerate(heads)]
     return Table("Loops", (Column("Loop"), *shown, Column("Violated, ticks", is_text=True)), tuple(rows), name="loops")
 
@@ -100,7 +91,7 @@ def loop_table(facts: ControlFacts) -> Table:
 def event_table(facts: ControlFacts) -> Table:
     """Return the events that controllers logged."""
     rows: list[tuple[Value, ...]] = [
-        (loop["name"], event["tick"], event["ticks"], event["text"]) for loop in facts.loops for event in loop["events"]
+        (loop.name, event.tick, event.ticks, event.text) for loop in facts.content.loops for event in loop.events
     ]
     whole = figures([], decimals=0)
     heads = (Column("Loop"), Column("From tick", "", whole), Column("Ticks", "", whole), Column("Event", is_text=True))
@@ -110,7 +101,7 @@ def event_table(facts: ControlFacts) -> Table:
 def solver_table(facts: ControlFacts) -> Table:
     """Return the controller's time per step."""
     rows: list[tuple[Value, ...]] = [
-        (loop["name"], *(loop["solve_us"][key] for key in ("median", "p99", "max"))) for loop in facts.loops
+        (loop.name, loop.solve_us.median, loop.solve_us.p99, loop.solve_us.max) for loop in facts.content.loops
     ]
     shown = [Column(name, "µs", figures([], decimals=0)) for name in ("Median", "99 %", "Longest")]
     return Table("Time of a step of the controller", (Column("Loop"), *shown), tuple(rows), name="solver")

@@ -15,7 +15,7 @@ def build_control_page(facts: ControlFacts) -> Page:
         title=facts.title,
         kind="closed loops",
         about=["closed loops"],
-        headline=facts.content["sentence"],
+        headline=facts.content.sentence,
         verdict=verdict(facts),
         tiles=tiles(facts),
         sections=[
@@ -36,7 +36,7 @@ def build_control_page(facts: ControlFacts) -> Page:
                     charts["strokes"],
                 ],
             ),
-            Section("side", "Side view", [f"Loop {facts.loops[0]['name']}.", side_view(facts.scene)]),
+            Section("side", "Side view", [f"Loop {facts.content.loops[0].name}.", side_view(facts.scene)]),
             Section("lever", "Levers", [charts["levers"]]),
             Section("loops", "Loops", [loop_table(facts), event_table(facts)]),
             Section(

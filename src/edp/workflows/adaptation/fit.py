@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from edp.config.experiment import experiment_toml
 from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.errors import ConfigError
+from edp.evaluation.adaptation_file import AdaptationFile
 from edp.ir.rls import Adaptation, AdaptationSpec
 from edp.ir.rls.constants import FEATURE_LIMIT
 from edp.networks.predictor import Predictor
@@ -31,7 +32,20 @@ Rows = NDArray[np.float64]
 HISTORY = "history.jsonl"
 
 
-def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) -> tuple[Adaptation, dict[str, object]]:
+@dataclass(frozen=True, eq=False)
+class AdaptedRun:
+    """Result of `adapt`.
+
+    Attributes:
+        adaptation: with fitted constants.
+        content: of ``adaptation.json``.
+    """
+
+    adaptation: Adaptation
+    content: AdaptationFile
+
+
+def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) -> AdaptedRun:
     """Write a run whose network has an adaptation: it is exported with it and replayed with it.
 
     Args:
@@ -40,7 +54,7 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
         spec: options.
 
     Returns:
-        The adaptation, and what `replay_run` says of the run's test recordings.
+        The adaptation, and its errors on the run's test recordings.
 
     Raises:
         EdpError: not a run folder, a network whose predictions are not measured later, or a folder that holds another
@@ -60,9 +74,9 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
         save_bundle(replace(bundle, adaptation=adaptation), target.file("bundle"))
         # The footprint counts the adaptation too; the one of the source run would state too little.
         write_json(target.file("footprint.json"), footprint_of(target.path)[0].to_json())
-        facts = replay(bundle.predictor, adaptation, data.test).to_json(data.task, data.target_kinds)
-        write_json(target.file("adaptation.json"), facts)
-    return adaptation, facts
+        content = replay(bundle.predictor, adaptation, data.test).content(data.task, data.target_kinds)
+        content.write(target.path)
+    return AdaptedRun(adaptation, content)
 
 
 def fit_adaptation(predictor: Predictor, data: Prepared, spec: AdaptationSpec) -> Adaptation:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from edp.data.series import Series
 from edp.data.task import Task
 from edp.errors import BundleError, DataError
+from edp.evaluation.adaptation_file import AdaptationFile, ReplayErrors, ReplayTarget
 from edp.ir.rls import Adaptation, RlsCorrector, RlsState, RlsStatus
 from edp.logs.source import DataSource
 from edp.networks.predictor import Predictor
@@ -88,31 +89,29 @@ class Replay:
         pairs = [(base, adapted) for base, adapted in rows if base is not None and adapted is not None]
         return np.concatenate(pairs, axis=1) if pairs else np.empty((2, 0))
 
-    def to_json(self, task: Task, kinds: Sequence[Kind]) -> dict[str, object]:
-        """MAE by horizon and time in motion, in the units of reports, and how often the adaptation was taken back."""
+    def content(self, task: Task, kinds: Sequence[Kind]) -> AdaptationFile:
+        """Return the errors of `task`, whose targets are of these kinds, by horizon and time in motion."""
         facts = [KINDS[kind] for kind in kinds]
         factors = np.array([fact.report_factor for fact in facts])
-        ends = [*BINS[1:], np.inf]
         rows = []
         for k in self.horizons:
-            for low, high in zip(BINS, ends, strict=True):
+            for low, high in zip(BINS, [*BINS[1:], np.inf], strict=True):
                 base, adapted = (self.mae(of, k, low, high) for of in ("base", "adapted"))
                 if base is not None and adapted is not None:
-                    values = {"base": list(base * factors), "adapted": list(adapted * factors)}
-                    rows.append({"horizon": k, "from_s": low, "to_s": None if np.isinf(high) else high, **values})
+                    rows.append(ReplayErrors(
+                        horizon=k, from_s=low, to_s=None if np.isinf(high) else high,
+                        base=tuple((base * factors).tolist()), adapted=tuple((adapted * factors).tolist()),
+                    ))  # fmt: skip
         status = np.concatenate([part.status for part in self.recordings])
-        return {
-            "schema": 1,
-            "recordings": [part.name for part in self.recordings],
-            "targets": [{"name": n, "unit": f.report_unit} for n, f in zip(task.targets, facts, strict=True)],
-            "mae": rows,
-            "change": relative_change(self.errors_by_target(self.recordings)),
-            "change_by_recording": {
-                part.name: relative_change(self.errors_by_target([part])) for part in self.recordings
-            },
-            "fallback": float((status == RlsStatus.FALLBACK).mean()),
-            "taught": int((status == RlsStatus.LEARNING).sum()),
-        }
+        return AdaptationFile(
+            recordings=tuple(part.name for part in self.recordings),
+            targets=tuple(ReplayTarget(name=n, unit=f.report_unit) for n, f in zip(task.targets, facts, strict=True)),
+            mae=tuple(rows),
+            change=relative_change(self.errors_by_target(self.recordings)),
+            change_by_recording={part.name: relative_change(self.errors_by_target([part])) for part in self.recordings},
+            fallback=float((status == RlsStatus.FALLBACK).mean()),
+            taught=int((status == RlsStatus.LEARNING).sum()),
+        )
 
 
 def relative_change(errors: NDArray[np.float64]) -> float:
@@ -187,7 +186,7 @@ def replay_run(
     learn: bool = True,
     progress: Progress = SILENT,
     twin: str | Path | None = None,
-) -> dict[str, object]:
+) -> AdaptationFile:
     """Replay logs through a run that `edp adapt` wrote; see `replay`.
 
     Args:
@@ -213,4 +212,4 @@ def replay_run(
         by_twin = TwinMoves(grey.twin, correction_of(grey.twin, bundle.adaptation, bundle.task, tuned_spec(grey)))
         moves = partial(by_twin, recordings, carry=carry, learn=learn)
     result = replay(bundle.predictor, bundle.adaptation, series, carry, learn, progress, moves)
-    return result.to_json(bundle.task, bundle.target_kinds)
+    return result.content(bundle.task, bundle.target_kinds)

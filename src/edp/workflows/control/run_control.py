@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,10 +10,10 @@ import numpy as np
 
 from edp import __version__
 from edp.config.control import CONTROL_SETTINGS, ControlExperiment, control_toml
-from edp.control.base import ControlEvent
 from edp.control.controllers import CONTROLLERS
 from edp.control.guard import LoopGuard
 from edp.control.loop import LoopResult
+from edp.control.run_file import ControlFile, ControlSummary, LoopEntry, StepTimes
 from edp.control.tasks import TASKS, ControlTask
 from edp.jobs import IN_PROCESS, Workers
 from edp.jobs.workers import UNITS, forget_units
@@ -25,12 +25,11 @@ from edp.report.common.provenance import provenance_rows
 from edp.settings.provenance import Provenance, new_provenance
 from edp.storage import make_folder, write_json
 from edp.storage.provenance import PROVENANCE
-from edp.storage.reading import Table
 from edp.storage.runs import Run, check_claimable, check_free, run_key
 from edp.workflows.control.bench import ControlBench, ControlSources, DividedLoops
 from edp.workflows.control.kept import keep_controller
 
-RESULTS, PAGE, LOOPS = "results.json", "control.html", "loops"
+PAGE, LOOPS = "control.html", "loops"
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +42,7 @@ class ControlRun:
         page: file of the page.
     """
 
-    content: Table
+    content: ControlFile
     results: Sequence[LoopResult]
     page: Path
 
@@ -88,10 +87,10 @@ def control_loops(
             write_recording(result.recording, folder / f"{result.recording.name}.parquet")
         keep_controller(run.path, bench.plant, bench.models, chosen.twin, (bench.tasks[0], results[0]))
         content = _content(experiment, bench.tasks, results)
-        write_json(run.file(RESULTS), content)
+        content.write(run.path)
         provenance = replace(new_provenance(), seed=experiment.seed).with_entries(
-            machine=content["machine"],
-            plant=content["plant"] if chosen.plant is None else str(chosen.plant),
+            machine=content.machine,
+            plant=content.plant if chosen.plant is None else str(chosen.plant),
             twin=str(chosen.twin or ""),
             predictor=str(chosen.predictor or ""),
         )
@@ -101,80 +100,67 @@ def control_loops(
     return ControlRun(content, results, page)
 
 
-def _content(
-    experiment: ControlExperiment, tasks: Sequence[ControlTask], results: Sequence[LoopResult]
-) -> dict[str, object]:
-    scores = [result.score for result in results]
-    energies = [score.energy_kj for score in scores]
-    times = np.concatenate([result.solve_s for result in results]) * 1e6
-    summary = {
-        "position_rms_mm": _mean([score.position_rms_mm for score in scores]),
-        "position_worst_mm": max(score.position_rms_mm for score in scores),
-        "path_rms_mm": _mean([score.path_rms_mm for score in scores]),
-        "path_worst_mm": max(score.path_rms_mm for score in scores),
-        "attitude_rms_deg": _mean([score.attitude_rms_deg for score in scores]),
-        "lever_travel": _mean([score.lever_travel for score in scores]),
-        "energy_kj": None if None in energies else _mean([energy for energy in energies if energy is not None]),
-        "violations": sum(sum(score.violations.values()) for score in scores),
-        "missed": sum(score.missed for score in scores),
-        "solve_us_median": float(np.median(times)),
-    }
-    source = results[0].recording.source.removeprefix("loop:")
+def _content(experiment: ControlExperiment, tasks: Sequence[ControlTask], results: Sequence[LoopResult]) -> ControlFile:
     plain = CONTROL_SETTINGS.plain(experiment)
-    name = CONTROLLERS.name_of(experiment.controller)
-    content = {
-        "schema": 1,
-        "edp": __version__,
-        "task": plain["task"],
-        "controller": plain["controller"],
-        "machine": results[0].recording.meta["machine"],
-        "plant": source,
-        "summary": summary,
-        "loops": [_loop(task, result) for task, result in zip(tasks, results, strict=True)],
-    }
-    return {"sentence": sentence(content, name), **content}
-
-
-def sentence(content: Table, controller: str) -> str:
-    """State the score in one sentence."""
-    summary, count = content["summary"], len(content["loops"])
-    loops = f"{count} loops" if count > 1 else "one loop"
-    worst = f", {summary['position_worst_mm']:.1f} mm in the worst" if count > 1 else ""
-    return (
-        f"{controller} keeps the bucket tip {summary['position_rms_mm']:.1f} mm (rms) from its reference in {loops} of "
-        f"{TASKS.what} '{content['task']['kind']}'{worst}, and {summary['path_rms_mm']:.1f} mm from the path"
+    summary = _summary(results)
+    return ControlFile(
+        edp=__version__,
+        sentence=_sentence(summary, CONTROLLERS.name_of(experiment.controller), plain["task"]["kind"], len(results)),
+        task=plain["task"],
+        controller=plain["controller"],
+        machine=results[0].recording.meta["machine"],
+        plant=results[0].recording.source.removeprefix("loop:"),
+        summary=summary,
+        loops=tuple(_loop(task, result) for task, result in zip(tasks, results, strict=True)),
     )
 
 
-def _loop(task: ControlTask, result: LoopResult) -> dict[str, object]:
+def _summary(results: Sequence[LoopResult]) -> ControlSummary:
+    scores = [result.score for result in results]
+    energies = [score.energy_kj for score in scores]
+    return ControlSummary(
+        position_rms_mm=_mean([score.position_rms_mm for score in scores]),
+        position_worst_mm=max(score.position_rms_mm for score in scores),
+        path_rms_mm=_mean([score.path_rms_mm for score in scores]),
+        path_worst_mm=max(score.path_rms_mm for score in scores),
+        attitude_rms_deg=_mean([score.attitude_rms_deg for score in scores]),
+        lever_travel=_mean([score.lever_travel for score in scores]),
+        energy_kj=None if None in energies else _mean([energy for energy in energies if energy is not None]),
+        violations=sum(sum(score.violations.values()) for score in scores),
+        missed=sum(score.missed for score in scores),
+        solve_us_median=float(np.median(np.concatenate([result.solve_s for result in results]) * 1e6)),
+    )
+
+
+def _sentence(summary: ControlSummary, controller: str, task: str, count: int) -> str:
+    loops = f"{count} loops" if count > 1 else "one loop"
+    worst = f", {summary.position_worst_mm:.1f} mm in the worst" if count > 1 else ""
+    return (
+        f"{controller} keeps the bucket tip {summary.position_rms_mm:.1f} mm (rms) from its reference in {loops} of "
+        f"{TASKS.what} '{task}'{worst}, and {summary.path_rms_mm:.1f} mm from the path"
+    )
+
+
+def _loop(task: ControlTask, result: LoopResult) -> LoopEntry:
     times = result.solve_s * 1e6
-    return {
-        "name": result.recording.name,
-        "seed": task.seed,
-        "seconds": task.reference.duration_s,
-        "score": result.score.plain(),
-        "solve_us": {
-            "median": float(np.median(times)),
-            "p99": float(np.percentile(times, 99.0)),
-            "max": float(times.max()),
-        },
-        "events": _plain(result.events),
-        "warnings": _plain(result.warnings),
-    }
-
-
-def _plain(events: Sequence[ControlEvent]) -> list[dict[str, object]]:
-    return [{"tick": event.tick, "ticks": event.ticks, "text": event.text} for event in events]
+    median, p99 = float(np.median(times)), float(np.percentile(times, 99.0))
+    return LoopEntry(
+        name=result.recording.name,
+        seed=task.seed,
+        seconds=task.reference.duration_s,
+        score=result.score,
+        solve_us=StepTimes(median=median, p99=p99, max=float(times.max())),
+        events=result.events,
+        warnings=result.warnings,
+    )
 
 
 def _mean(values: Sequence[float]) -> float:
     return float(np.mean(values))
 
 
-def _facts(
-    title: str, content: Mapping[str, object], results: Sequence[LoopResult], provenance: Provenance
-) -> ControlFacts:
+def _facts(title: str, content: ControlFile, results: Sequence[LoopResult], provenance: Provenance) -> ControlFacts:
     recordings = [result.recording for result in results]
-    scene = scene_of(recordings[0], str(content["machine"]))
+    scene = scene_of(recordings[0], content.machine)
     solve_us = [result.solve_s * 1e6 for result in results]
     return ControlFacts(title, content, recordings, solve_us, scene, provenance_rows(provenance))
