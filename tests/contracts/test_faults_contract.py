@@ -95,9 +95,9 @@ def test_places_units_and_ladder_are_sound(name):
         assert parse_fault(fault_text(fault)) == fault
         assert FaultSpec(**fault.plain()) == fault
     if isinstance(kind, SensorFault):
-        channels = {site: kind.channels(site) for site in kind.sites or ("",)}
-        assert len(set(channels.values())) == len(channels)
-        assert all(0 <= channel < chain.SENSED for pair in channels.values() for channel in pair)
+        assert tuple(kind.channels) == (kind.sites or ("",))
+        assert len(set(kind.channels.values())) == len(kind.channels)
+        assert all(0 <= channel < chain.SENSED for pair in kind.channels.values() for channel in pair)
 
 
 @pytest.mark.parametrize("name", list(FAULTS))

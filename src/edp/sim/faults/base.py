@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields
-from typing import ClassVar
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,7 +79,8 @@ class MachineNumbers:
         return MachineNumbers(self.machine, self.rate_hz, self.half_steps_s, *copies)
 
 
-class FaultKind(ABC):
+@dataclass(frozen=True, kw_only=True)
+class FaultKind:
     """One kind of fault; instances are entered in `FAULTS`.
 
     Attributes:
@@ -96,15 +95,15 @@ class FaultKind(ABC):
         neutral: the size that is no fault, in the first unit.
     """
 
-    text: ClassVar[str]
-    part: ClassVar[str]
-    words: ClassVar[str]
-    grave: ClassVar[bool] = False
-    sites: ClassVar[tuple[str, ...]] = AXES
-    units: ClassVar[Units]
-    ladder: ClassVar[tuple[float, ...]] = ()
-    bound: ClassVar[Bound] = span(0.0, 0.0)
-    neutral: ClassVar[float] = 0.0
+    text: str
+    part: str
+    words: str
+    grave: bool = False
+    sites: tuple[str, ...] = AXES
+    units: Units
+    ladder: tuple[float, ...] = ()
+    bound: Bound = field(default_factory=lambda: span(0.0, 0.0))
+    neutral: float = 0.0
 
     @property
     def signed(self) -> bool:
@@ -121,40 +120,32 @@ class FaultKind(ABC):
         return at_site(self.part, site)
 
 
+@dataclass(frozen=True, kw_only=True)
 class MachineFault(FaultKind):
-    """Machine fault, which changes plant parameters."""
+    """Machine fault, which changes plant parameters.
 
-    @abstractmethod
-    def change(self, numbers: MachineNumbers, site: str, size: float) -> None:
-        """Apply the fault to the parameters of a machine, in place.
+    Attributes:
+        change: applies the fault to the parameters of a machine, in place. Its arguments are the parameters of a sound
+            machine, or of one with other faults; one of `sites`; and the size in SI units, `neutral` for no fault.
+        delays_commands: whether the size is a dead time that is added to the commands: room that a plant must have.
+    """
 
-        Args:
-            numbers: of a sound machine, or of one with other faults.
-            site: one of `sites`.
-            size: in SI units, `neutral` for no fault.
-        """
-
-    def dead_time_s(self, size: float) -> float:
-        """Dead time that a fault of this size (SI units) may add to the commands: room that a plant must have."""
-        return 0.0
+    change: Callable[[MachineNumbers, str, float], None]
+    delays_commands: bool = False
 
 
+@dataclass(frozen=True, kw_only=True)
 class SensorFault(FaultKind):
     """Sensor fault: one observed value per sample changes, or two are swapped.
 
     Attributes:
         operation: what happens, one of `edp.sim.sensors.alterations`.
+        channels: affected values by site, as indices of `edp.sim.sensors.chain.SENSED`; for noise, columns of its
+            draws. The site is empty for kinds without sites.
     """
 
-    operation: ClassVar[int]
-
-    @abstractmethod
-    def channels(self, site: str) -> tuple[int, ...]:
-        """Return the affected values as indices of `edp.sim.sensors.chain.SENSED`; for noise, columns of its draws."""
-
-    def parameter(self, sizes: Array, rate_hz: float, chance: np.random.Generator) -> Array:
-        """Return the operation's parameter at each sample (0: none) from sizes in SI units, shape (time,)."""
-        return sizes
+    operation: int
+    channels: Mapping[str, tuple[int, ...]]
 
 
 FAULTS: Registry[FaultKind] = Registry("kind of fault")

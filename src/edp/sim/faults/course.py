@@ -55,7 +55,7 @@ def of_machine(faults: Sequence[FaultSpec]) -> tuple[FaultSpec, ...]:
 def spare_s(faults: Sequence[FaultSpec]) -> float:
     """Dead time that faults may add, s: room that a plant must have for past commands."""
     pairs = [(fault, FAULTS[fault.kind]) for fault in faults]
-    return sum(kind.dead_time_s(fault.full) for fault, kind in pairs if isinstance(kind, MachineFault))
+    return sum(fault.full for fault, kind in pairs if isinstance(kind, MachineFault) and kind.delays_commands)
 
 
 def numbers_of(plant: Plant) -> MachineNumbers:
@@ -126,6 +126,20 @@ class MachineCourse:
         return numbers
 
 
+def _parameters(operation: int, sizes: Array, rate_hz: float, chance: np.random.Generator) -> Array:
+    """Return the parameter of an operation at each sample, 0 for no fault, from sizes in SI units, shape (time,)."""
+    if operation == alterations.DROPOUT:
+        return np.asarray(chance.random(len(sizes)) < sizes, float)
+    if operation == alterations.NOISE:
+        return sizes - 1.0
+    if operation == alterations.DELAY:
+        return sizes * rate_hz
+    if operation == alterations.LAG:
+        # What is left of a step after one sample; of a lag of nothing, nothing.
+        return np.where(sizes > 0.0, np.exp(-1.0 / (rate_hz * np.maximum(sizes, 1e-9))), 0.0)
+    return sizes
+
+
 class SensorCourse:
     """Effect of sensor faults on the observations of one recording.
 
@@ -140,7 +154,7 @@ class SensorCourse:
         pairs = [(fault, FAULTS[fault.kind]) for fault in faults]
         self._every = [(fault, kind) for fault, kind in pairs if isinstance(kind, SensorFault)]
         self._shown = [(fault, kind) for fault, kind in self._every if kind.operation != alterations.NOISE]
-        rows = [(kind.operation, *kind.channels(fault.site), 0)[: alterations.COLUMNS] for fault, kind in self._shown]
+        rows = [(kind.operation, *kind.channels[fault.site], 0)[: alterations.COLUMNS] for fault, kind in self._shown]
         self.table = np.array(rows, dtype=float).reshape(len(rows), alterations.COLUMNS)
 
     def drawn(self, healthy: Array, rate_hz: float, chance: np.random.Generator) -> Array:
@@ -158,9 +172,9 @@ class SensorCourse:
         # A generator each: what one fault draws does not move another.
         for (fault, kind), child in zip(self._every, chance.spawn(len(self._every)), strict=True):
             sizes = sizes_of(fault, shares_at((fault,), ticks, rate_hz)[:, 0])
-            numbers = kind.parameter(sizes, rate_hz, child)
+            numbers = _parameters(kind.operation, sizes, rate_hz, child)
             if kind.operation == alterations.NOISE:
-                for channel in kind.channels(fault.site):
+                for channel in kind.channels[fault.site]:
                     drawn[:, channel] *= 1.0 + numbers
             else:
                 columns.append(numbers)

@@ -29,7 +29,7 @@ def falsified_channels(kind: str, site: str) -> tuple[str, ...]:
     fault = FAULTS[kind]
     if not isinstance(fault, SensorFault):
         return ()
-    columns = fault.channels(site)
+    columns = fault.channels[site]
     if fault.operation == alterations.NOISE:
         columns = tuple(dict.fromkeys(_DRAWN[column] for column in columns))
     names = {**dict(enumerate(TABLE_A1)), **{column: name for name, column in shown_names().items()}}

@@ -1,1 +1,0 @@
-"""Machine faults, one module per fault type."""

@@ -1,1 +1,0 @@
-"""Sensor faults, one module per fault type."""
