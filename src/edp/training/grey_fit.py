@@ -19,6 +19,7 @@ from edp.data.series import Series
 from edp.errors import DataError
 from edp.networks.twin.grey.numbers import coarse_by_fine
 from edp.networks.twin.grey.plausible import STRETCHES
+from edp.networks.twin.grey.rollouts import RunBatch
 from edp.networks.twin.greybox import GreyTwin, RunTarget
 from edp.storage.reading import Table
 from edp.training.blas import one_blas_thread
@@ -44,8 +45,7 @@ class GreyRound:
 
     demands: Doubles
     measured: Doubles
-    truth: Doubles
-    counts: tuple[int, int, int]
+    target: RunTarget
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,9 +139,10 @@ class GreyProblem:
         measured = values[:, :-1].copy()
         measured[:, prefix + 1 :] = np.nan
         # Rows that count lie apart: neighbouring errors of a run say the same.
-        counts = (prefix, prefix if self.twin.wiring.whole else 0, max(1, ticks // 10))
-        truth = np.ascontiguousarray(values[:, 1:])
-        return GreyRound(self.twin.demands(np.stack(commands)), measured, truth, counts)
+        followed = prefix if self.twin.wiring.whole else 0
+        truth, stride = np.ascontiguousarray(values[:, 1:]), max(1, ticks // 10)
+        target = RunTarget(truth, self.weight, self.delta, prefix, followed, stride)
+        return GreyRound(self.twin.demands(np.stack(commands)), measured, target)
 
     @property
     def final_memory(self) -> float:
@@ -165,20 +166,18 @@ class GreyProblem:
     def losses(self, theta: Doubles, drawn: GreyRound, full: bool) -> tuple[Doubles, Doubles, Doubles]:
         """Return matrix and gradient by the coordinates, and the loss of each run."""
         twin, numbers = self.twin, self.numbers(theta)
-        size = len(numbers) if full else 0
         rest = twin.rest(drawn.demands[:, 0], (drawn.measured[:, 0] * twin.units).astype(np.float32))
-        state = (drawn.measured[:, 0].copy(), *(np.ascontiguousarray(values, dtype=np.float64) for values in rest))
-        normal = (np.zeros((size, size)), np.zeros(size), np.zeros(len(drawn.demands)))
-        judged = RunTarget(drawn.truth, self.weight, self.delta, drawn.counts, normal)
-        twin.lanes(numbers, drawn.demands, drawn.measured, state, judge=judged)
-        matrix, gradient, losses = normal
+        state = (np.ascontiguousarray(values, dtype=np.float64) for values in (drawn.measured[:, 0], *rest))
+        batch = RunBatch(drawn.demands, drawn.measured, *state)
+        normal = twin.judge(numbers, batch, drawn.target, full)
+        matrix, gradient = normal.matrix, normal.gradient
         if full and self.tie is not None:
             slopes = self.tie.slopes(theta)
             matrix, gradient = slopes.T @ matrix @ slopes, slopes.T @ gradient
         elif full:
             slope = self.slope(numbers)
             matrix, gradient = _led(matrix * slope * slope[:, None], gradient * slope, self.twin.table.leader)
-        return matrix, gradient, np.nan_to_num(losses, nan=1e12, posinf=1e12)
+        return matrix, gradient, np.nan_to_num(normal.losses, nan=1e12, posinf=1e12)
 
 
 def _led(matrix: Doubles, gradient: Doubles, leader: NDArray[np.int64]) -> tuple[Doubles, Doubles]:

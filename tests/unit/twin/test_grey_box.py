@@ -17,6 +17,7 @@ from edp.networks.twin.grey.datasheet import datasheet, datasheet_text
 from edp.networks.twin.grey.elements import CylinderElement, Elements, ValveElement
 from edp.networks.twin.grey.numbers import monomials, number_table
 from edp.networks.twin.grey.plausible import Travel
+from edp.networks.twin.grey.rollouts import RunBatch
 from edp.networks.twin.greybox import GreyBox, GreyFitSpec, RunTarget
 from edp.storage.seals import HASH, content_digest
 from edp.testing.bench import bench_channels, bench_grey_box, bench_series
@@ -68,12 +69,10 @@ def errors(twin, numbers, series, starts, full, ticks=8):
     measured[:, PREFIX + 1 :] = np.nan
     rest = twin.rest(demands[:, 0], (measured[:, 0] * twin.units).astype(np.float32))
     state = (measured[:, 0].copy(), *(np.ascontiguousarray(part, dtype=np.float64) for part in rest))
-    count = len(numbers) if full else 0
-    normal = (np.zeros((count, count)), np.zeros(count), np.zeros(len(starts)))
     weight = twin.units / twin.scales.answer_width.astype(np.float64)
-    target = RunTarget(np.ascontiguousarray(values[:, 1:]), weight, 1e9, (PREFIX, 0, 1), normal)
-    twin.lanes(numbers, demands, measured, state, judge=target)
-    return normal
+    target = RunTarget(np.ascontiguousarray(values[:, 1:]), weight, 1e9, PREFIX)
+    normal = twin.judge(numbers, RunBatch(demands, measured, *state), target, full)
+    return normal.matrix, normal.gradient, normal.losses
 
 
 @pytest.mark.long

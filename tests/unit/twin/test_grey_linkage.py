@@ -13,10 +13,11 @@ from edp.data.series import Series
 from edp.errors import ConfigError
 from edp.networks.twin import fit_scales
 from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey.bodies import forces_by_moments, moments_of
 from edp.networks.twin.grey.datasheet import datasheet, datasheet_text
 from edp.networks.twin.grey.elements import MotorElement, ValveElement
 from edp.networks.twin.grey.known_linkage import BODY_NAMES
-from edp.networks.twin.grey.linkage import balance_by_base, base_of, load_at
+from edp.networks.twin.grey.rollouts import RunBatch
 from edp.networks.twin.grey.runner import SINGLE_TICKS
 from edp.networks.twin.greybox import RunTarget
 from edp.networks.twin.load import LoadEstimate
@@ -50,15 +51,17 @@ def strokes_and_angles(count, seed=0):
 PLACES = [ORDER.index(name) for name in BODY_NAMES]
 
 
-def loads_of(twin, numbers, strokes, speeds):
-    """Forces, slopes by strokes, velocities, numbers, inertia and its gradient at one pose."""
-    n = 3
-    loads = (
-        np.zeros(n), np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, len(numbers))), np.zeros((n, n)),
-        np.zeros((n, n, n)), np.zeros((at.BASE, n, n)), np.zeros((at.BASE, at.BODIES * at.BODY_VALUES)),
-    )  # fmt: skip
-    load_at(numbers, twin.table.inertia_at, strokes, speeds, twin.table.linkage, loads)
-    return loads
+def balance_of(twin, numbers, strokes, speeds, accelerations):
+    """Forces that a motion takes, a row for each."""
+    rows = (np.atleast_2d(part) for part in (strokes, speeds, accelerations))
+    moments = moments_of(numbers, twin.table.inertia_at, twin.table.linkage).values
+    return forces_by_moments(*np.broadcast_arrays(*rows), twin.table.linkage) @ moments
+
+
+def load_of(twin, numbers, strokes, speeds):
+    """Forces of gravity and turning, and inertia, at one pose."""
+    force = balance_of(twin, numbers, strokes, speeds, np.zeros(3))[0]
+    return force, balance_of(twin, numbers, strokes, speeds, np.eye(3)).T - force[:, None]
 
 
 def test_inertia_and_forces_are_those_of_the_simulators_bodies(twin):
@@ -77,7 +80,7 @@ def test_inertia_and_forces_are_those_of_the_simulators_bodies(twin):
         torque = dynamics.bias_torque(psi, rate, axes, plant) - joint @ (np.array(bend) * rate**2 / lever)
         strokes, velocities = np.empty(3), np.empty(3)
         strokes[PLACES], velocities[PLACES] = row, speeds
-        force, _, _, _, mass, _, _, _ = loads_of(twin, twin.numbers, strokes, velocities)
+        force, mass = load_of(twin, twin.numbers, strokes, velocities)
         force_wanted = torque / lever / 1e6
         worst = max(worst, np.abs(mass[np.ix_(PLACES, PLACES)] / wanted - 1.0).max())
         worst = max(worst, np.abs(force[PLACES] - force_wanted).max() / np.abs(force_wanted).max())
@@ -85,31 +88,15 @@ def test_inertia_and_forces_are_those_of_the_simulators_bodies(twin):
     assert worst < 1e-3
 
 
-def test_slopes_of_the_load_are_those_of_differences(twin):
-    rng = np.random.default_rng(2)
-    strokes, speeds = np.array([0.71, 0.4, 0.33]), rng.uniform(-0.5, 0.5, 3)
-    numbers, first, last = twin.numbers, twin.table.inertia_at, twin.table.potential_at
-    _, by_s, by_v, by_q, mass, mass_s, parts, by_number = loads_of(twin, numbers, strokes, speeds)
-
-    def differenced(change):
-        above, below = (loads_of(twin, *change(side)) for side in (1e-6, -1e-6))
-        return (above[0] - below[0]) / 2e-6, (above[4] - below[4]) / 2e-6
-
-    for k in range(3):
-        unit = np.eye(3)[k]
-        slope, of_mass = differenced(lambda step, unit=unit: (numbers, strokes + step * unit, speeds))
-        np.testing.assert_allclose(by_s[:, k], slope, rtol=1e-5, atol=1e-6 * np.abs(by_s).max())
-        np.testing.assert_allclose(mass_s[:, :, k], of_mass, rtol=1e-5, atol=1e-6 * np.abs(mass_s).max())
-        slope, _ = differenced(lambda step, unit=unit: (numbers, strokes, speeds + step * unit))
-        np.testing.assert_allclose(by_v[:, k], slope, rtol=1e-5, atol=1e-6 * np.abs(by_v).max())
+def test_slopes_of_moments_are_those_of_differences(twin):
+    first, last = twin.table.inertia_at, twin.table.potential_at
+    slopes = moments_of(twin.numbers, first, twin.table.linkage).slopes
     for m in range(first, last):
-        size = np.eye(len(numbers))[m] * max(abs(numbers[m]), 1e-3)
-        slope, of_mass = differenced(lambda step, size=size: (numbers + step * size, strokes, speeds))
-        np.testing.assert_allclose(by_q[:, m] * size[m], slope, rtol=1e-5, atol=1e-7)
-        own = np.einsum("b,bij->ij", by_number[:, m - first], parts)
-        np.testing.assert_allclose(own * size[m], of_mass, rtol=1e-5, atol=1e-7)
-    base = base_numbers(twin, numbers)
-    np.testing.assert_allclose(np.einsum("b,bij->ij", base, parts), mass, rtol=1e-12)
+        size = np.eye(len(twin.numbers))[m] * max(abs(twin.numbers[m]), 1e-3) * 1e-6
+        above, below = (
+            moments_of(twin.numbers + side * size, first, twin.table.linkage).values for side in (1.0, -1.0)
+        )
+        np.testing.assert_allclose(slopes[:, m - first] * 2.0 * size[m], above - below, rtol=1e-5, atol=1e-12)
 
 
 def errors(twin, numbers, series, starts, full, ticks=8):
@@ -121,12 +108,10 @@ def errors(twin, numbers, series, starts, full, ticks=8):
     measured[:, PREFIX + 1 :] = np.nan
     rest = twin.rest(demands[:, 0], (measured[:, 0] * twin.units).astype(np.float32))
     state = (measured[:, 0].copy(), *(np.ascontiguousarray(part, dtype=np.float64) for part in rest))
-    count = len(numbers) if full else 0
-    normal = (np.zeros((count, count)), np.zeros(count), np.zeros(len(starts)))
     weight = twin.units / twin.scales.answer_width.astype(np.float64)
-    target = RunTarget(np.ascontiguousarray(values[:, 1:]), weight, 1e9, (PREFIX, 0, 1), normal)
-    twin.lanes(numbers, demands, measured, state, judge=target)
-    return normal
+    target = RunTarget(np.ascontiguousarray(values[:, 1:]), weight, 1e9, PREFIX)
+    normal = twin.judge(numbers, RunBatch(demands, measured, *state), target, full)
+    return normal.matrix, normal.gradient, normal.losses
 
 
 START = np.array([[0.0] * 3 + [0.7, 0.5, 0.4] + [6e6, 4e6] * 3 + [5e6]], np.float32)
@@ -172,16 +157,19 @@ def test_no_load_makes_energy(twin):
     strokes, speeds, pulls = np.array([0.9, 0.3, 0.6]), rng.uniform(-0.5, 0.5, 3), rng.uniform(-1, 1, 3)
 
     def kinetic(at_s, v):
-        return 0.5 * v @ loads_of(twin, twin.numbers, at_s, v)[4] @ v
+        return 0.5 * v @ load_of(twin, twin.numbers, at_s, v)[1] @ v
 
-    force, _, _, _, mass, _, _, _ = loads_of(twin, twin.numbers, strokes, speeds)
-    gravity = loads_of(twin, twin.numbers, strokes, 0 * speeds)[0]
+    force, mass = load_of(twin, twin.numbers, strokes, speeds)
+    gravity = load_of(twin, twin.numbers, strokes, 0 * speeds)[0]
     power = speeds @ (mass @ pulls + force - gravity)
     sides = [kinetic(strokes + side * step * speeds, speeds + side * step * pulls) for side in (1, -1)]
     assert power == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=1e-6)
     # Gravity has a potential: its forces' slopes by the strokes are symmetric.
-    slopes = loads_of(twin, twin.numbers, strokes, 0 * speeds)[1]
-    np.testing.assert_allclose(slopes, slopes.T, atol=1e-9 * np.abs(slopes).max())
+    forces = [
+        load_of(twin, twin.numbers, strokes + side, 0 * speeds)[0] for side in (*np.eye(3) * step, *np.eye(3) * -step)
+    ]
+    slopes = np.array(forces[:3]) - forces[3:]
+    np.testing.assert_allclose(slopes, slopes.T, atol=1e-6 * np.abs(slopes).max())
 
 
 @pytest.fixture
@@ -195,18 +183,15 @@ def guess(tmp_path):
     return path
 
 
-def base_numbers(twin, numbers):
+def moments_and_inertias(twin, numbers):
     """The moments and inertias that inertia and gravity are linear in."""
-    table = twin.table
-    base = np.empty(at.BASE)
-    base_of(numbers, table.inertia_at, table.linkage, base, np.empty((at.BASE, table.potential_at - table.inertia_at)))
-    return base
+    return moments_of(numbers, twin.table.inertia_at, twin.table.linkage).values
 
 
 def test_a_fit_starts_from_bodies_that_balance_the_measured_forces(twin, runs, guess):
     begun = front(linkage=str(guess)).start(twin.channels, twin.scales, runs, 0)
     truth, before, after = (
-        base_numbers(twin, numbers) for numbers in (twin.numbers, begun.table.nominal, begun.numbers)
+        moments_and_inertias(twin, numbers) for numbers in (twin.numbers, begun.table.nominal, begun.numbers)
     )
     moments = [0, 2, 4]
     wrong = np.abs(before / truth - 1.0)[moments]
@@ -248,7 +233,7 @@ def test_a_fit_moves_the_bodies_and_the_datasheet_has_them(twin, runs, guess, tm
 def test_inertia_of_the_datasheet_is_that_of_the_load(twin):
     table, zero = twin.table, np.zeros(3)
     rows = datasheet(table, twin.numbers, np.zeros((len(twin.numbers),) * 2))
-    mass = loads_of(twin, twin.numbers, 0.5 * np.array([1.504, 1.26, 1.104]), zero)[4]
+    mass = load_of(twin, twin.numbers, 0.5 * np.array([1.504, 1.26, 1.104]), zero)[1]
     told = [row["value"] for row in rows if row["name"].startswith("inertia_") and row["element"] == "load"]
     np.testing.assert_allclose(told, 1e6 * np.diag(mass), rtol=1e-6)
 
@@ -256,9 +241,9 @@ def test_inertia_of_the_datasheet_is_that_of_the_load(twin):
 def test_a_joint_goes_on_in_a_straight_line_far_beyond_its_stroke(twin):
     speeds = np.array([0.1, 0.2, 0.3])
     for stroke in (-5.0, -0.1, 3.0, 50.0):
-        loads = loads_of(twin, twin.numbers, np.full(3, stroke), speeds)
-        assert all(np.isfinite(values).all() for values in loads)
-        assert (np.linalg.eigvalsh(loads[4]) > 0.0).all()
+        force, mass = load_of(twin, twin.numbers, np.full(3, stroke), speeds)
+        assert np.isfinite(force).all()
+        assert (np.linalg.eigvalsh(mass) > 0.0).all()
 
 
 @pytest.mark.parametrize(
@@ -313,15 +298,6 @@ def test_the_setting_comes_back(tmp_path):
     experiment = load_twin_experiment(None, ["twin.kind=greybox", "twin.linkage=m22"])
     (tmp_path / "again.toml").write_text(twin_toml(experiment))
     assert load_twin_experiment(tmp_path / "again.toml").twin.linkage == "m22"
-
-
-def test_balance_by_base_is_inertia_times_acceleration_and_the_forces(twin):
-    rng = np.random.default_rng(5)
-    strokes, speeds, pulls = np.array([[0.9, 0.3, 0.6]]), rng.uniform(-0.5, 0.5, (1, 3)), rng.uniform(-1, 1, (1, 3))
-    out = np.empty((1, 3, at.BASE))
-    balance_by_base(strokes, speeds, pulls, twin.table.linkage, out)
-    force, _, _, _, mass, _, _, _ = loads_of(twin, twin.numbers, strokes[0], speeds[0])
-    np.testing.assert_allclose(out[0] @ base_numbers(twin, twin.numbers), mass @ pulls[0] + force, rtol=1e-10)
 
 
 def near(twin, runs=7, ticks=30, seed=3):

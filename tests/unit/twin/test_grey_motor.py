@@ -13,6 +13,7 @@ from edp.networks.twin import TWINS, fit_scales
 from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.datasheet import datasheet
 from edp.networks.twin.grey.elements import CylinderElement, MotorElement, PumpElement, ValveElement
+from edp.networks.twin.grey.rollouts import RunBatch
 from edp.networks.twin.greybox import GreyBox, GreyFitSpec, RunTarget
 from edp.networks.twin.residual import Residual
 from edp.signals import Channel, Kind
@@ -75,11 +76,10 @@ def loss(twin, numbers, commands, truth, columns):
     demands = twin.demands(commands[:, :-1])
     rest = twin.rest(demands[:, 0], truth[:, 0])
     state = (measured[:, 0].copy(), *(np.ascontiguousarray(part, dtype=np.float64) for part in rest))
-    normal = (np.zeros((columns, columns)), np.zeros(columns), np.zeros(1))
     weight = twin.units / twin.scales.answer_width.astype(np.float64)
-    judge = RunTarget(np.ascontiguousarray(values[:, 1:]), weight, 1e9, (PREFIX, 0, 1), normal)
-    twin.lanes(numbers, demands, measured, state, judge=judge)
-    return normal[2].sum(), normal[1]
+    target = RunTarget(np.ascontiguousarray(values[:, 1:]), weight, 1e9, PREFIX)
+    normal = twin.judge(numbers, RunBatch(demands, measured, *state), target, columns > 0)
+    return normal.losses.sum(), normal.gradient
 
 
 @pytest.mark.long

@@ -14,9 +14,8 @@ from edp.errors import ConfigError, closest
 from edp.ir import Builder
 from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinRunner, TwinState
 from edp.networks.twin.grey import layout as at
-from edp.networks.twin.grey.absent import NO_CELL, NO_SUMS, NO_TRACE
 from edp.networks.twin.grey.connections import check_elements
-from edp.networks.twin.grey.correction import Cell, Trace
+from edp.networks.twin.grey.correction import Cell, OutputBounds, Trace
 from edp.networks.twin.grey.elements import (
     CylinderElement,
     Elements,
@@ -25,14 +24,18 @@ from edp.networks.twin.grey.elements import (
     ValveElement,
     default_elements,
 )
+from edp.networks.twin.grey.equations import GreyForm
 from edp.networks.twin.grey.fit_spec import GreyFitSpec
 from edp.networks.twin.grey.known_linkage import KnownLinkage, check_linkage
+from edp.networks.twin.grey.linkage import joint_actuators
 from edp.networks.twin.grey.lowering import add_layer
 from edp.networks.twin.grey.numbers import LEFT_OUT, NumberTable, finer_values, number_table
 from edp.networks.twin.grey.plausible import STRETCHES, Travel
-from edp.networks.twin.grey.run import run_lanes
+from edp.networks.twin.grey.program import GreyProgram, program_of
+from edp.networks.twin.grey.rollouts import FitTarget, RunBatch, judge_run, run_batch
 from edp.networks.twin.grey.runner import GreyRunner
 from edp.networks.twin.grey.start import load_start
+from edp.networks.twin.grey.tick import MachineArrays
 from edp.networks.twin.grey.wiring import Wiring, turning_scales
 from edp.networks.twin.scales import FASTEST, HIGHEST, Array, TwinScales
 from edp.settings.bounds import MOST_NAMES, check_bounds, check_count, integer
@@ -196,6 +199,10 @@ class GreyBox:
         return number_table(elements, travels, pumps, self.degrees, self.without, front, self.curve)
 
 
+def _rows(places: NDArray[np.int64]) -> tuple[tuple[int, ...], ...]:
+    return tuple(map(tuple, places.tolist()))
+
+
 def _sides(valve: ValveElement, channels: TwinChannels) -> list[int]:
     names = [channel.name for channel in channels.commands]
     return [names.index(name) for name in (valve.extend, valve.retract) if name]
@@ -208,26 +215,38 @@ def _full(commands: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class RunTarget:
-    """Reference of the summed free-run errors, in units of the grey box.
+    """Reference of free-run errors, in units of the grey box.
 
     Attributes:
-        truth: ``(lane, tick, answer)``; row t is the machine after the command of tick t.
-        weight: of the errors ``(answer,)``.
+        truth: row t is the machine after the command of sample t, shape (run, tick, output).
+        weight: of the errors, shape (output,).
         delta: where the Huber loss turns to a line, in weighted errors.
-        counts: see `edp.networks.twin.grey.run.run_lanes`.
-        normal: matrix, gradient and losses, as there.
+        prefix: samples at the start whose errors do not count.
+        followed: samples of the prefix that need no load, since all of it is measured.
+        stride: samples from one that counts to the next.
     """
 
     truth: Doubles
     weight: Doubles
     delta: float
-    counts: tuple[int, int, int]
-    normal: tuple[Doubles, Doubles, Doubles]
+    prefix: int
+    followed: int = 0
+    stride: int = 1
 
-    @property
-    def full(self) -> bool:
-        """Whether matrix and gradient are summed up too: where they have room."""
-        return self.normal[0].size > 0
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """Sums over the errors of free runs.
+
+    Attributes:
+        matrix: Gauss-Newton matrix, shape (parameter, parameter); no rows where losses alone are wanted.
+        gradient: shape (parameter,).
+        losses: of the runs, shape (run,).
+    """
+
+    matrix: Doubles
+    gradient: Doubles
+    losses: Doubles
 
 
 class GreyTwin(Twin):
@@ -269,10 +288,32 @@ class GreyTwin(Twin):
         return np.where(self.wiring.ports[:, 0] == 2, 1e6, 1.0)
 
     @property
-    def form(self) -> tuple[NDArray[np.int64], ...]:
-        """Places of valves and elements, as compiled code reads them."""
+    def program(self) -> GreyProgram:
+        """Machine code of the equations."""
         table, wiring = self.table, self.wiring
-        return table.valve_at, wiring.actuator, wiring.pump, table.actuator_at, table.pump_at
+        joints = () if table.front is None else tuple(int(k) for k in joint_actuators(table.linkage))
+        return program_of(GreyForm(
+            valve_at=_rows(table.valve_at),
+            valve_actuator=tuple(wiring.actuator.tolist()),
+            valve_pump=tuple(wiring.pump.tolist()),
+            actuator_at=tuple(table.actuator_at.tolist()),
+            pump_at=tuple(table.pump_at.tolist()),
+            circuit_at=int(table.circuit_at),
+            inertia_at=int(table.inertia_at),
+            inertia_terms=int(table.inertia_terms),
+            potential_at=int(table.potential_at),
+            exponents=_rows(table.exponents),
+            joint_actuators=joints,
+            knots=tuple(table.knots.tolist()),
+            parameters=len(table.numbers),
+        ))  # fmt: skip
+
+    def machine(self, numbers: Doubles) -> MachineArrays:
+        """Return parameters, in place of its own, with the constants of the machine."""
+        (middle, scale), linkage = self.wiring.z_of, self.table.linkage
+        bodies = linkage[: at.JOINTS] if len(linkage) else np.zeros(at.JOINTS)
+        constants = np.concatenate([middle, scale, bodies])
+        return MachineArrays(numbers, constants, scale, linkage, self.wiring.ports, *self.time)
 
     @property
     def time(self) -> tuple[float, int]:
@@ -329,38 +370,48 @@ class GreyTwin(Twin):
         return self.answered(commands, measured, state)
 
     def answered(
-        self, commands: Array, measured: Array, state: TwinState, cell: Cell = NO_CELL, trace: Trace = NO_TRACE
+        self,
+        commands: Array,
+        measured: Array,
+        state: TwinState,
+        cell: Cell | None = None,
+        trace: Trace | None = None,
     ) -> tuple[Array, TwinState]:
-        """`rollout` of checked arrays, with a cell on top; see `edp.networks.twin.grey.run.run_lanes`."""
-        now = tuple(np.array(state[name], np.float64, order="C") for name in ("answer", *STATES))
-        now[0][:] /= self.units
+        """`rollout` of checked arrays, with a cell on top; see `edp.networks.twin.grey.rollouts.run_batch`."""
+        now = [np.array(state[name], np.float64, order="C") for name in ("answer", *STATES)]
+        now[0] /= self.units
         answers = np.empty(measured.shape)
-        network = (cell, trace)
-        self.lanes(self.numbers, self.demands(commands), measured / self.units, now, answers=answers, network=network)
+        batch = RunBatch(self.demands(commands), measured / self.units, *now)
+        bounds = OutputBounds(self.scales.low / self.units, self.scales.high / self.units, self.units)
+        run_batch(self.program, self.machine(self.numbers), bounds, batch, answers, cell, trace)
         after = {name: values.astype(np.float32) for name, values in zip(STATES, now[1:], strict=True)}
         rounded = answers.astype(np.float32)
         return rounded, {"answer": rounded[:, -1].copy()} | after
 
-    def lanes(
-        self,
-        numbers: Doubles,
-        demands: Doubles,
-        measured: Doubles,
-        state: tuple[Doubles, ...],
-        answers: Doubles | None = None,
-        judge: RunTarget | None = None,
-        network: tuple[Cell, Trace] = (NO_CELL, NO_TRACE),
-    ) -> None:
-        """Call `edp.networks.twin.grey.run.run_lanes` with these elements: a free run, or the errors of one."""
-        nothing = np.zeros((0, 0, 0))
-        judged = judge or RunTarget(nothing, np.zeros(len(self.wiring.ports)), 1.0, (0, 0, 1), NO_SUMS)
-        limits = (self.scales.low / self.units, self.scales.high / self.units, self.units)
-        run_lanes(
-            demands, measured, judged.truth, state, judged.counts, (judged.weight, judged.delta), limits,
-            (numbers, self.table.knots, *self.wiring.z_of, self.table.linkage), self.form, self.wiring.ports,
-            self.table.places, self.table.exponents, self.time, judged.full, nothing if answers is None else answers,
-            judged.normal, *network,
-        )  # fmt: skip
+    def judge(self, numbers: Doubles, batch: RunBatch, target: RunTarget, full: bool) -> NormalEquations:
+        """Return the losses of free runs with these parameters; if `full`, with gradient and Gauss-Newton matrix.
+
+        Args:
+            numbers: parameters, shape (parameter,).
+            batch: of runs; moved.
+            target: what their outputs should be.
+            full: whether gradient and matrix are wanted.
+        """
+        size, outputs = len(numbers) if full else 0, len(self.wiring.ports)
+        rows = ((batch.demands.shape[1] - target.prefix) // target.stride + 2) * outputs if full else 0
+        slopes, errors = np.zeros((rows, size)), np.zeros(rows)
+        part = FitTarget(
+            target.truth, target.weight, target.delta, target.prefix, target.followed, target.stride, errors, slopes
+        )
+        matrix, gradient, losses = np.zeros((size, size)), np.zeros(size), np.zeros(len(batch.demands))
+        program, machine = self.program, self.machine(numbers)
+        for run in range(len(losses)):
+            slopes[:], errors[:] = 0.0, 0.0
+            losses[run] = judge_run(program, machine, batch, run, part)
+            if full and np.isfinite(losses[run]):
+                matrix += slopes.T @ slopes
+                gradient += slopes.T @ errors
+        return NormalEquations(matrix, gradient, losses)
 
     def runner(self) -> TwinRunner:
         return GreyRunner(self, STATES)

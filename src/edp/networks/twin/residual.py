@@ -122,18 +122,20 @@ class ResidualTwin(GreyTwin):
         return super().initial_state(command, measured) | {"h": h}
 
     def cell(self, projected: Array, h: Array) -> Cell:
-        """Return the network for compiled code, in units of the grey box; see `edp.networks.twin.grey.run.run_lanes`.
+        """Return the network for compiled code, in units of the grey box; see `edp.networks.twin.grey.correction.Cell`.
 
         Args:
             projected: the commands' part of the gates ``(tick, lane, 3 units)``.
             h: ``(lane, units)``; a run moves it.
         """
         solved = np.array(solved_columns(self.channels), dtype=np.int64)
-        weights = tuple(weight.detach().numpy() for weight in self.network.looped)
+        read, state, inner_bias, out, out_bias = (weight.detach().numpy() for weight in self.network.looped)
         scales, units = self.scales, self.units
         offset, per_width = scales.answer_offset / units, units / scales.answer_width
         change = (scales.change_width / units)[solved]
-        return (projected, h, *weights, offset, per_width, change, solved)  # type: ignore[return-value]
+        return Cell(
+            projected, h, read, state, inner_bias, out, out_bias, offset, per_width, change, solved
+        )  # fmt: skip
 
     def _run(self, commands: Array, measured: Array, state: TwinState) -> tuple[Array, TwinState]:
         command_weight, bias = (w.detach().numpy() for w in (self.network.command_weight, self.network.bias))
@@ -199,10 +201,15 @@ class _Corrected(torch.autograd.Function):
         units, sizes = twin.network.units, twin.sizes
         h = np.zeros((lanes, units), np.float32)
         solved = len(solved_columns(twin.channels))
-        shapes = [(ticks, answers + solved), (ticks, answers), (ticks, 3 * units), (ticks, units), (ticks + 1, units)]
-        rows = [np.zeros((time, lanes, width), np.float32) for time, width in shapes]
-        jacobians = np.zeros((ticks, lanes, sum(sizes), sum(sizes)), np.float32)
-        trace: Trace = (*rows, jacobians, np.zeros((ticks, lanes), np.float32))  # type: ignore[assignment]
+        trace = Trace(
+            read=np.zeros((ticks, lanes, answers + solved), np.float32),
+            free=np.zeros((ticks, lanes, answers), np.float32),
+            gates=np.zeros((ticks, lanes, 3 * units), np.float32),
+            inner_sum=np.zeros((ticks, lanes, units), np.float32),
+            state=np.zeros((ticks + 1, lanes, units), np.float32),
+            slopes=np.zeros((ticks, lanes, sum(sizes), sum(sizes)), np.float32),
+            counts=np.zeros((ticks, lanes), np.float32),
+        )
         ctx.cell = twin.cell(np.ascontiguousarray(projected.detach().numpy()), h)
         state = twin.initial_state(np.ascontiguousarray(commands[:, 0]), np.ascontiguousarray(fed[:, 0]))
         values, _ = twin.answered(np.ascontiguousarray(commands), np.ascontiguousarray(fed), state, ctx.cell, trace)
@@ -213,11 +220,11 @@ class _Corrected(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_answers: Tensor) -> tuple[Tensor | None, ...]:
         twin, trace, cell = ctx.twin, ctx.trace, ctx.cell
-        by_gates, by_inner = np.empty_like(trace[2]), np.empty_like(trace[3])
-        by_out = np.empty((*trace[2].shape[:2], len(cell[-1])), np.float32)
+        by_gates, by_inner = np.empty_like(trace.gates), np.empty_like(trace.inner_sum)
+        by_out = np.empty((*trace.gates.shape[:2], len(cell.solved)), np.float32)
         incoming = np.ascontiguousarray(grad_answers.numpy())
         actuators, nodes = len(twin.wiring.columns), twin.wiring.nodes
         sizes = (actuators, nodes, 0.5 / twin.channels.rate_hz)
         run_back(incoming, ctx.port, cell, twin.wiring.ports, sizes, trace, (by_gates, by_inner, by_out))
-        by_weights = weight_gradients(trace[0], trace[4], by_gates, by_inner, by_out)
+        by_weights = weight_gradients(trace.read, trace.state, by_gates, by_inner, by_out)
         return (torch.from_numpy(by_gates), *by_weights, None, None, None, None)

@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.networks.twin.grey import layout as grey
+from edp.networks.twin.grey.equations import GAMMA
 from edp.networks.twin.grey.numbers import NumberTable
 from edp.networks.twin.grey.plausible import opening_knots
-from edp.networks.twin.grey.steps import GAMMA
 from edp.sim.machine import layout as sim
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.parameters import pack

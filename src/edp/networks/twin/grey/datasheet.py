@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey.bodies import forces_by_moments, moments_of
 from edp.networks.twin.grey.known_linkage import GIGA
-from edp.networks.twin.grey.linkage import balance_by_base, base_of
 from edp.networks.twin.grey.numbers import NumberTable
 from edp.storage.reading import Table
 from edp.wording import typed
@@ -84,20 +84,18 @@ def _body_inertias(table: NumberTable, values: Doubles, covariance: Doubles) -> 
     """Return the inertia rows of a known linkage, at the middle of the strokes of its machine."""
     span, n = slice(table.inertia_at, table.potential_at), len(table.actuator_at)
     joints = table.linkage[at.JOINTS :].reshape(at.BODIES, at.JOINT_VALUES)
-    strokes, zero = np.zeros((1, n)), np.zeros((1, n))
+    strokes, resting = np.zeros((1, n)), np.zeros((1, n))
     which = joints[:, at.ACTUATOR].astype(int)
     strokes[0, which] = 0.5 * (joints[:, at.KNOT] + joints[:, -at.KNOT_VALUES])
-    base, by_number = np.empty(at.BASE), np.empty((at.BASE, span.stop - span.start))
-    base_of(values, table.inertia_at, table.linkage, base, by_number)
-    by_coordinate = by_number * np.where(table.positive[span], values[span] * table.width[span], table.width[span])
-    resting, moved, rows = np.empty((1, n, at.BASE)), np.empty((1, n, at.BASE)), []
-    balance_by_base(strokes, zero, zero, table.linkage, resting)
+    moments = moments_of(values, table.inertia_at, table.linkage)
+    by_coordinate = moments.slopes * np.where(table.positive[span], values[span] * table.width[span], table.width[span])
+    at_rest, rows = forces_by_moments(strokes, resting, resting, table.linkage), []
     for i, first_number in enumerate(table.actuator_at):
-        balance_by_base(strokes, zero, np.eye(n)[i : i + 1], table.linkage, moved)
-        parts = (moved - resting)[0, i]
+        moved = forces_by_moments(strokes, resting, np.eye(n)[i : i + 1], table.linkage)
+        parts = (moved - at_rest)[0, i]
         of = table.numbers[first_number].element
         slope = parts @ by_coordinate
-        rows.append(_inertia_row(of, "kg", GIGA, float(parts @ base), slope, covariance[span, span]))
+        rows.append(_inertia_row(of, "kg", GIGA, float(parts @ moments.values), slope, covariance[span, span]))
     return rows
 
 

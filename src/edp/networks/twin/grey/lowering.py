@@ -13,8 +13,13 @@ from edp.ir.base import INPUT
 from edp.ir.builder import indices
 from edp.ir.hydraulics import NONE, HydraulicTick
 from edp.ir.reference import STEPS
-from edp.networks.twin.grey.absent import NO_CELL, NO_SUMS, NO_TRACE
-from edp.networks.twin.grey.run import run_lanes
+from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey.correction import OutputBounds
+from edp.networks.twin.grey.equations import GreyForm
+from edp.networks.twin.grey.linkage import joint_actuators
+from edp.networks.twin.grey.program import program_of
+from edp.networks.twin.grey.rollouts import RunBatch, run_batch
+from edp.networks.twin.grey.tick import MachineArrays
 
 if TYPE_CHECKING:
     from edp.networks.twin.greybox import GreyTwin
@@ -86,7 +91,7 @@ def _signed(values: NDArray[np.uint16]) -> NDArray[np.int64]:
 def _tick(
     layer: HydraulicTick, w: Mapping[str, Values], memory: dict[str, Values], commands: Values, fed: Values
 ) -> Values:
-    """Compute one sample of the layer with the compiled kernel of the twin, without output bounds."""
+    """Compute one sample of the layer with the machine code of the twin, without output bounds."""
     values = {name: np.asarray(array, np.float64) for name, array in w.items()}
     sides, ports = _signed(layer.sides), _signed(layer.ports)
     demand = commands[sides[:, 0]] - np.where(sides[:, 1] >= 0, commands[sides[:, 1]], 0.0)
@@ -94,34 +99,19 @@ def _tick(
     measured = values["offset"] + values["answer_width"] * fed
     state = [np.array(memory[slot.name], np.float64)[None] for slot in layer.slots]
     pumps = layer.sizes[2]
-    state[3] = state[3][:, :pumps]
+    state[3] = np.ascontiguousarray(state[3][:, :pumps])
     answers, unbounded = np.empty((1, 1, len(ports))), np.full(len(ports), np.inf)
-    inertia, per_entry, potential = layer.load
-    run_lanes(
-        np.array(demand, np.float64)[None, None],
-        measured[None, None],
-        np.zeros((0, 0, 0)),
-        (np.zeros((1, len(ports))), *state),
-        (0, 0, 1),
-        (np.zeros(len(ports)), 1.0),
-        (-unbounded, unbounded, np.ones(len(ports))),
-        (
-            values["numbers"],
-            values["knots"],
-            values["middle"],
-            values["scale"],
-            values["linkage"] if layer.linked else np.zeros(0),
-        ),
-        tuple(_signed(table) for table in (layer.valve_at, layer.valve_actuator, layer.valve_pump)) + _places_of(layer),
-        ports,
-        (inertia, per_entry, potential, layer.circuit),
-        _signed(layer.exponents),
-        (layer.tick_s, layer.steps),
-        False,
+    linkage = values["linkage"] if layer.linked else np.zeros(0)
+    bodies = linkage[: at.JOINTS] if layer.linked else np.zeros(at.JOINTS)
+    constants = np.concatenate([values["middle"], values["scale"], bodies])
+    run_batch(
+        program_of(_form(layer, values)),
+        MachineArrays(values["numbers"], constants, values["scale"], linkage, ports, layer.tick_s, layer.steps),
+        OutputBounds(-unbounded, unbounded, np.ones(len(ports))),
+        RunBatch(np.array(demand, np.float64)[None, None], measured[None, None], np.zeros((1, len(ports))), *state),
         answers,
-        NO_SUMS,
-        NO_CELL,
-        NO_TRACE,
+        None,
+        None,
     )
     for slot, value in zip(layer.slots, state, strict=True):
         memory[slot.name] = _padded(value[0], slot.size) if slot.shape != value[0].shape else value[0]
@@ -129,8 +119,24 @@ def _tick(
     return np.asarray(scaled[ports[:, 0] != 1], commands.dtype)
 
 
-def _places_of(layer: HydraulicTick) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    return _signed(layer.actuator_at), _signed(layer.pump_at[: layer.sizes[2]])
+def _form(layer: HydraulicTick, values: Mapping[str, NDArray[np.float64]]) -> GreyForm:
+    inertia_at, inertia_terms, potential_at = layer.load
+    joints = tuple(joint_actuators(values["linkage"]).tolist()) if layer.linked else ()
+    return GreyForm(
+        valve_at=tuple(map(tuple, _signed(layer.valve_at).tolist())),
+        valve_actuator=tuple(_signed(layer.valve_actuator).tolist()),
+        valve_pump=tuple(_signed(layer.valve_pump).tolist()),
+        actuator_at=tuple(_signed(layer.actuator_at).tolist()),
+        pump_at=tuple(_signed(layer.pump_at[: layer.sizes[2]]).tolist()),
+        circuit_at=layer.circuit,
+        inertia_at=inertia_at,
+        inertia_terms=inertia_terms,
+        potential_at=potential_at,
+        exponents=tuple(map(tuple, _signed(layer.exponents).tolist())),
+        joint_actuators=joints,
+        knots=tuple(values["knots"].tolist()),
+        parameters=len(values["numbers"]),
+    )
 
 
 STEPS[HydraulicTick] = _tick

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.networks.twin.base import TwinRunner, TwinState
-from edp.networks.twin.grey.near_runs import run_near
+from edp.networks.twin.grey.correction import OutputBounds
+from edp.networks.twin.grey.neighbours import run_near
 from edp.networks.twin.scales import Array
 
 if TYPE_CHECKING:
@@ -37,17 +38,10 @@ class GreyRunner(TwinRunner):
     def __init__(self, twin: GreyTwin, names: tuple[str, ...]) -> None:
         super().__init__(twin)
         self._grey, self._names, self._units = twin, names, twin.units
-        table, wiring, units = twin.table, twin.wiring, twin.units
+        wiring, units = twin.wiring, twin.units
         limits = (twin.scales.low / units, twin.scales.high / units, units)
-        self._parts: tuple[Any, ...] = (
-            tuple(np.ascontiguousarray(values, dtype=np.float64) for values in limits),
-            (twin.numbers, table.knots, *wiring.z_of, table.linkage),
-            twin.form,
-            wiring.ports,
-            table.places,
-            table.exponents,
-            twin.time,
-        )
+        self._bounds = OutputBounds(*(np.ascontiguousarray(values, dtype=np.float64) for values in limits))
+        self._program, self._machine = twin.program, twin.machine(twin.numbers)
         self._double = goes_twice(twin)
         self._speeds = np.array([speed for speed, _, _, _ in wiring.columns])
         self.resistance = np.zeros(len(wiring.columns))
@@ -80,6 +74,6 @@ class GreyRunner(TwinRunner):
         resistance = np.ascontiguousarray(1e-6 * forces[self._speeds])
         row = measured / self._units
         singles = ticks if single is None or not self._double else max(1, single)
-        rest: tuple[Any, ...] = (*self._parts, singles, answers)
-        run_near(self._grey.demands(commands), row, first, now, resistance, *rest)
+        plan = self._grey.demands(commands), row, first, singles
+        run_near(self._program, self._machine, self._bounds, plan, now, resistance, answers)
         return answers, now

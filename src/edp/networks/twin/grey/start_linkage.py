@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.networks.twin.grey import layout as at
-from edp.networks.twin.grey.linkage import balance_by_base, base_of
+from edp.networks.twin.grey.bodies import forces_by_moments, moments_of
 from edp.networks.twin.grey.numbers import NumberTable
 
 Array = NDArray[np.float64]
@@ -25,9 +25,7 @@ def balance_columns(table: NumberTable, rows: Array) -> Array:
         rows: velocity, acceleration, stroke ... ``(row, actuator, at least 3)``.
     """
     speeds, pulls, strokes = (np.ascontiguousarray(rows[:, :, k]) for k in range(3))
-    out = np.empty((*strokes.shape, at.BASE))
-    balance_by_base(strokes, speeds, pulls, table.linkage, out)
-    return np.moveaxis(out, 0, 1)
+    return np.moveaxis(forces_by_moments(strokes, speeds, pulls, table.linkage), 0, 1)
 
 
 def balanced_bodies(table: NumberTable, matrix: Array, goal: Array) -> tuple[Array, Array]:
@@ -71,10 +69,9 @@ def balanced_bodies(table: NumberTable, matrix: Array, goal: Array) -> tuple[Arr
 def _cost(table: NumberTable, theta: Array, square: Array, pull: Array) -> tuple[float, Array, Array]:
     """Return cost (residual balance and deviation from typical values), nine parameters and derivatives."""
     values, span = _numbers(table, theta), slice(table.inertia_at, table.potential_at)
-    base, by_number = np.empty(at.BASE), np.empty((at.BASE, len(theta)))
-    base_of(values, table.inertia_at, table.linkage, base, by_number)
-    width = table.width[span]
-    slopes = by_number * np.where(table.positive[span], values[span] * width, width)
+    moments = moments_of(values, table.inertia_at, table.linkage)
+    base, width = moments.values, table.width[span]
+    slopes = moments.slopes * np.where(table.positive[span], values[span] * width, width)
     return float(0.5 * base @ square @ base - pull @ base + 0.5 * theta @ theta), base, slopes
 
 

@@ -1,0 +1,115 @@
+"""Bodies of a known linkage: moments and inertias, and the forces of a motion, which are linear in these."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey.equations import Equations, GreyForm
+from edp.networks.twin.grey.jit import compiled
+from edp.networks.twin.grey.linkage import joint_actuators, joint_angle
+from edp.networks.twin.grey.program import ANGLES, ExpressionAlgebra, loaded_module
+from edp.networks.twin.symbolic.expression import Graph
+from edp.networks.twin.symbolic.machine_code import CodeModule, Loaded, call
+
+Array = NDArray[np.float64]
+PARAMETERS = at.BODIES * at.BODY_VALUES
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Moments and inertias of all bodies about their joints: X, Y, H of the first body, of the second ...
+
+    Attributes:
+        values: shape (BASE,).
+        slopes: by masses, centres and inertias, shape (BASE, parameter of a body).
+    """
+
+    values: Array
+    slopes: Array
+
+
+@cache
+def _functions(joints: tuple[int, ...]) -> Loaded:
+    graph, n = Graph(), len(joints)
+    parameters, constants = graph.inputs("parameter", PARAMETERS), graph.inputs("constant", 2 * n + at.JOINTS)
+    inputs = graph.inputs("input", 3 * n + ANGLES * n + at.BASE)
+    strokes, speeds, accelerations = inputs[:n], inputs[n : 2 * n], inputs[2 * n : 3 * n]
+    angles, moments = inputs[3 * n : 3 * n + ANGLES * n], inputs[3 * n + ANGLES * n :]
+    for a, actuator in enumerate(joints):
+        graph.link(angles[ANGLES * a : ANGLES * (a + 1)], strokes[actuator])
+    form = GreyForm(
+        valve_at=(), valve_actuator=(), valve_pump=(), actuator_at=(0,) * n, pump_at=(), circuit_at=0, inertia_at=0,
+        inertia_terms=0, potential_at=PARAMETERS, exponents=(), joint_actuators=joints, knots=(), parameters=PARAMETERS,
+    )  # fmt: skip
+    algebra = ExpressionAlgebra(graph)
+    equations, module = (
+        Equations(form, parameters, constants, algebra),
+        CodeModule(graph, (parameters, constants, inputs)),
+    )
+    made = equations.moments()
+    module.add("moments", [*made, *(slope for row in algebra.derivatives(made, parameters) for slope in row)])
+    forces = equations.balance(moments, strokes, speeds, accelerations, angles[::ANGLES])
+    module.add("balance", [slope for row in algebra.derivatives(forces, moments) for slope in row])
+    return loaded_module(module, ("bodies", joints))
+
+
+def moments_of(values: Array, inertia_at: int, linkage: Array) -> Moments:
+    """Return the moments and inertias of bodies.
+
+    Args:
+        values: parameters of the grey box, shape (parameter,).
+        inertia_at: place of the first body's.
+        linkage: of `edp.networks.twin.grey.layout`.
+    """
+    joints = tuple(joint_actuators(linkage).tolist())
+    own, results = (
+        np.ascontiguousarray(values[inertia_at : inertia_at + PARAMETERS]),
+        np.empty(at.BASE * (1 + PARAMETERS)),
+    )
+    constants = np.concatenate([np.zeros(2 * len(joints)), linkage[: at.JOINTS]])
+    _call(_functions(joints).addresses["moments"], own, constants, np.zeros(1), results)
+    return Moments(results[: at.BASE], results[at.BASE :].reshape(at.BASE, PARAMETERS))
+
+
+def forces_by_moments(strokes: Array, speeds: Array, accelerations: Array, linkage: Array) -> Array:
+    """Return the forces on the actuators by each moment and inertia, shape (row, actuator, BASE).
+
+    Args:
+        strokes: m, shape (row, actuator).
+        speeds: m/s, shape (row, actuator).
+        accelerations: m/s^2, shape (row, actuator).
+        linkage: of `edp.networks.twin.grey.layout`.
+    """
+    joints = joint_actuators(linkage)
+    motion = np.ascontiguousarray(np.concatenate([strokes, speeds, accelerations], axis=1))
+    forces = np.empty((*strokes.shape, at.BASE))
+    constants = np.concatenate([np.zeros(2 * len(joints)), linkage[: at.JOINTS]])
+    _balance(_functions(tuple(joints.tolist())).addresses["balance"], constants, linkage, motion, forces)
+    return forces
+
+
+@compiled
+def _call(address: int, parameters: Array, constants: Array, inputs: Array, results: Array) -> None:
+    call(address, parameters, constants, inputs, results)
+
+
+@compiled
+def _balance(address: int, constants: Array, linkage: Array, motion: Array, forces: Array) -> None:
+    n = forces.shape[1]
+    inputs, results = np.zeros(3 * n + ANGLES * n + at.BASE), np.empty(n * at.BASE)
+    for row in range(len(motion)):
+        for k in range(3 * n):
+            inputs[k] = motion[row, k]
+        for a in range(at.BODIES):
+            joint, place = at.JOINTS + a * at.JOINT_VALUES, 3 * n + ANGLES * a
+            stroke = inputs[int(linkage[joint + at.ACTUATOR])]
+            inputs[place], inputs[place + 1], inputs[place + 2], inputs[place + 3] = joint_angle(linkage, joint, stroke)
+        call(address, inputs, constants, inputs, results)
+        for i in range(n):
+            for k in range(at.BASE):
+                forces[row, i, k] = results[i * at.BASE + k]

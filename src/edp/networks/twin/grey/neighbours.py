@@ -1,0 +1,469 @@
+"""Linearised rollouts: one machine, and runs whose commands differ a little from its own, for the plan at each sample.
+
+The first run is the grey box itself. The others start each implicit stage from its solution and take one step of
+Newton's method with its matrix. So they follow their own commands, with dead bands and play, and differ from exact runs
+by the square of their distance. What changes of the strokes do to volumes, cushions, inertia and gravity is left out:
+within a plan they are a few per cent of what drives the machine.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey import program as code
+from edp.networks.twin.grey.correction import OutputBounds
+from edp.networks.twin.grey.equations import GAMMA
+from edp.networks.twin.grey.jit import compiled, inlined, inner
+from edp.networks.twin.grey.program import GreyProgram
+from edp.networks.twin.grey.rollouts import clamp_outputs, feed
+from edp.networks.twin.grey.tick import (
+    AHEAD,
+    MachineArrays,
+    RunValues,
+    copy,
+    factorise,
+    freeze,
+    newton,
+    solve,
+    work_arrays,
+)
+from edp.networks.twin.symbolic.machine_code import call
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+TOLERANCE = 1e-5
+"""Of the last change of Newton's method, in MPa and m/s: what is left then is about its square."""
+BETWEEN = GAMMA / (1.0 - GAMMA)
+"""Where the first stage of a step over two samples lies between the two stages of the first of them."""
+
+
+class NearRuns(NamedTuple):
+    """Runs near a first one; arrays whose first dimension is the run hold it, too.
+
+    Attributes:
+        frames: inputs of all functions, shape (run, value).
+        unknowns: shape (run, unknown).
+        branched: whether a run differs from the first one, shape (run,).
+        begins: first sample whose outputs are its own, shape (run,).
+        spools: at both stages of each step, shape (run, tick, 2 * step, valve).
+        pilots: in the middle of each step, shape (run, tick, step, valve).
+        steps: of Newton's method, shape (unknown, run - 1).
+        out: results of functions.
+        matrix: factorised, shape (unknown, unknown).
+    """
+
+    frames: Array
+    unknowns: Array
+    branched: NDArray[np.bool_]
+    begins: IntArray
+    spools: Array
+    pilots: Array
+    steps: Array
+    out: Array
+    matrix: Array
+
+
+@inlined
+def _demand(demands: Array, history: Array, t: int, j: int, ticks: float) -> float:
+    """Return the command of valve `j` some ticks before tick t, interpolated; from `history` before the run."""
+    whole = min(int(ticks), len(history) - 2)
+    newer = demands[t - whole, j] if whole <= t else history[whole - t - 1, j]
+    older = demands[t - whole - 1, j] if whole < t else history[whole - t, j]
+    return float(newer + (ticks - whole) * (older - newer))
+
+
+@inner
+def follow_commands(
+    program: GreyProgram, machine: MachineArrays, runs: NearRuns, demands: Array, history: Array, first: IntArray
+) -> None:
+    """Compute spools and pilots of all runs.
+
+    Args:
+        program: of the form.
+        machine: its parameters.
+        runs: whose frames hold the states of the valves; moved.
+        demands: shape (run, tick, valve).
+        history: commands before, newest first, shape (tick, valve).
+        first: tick at which each run branches off, shape (run,).
+    """
+    frame, count, ticks = program.frame, program.sizes[1], demands.shape[1]
+    length, states = machine.tick_s / machine.steps, count * at.VALVE_STATES
+    before, remains = np.empty((ticks, states)), np.empty((2, 2 * count))
+    for stage in range(2):
+        runs.frames[0, frame.length] = GAMMA * length if stage == 0 else length - GAMMA * length
+        call(program.addresses[code.REMAINS], machine.parameters, machine.constants, runs.frames[0], runs.out)
+        copy(remains[stage], runs.out)
+    for run in range(len(demands)):
+        values = runs.frames[run]
+        begin = first[run] if run > 0 else 0
+        if begin >= ticks:
+            continue
+        if run > 0:
+            # A step over two samples may begin at the one before.
+            if begin > 0:
+                _copy_ways(runs, run, begin - 1, 0)
+            copy(values[frame.valves : frame.goals], before[begin])
+        for t in range(begin, ticks):
+            if run == 0:
+                copy(before[t], values[frame.valves : frame.goals])
+            for j in range(count):
+                delay = machine.parameters[program.own[j, at.BY_DELAY]] / machine.tick_s
+                delay = min(max(delay, 0.0), len(history) - 2.0)
+                values[frame.goals + j] = _demand(demands[run], history, t, j, delay)
+            for stage in range(2 * machine.steps):
+                copy(values[frame.remains : frame.mass], remains[stage % 2])
+                call(program.addresses[code.FOLLOW], machine.parameters, machine.constants, values, runs.out)
+                copy(values[frame.valves : frame.goals], runs.out)
+                for j in range(count):
+                    state = at.VALVE_STATES * j
+                    runs.spools[run, t, stage, j] = runs.out[state + at.SPOOL]
+                    if stage % 2 == 0:
+                        runs.pilots[run, t, stage // 2, j] = runs.out[state + at.PILOT_2]
+
+
+@inlined
+def _copy_ways(runs: NearRuns, run: int, t: int, source: int) -> None:
+    for stage in range(runs.spools.shape[2]):
+        copy(runs.spools[run, t, stage], runs.spools[source, t, stage])
+    for step in range(runs.pilots.shape[2]):
+        copy(runs.pilots[run, t, step], runs.pilots[source, t, step])
+
+
+@inlined
+def _set_valves(program: GreyProgram, values: Array, state: int, positions: Array) -> None:
+    for j in range(len(positions)):
+        values[program.frame.valves + at.VALVE_STATES * j + state] = positions[j]
+
+
+@inner
+def _contents(
+    program: GreyProgram, machine: MachineArrays, values: Array, y: Array, out: Array, contents: Array
+) -> None:
+    """Compute contents of the nodes and velocities from unknowns."""
+    nodes = program.sizes[3]
+    copy(values[: len(y)], y)
+    call(program.addresses[code.CONTENTS], machine.parameters, machine.constants, values, out)
+    copy(contents[:nodes], out)
+    copy(contents[nodes:], y[nodes:])
+
+
+@inner
+def _begin_step(program: GreyProgram, machine: MachineArrays, runs: NearRuns, work: RunValues, length: float) -> None:
+    """Prepare a step of all runs: frozen load, contents, deflections and displacements."""
+    (n, _, pumps, nodes, _), frame = program.sizes, program.frame
+    size, base = nodes + n, frame.base
+    for run in range(len(runs.frames)):
+        values = runs.frames[run]
+        if not runs.branched[run]:
+            continue
+        if run > 0:
+            for place, count in ((frame.frozen, n), (frame.mass, n * n + n)):
+                copy(values[place : place + count], work.frame[place : place + count])
+            copy(values[frame.speeds : frame.speeds + n], runs.unknowns[run, nodes:])
+        _contents(program, machine, values, runs.unknowns[run], runs.out, values[base : base + size])
+        copy(values[frame.bristle_base : frame.bristle_base + n], values[frame.bristles : frame.bristles + n])
+        values[frame.length] = length
+        call(program.addresses[code.PUMPS], machine.parameters, machine.constants, values, runs.out)
+        copy(values[frame.displacements : frame.displacements + pumps], runs.out)
+        values[frame.step] = GAMMA * length
+
+
+@inner
+def _stage(program: GreyProgram, machine: MachineArrays, runs: NearRuns, work: RunValues) -> None:
+    """Solve a stage of the first run, and take one step of Newton's method for each other one."""
+    size, steps = len(runs.matrix), runs.steps
+    values = runs.frames[0]
+    newton(program, machine, work, TOLERANCE)
+    y = values[:size]
+    copy(runs.unknowns[0], y)
+    any_branched = False
+    for run in range(1, len(runs.frames)):
+        if not runs.branched[run]:
+            continue
+        any_branched, other = True, runs.frames[run]
+        copy(other[:size], y)
+        call(program.addresses[code.RESIDUAL], machine.parameters, machine.constants, other, runs.out)
+        for k in range(size):
+            steps[k, run - 1] = runs.out[k]
+    if any_branched:
+        call(program.addresses[code.MATRIX], machine.parameters, machine.constants, values, runs.out)
+        for row in range(size):
+            copy(runs.matrix[row], runs.out[row * size : (row + 1) * size])
+        factorise(runs.matrix)
+        solve(runs.matrix, steps)
+    for run in range(1, len(runs.frames)):
+        if runs.branched[run]:
+            for k in range(size):
+                runs.unknowns[run, k] = y[k] - steps[k, run - 1]
+
+
+@inner
+def _end_stage(program: GreyProgram, machine: MachineArrays, runs: NearRuns, work: RunValues, first: bool) -> None:
+    """Move deflections, and after the first stage the bases of the second."""
+    (n, _, _, nodes, _), frame = program.sizes, program.frame
+    size = nodes + n
+    for run in range(len(runs.frames)):
+        values = runs.frames[run]
+        if not runs.branched[run]:
+            continue
+        copy(values[:size], runs.unknowns[run])
+        call(program.addresses[code.BRISTLES], machine.parameters, machine.constants, values, runs.out)
+        copy(values[frame.bristles : frame.bristles + n], runs.out)
+        if first:
+            _contents(program, machine, values, runs.unknowns[run], runs.out, work.contents)
+            for k in range(size):
+                values[frame.base + k] += AHEAD * (work.contents[k] - values[frame.base + k])
+            for i in range(n):
+                before = values[frame.bristle_base + i]
+                values[frame.bristle_base + i] = before + AHEAD * (values[frame.bristles + i] - before)
+
+
+@inner
+def step_all(
+    program: GreyProgram, machine: MachineArrays, runs: NearRuns, work: RunValues, length: float, at_stages: Array
+) -> None:
+    """Advance all runs by one implicit step of `length` seconds, whose pilots are in their frames.
+
+    Args:
+        program: of the form.
+        machine: its parameters.
+        runs: moved.
+        work: of the first run.
+        length: s.
+        at_stages: spools at both stages, shape (run, stage, valve).
+    """
+    n, frame = program.sizes[0], program.frame
+    _begin_step(program, machine, runs, work, length)
+    for which in range(2):
+        half = 0.5 * (GAMMA * length if which == 0 else length)
+        for run in range(len(runs.frames)):
+            values = runs.frames[run]
+            if not runs.branched[run]:
+                continue
+            values[frame.half] = half
+            _set_valves(program, values, at.SPOOL, at_stages[run, which])
+            for i in range(n):
+                values[frame.reached + i] = values[frame.strokes + i] + half * values[frame.speeds + i]
+        _stage(program, machine, runs, work)
+        _end_stage(program, machine, runs, work, which == 0)
+    for run in range(len(runs.frames)):
+        if runs.branched[run]:
+            _move_strokes(program, machine, runs, run, 0.5 * length, frame.strokes, frame.speeds, runs.frames[run])
+
+
+@inlined
+def _move_strokes(
+    program: GreyProgram,
+    machine: MachineArrays,
+    runs: NearRuns,
+    run: int,
+    half: float,
+    strokes: int,
+    speeds: int,
+    source: Array,
+) -> None:
+    """Integrate strokes by the trapezoidal rule from values of `source` at places of strokes and velocities."""
+    n, nodes = program.sizes[0], program.sizes[3]
+    for i in range(n):
+        weight = half if machine.scale[i] > 0.0 else 0.0
+        moved = weight * (source[speeds + i] + runs.unknowns[run, nodes + i])
+        runs.frames[run, program.frame.strokes + i] = source[strokes + i] + moved
+
+
+@inner
+def _write(t: int, ports: IntArray, units: Array, runs: NearRuns, strokes: int, nodes: int, answers: Array) -> None:
+    """Write the outputs of all branched runs after sample t, in SI units."""
+    for run in range(len(answers)):
+        if not runs.branched[run]:
+            continue
+        for c in range(len(ports)):
+            kind, which = ports[c, 0], ports[c, 1]
+            if kind == 1:
+                value = runs.frames[run, strokes + which]
+            else:
+                value = runs.unknowns[run, which + (nodes if kind == 0 else 0)]
+            answers[run, t, c] = value * units[c]
+
+
+@inner
+def _write_between(t: int, ports: IntArray, half: float, runs: NearRuns, answers: Array) -> None:
+    """Interpolate outputs of all branched runs at sample t between the solved samples before and after it.
+
+    Args:
+        t: the sample, of which there is one before.
+        ports: kind and number of the state behind each output, shape (output, 2).
+        half: half a tick, s.
+        runs: that are simulated.
+        answers: read and written, shape (run, tick, output).
+    """
+    for run in range(len(answers)):
+        if not runs.branched[run]:
+            continue
+        earlier = run if runs.begins[run] < t else 0
+        for c in range(len(ports)):
+            answers[run, t, c] = 0.5 * (answers[earlier, t - 1, c] + answers[run, t + 1, c])
+    for c in range(len(ports)):
+        for v in range(len(ports)):
+            if ports[c, 0] != 1 or ports[v, 0] != 0 or ports[v, 1] != ports[c, 1]:
+                continue
+            for run in range(len(answers)):
+                if runs.branched[run]:
+                    earlier = run if runs.begins[run] < t else 0
+                    moved = half * (answers[earlier, t - 1, v] + answers[run, t, v])
+                    answers[run, t, c] = answers[earlier, t - 1, c] + moved
+
+
+@inner
+def _clamp_others(ports: IntArray, bounds: OutputBounds, runs: NearRuns, strokes: int, nodes: int) -> None:
+    """Hold the other runs at a bound where the first run is at this bound."""
+    for c in range(len(ports)):
+        kind, which = ports[c, 0], ports[c, 1]
+        index = which + (0 if kind == 2 else nodes)
+        value = runs.frames[0, strokes + which] if kind == 1 else runs.unknowns[0, index]
+        if bounds.low[c] < value < bounds.high[c]:
+            continue
+        for run in range(1, len(runs.frames)):
+            runs.unknowns[run, index] = runs.unknowns[0, index]
+            if kind == 1:
+                runs.frames[run, strokes + which] = runs.frames[0, strokes + which]
+
+
+@inner
+def _near_runs(program: GreyProgram, count: int, ticks: int, steps: int) -> NearRuns:
+    valves, size = program.sizes[1], program.sizes[3] + program.sizes[0]
+    return NearRuns(
+        np.zeros((count, program.frame.size)),
+        np.zeros((count, size)),
+        np.zeros(count, np.bool_),
+        np.zeros(count, np.int64),
+        np.empty((count, ticks, 2 * steps, valves)),
+        np.empty((count, ticks, steps, valves)),
+        np.zeros((size, count - 1)),
+        np.zeros(program.results),
+        np.zeros((size, size)),
+    )
+
+
+@compiled
+def run_near(
+    program: GreyProgram,
+    machine: MachineArrays,
+    bounds: OutputBounds,
+    plan: tuple[Array, Array, IntArray, int],
+    state: tuple[Array, ...],
+    resistance: Array,
+    answers: Array,
+) -> None:
+    """Simulate one machine in free run from the measured state, and neighbouring runs to first order.
+
+    From sample `single` on, a step may go over two samples: what is answered between them lies on their velocities'
+    line.
+
+    Args:
+        program: of the form.
+        machine: its parameters.
+        bounds: of the outputs.
+        plan: commands of the valves, shape (run, tick, valve); what the ports read at the first sample, in units of the
+            grey box, NaN where one is free; tick at which each run branches off the first one; `single`.
+        state: of the machine: unknowns, strokes, bristles, displacements, valves and history; moved by the first run.
+        resistance: forces against each actuator that the load does not know of, MN, shape (actuator,).
+        answers: written, SI units, shape (run, tick, output).
+    """
+    demands, measured, first, single = plan
+    y, s, z, d, valves, history = state
+    (n, count, pumps, nodes, _), frame, ports = program.sizes, program.frame, machine.ports
+    runs, ticks = _near_runs(program, len(demands), demands.shape[1], machine.steps), demands.shape[1]
+    work = work_arrays(program, 0)
+    shared = RunValues(
+        runs.frames[0], work.tangents, work.own, work.out, work.contents, work.rows, work.states, work.before,
+        work.rows_before,
+    )  # fmt: skip
+    for j in range(count):
+        copy(runs.frames[0, frame.valves + at.VALVE_STATES * j : frame.goals], valves[j])
+    follow_commands(program, machine, runs, demands, history, first)
+    for j in range(count):
+        for k in range(at.VALVE_STATES):
+            valves[j, k] = runs.frames[0, frame.valves + at.VALVE_STATES * j + k]
+    feed(ports, measured, y, s)
+    own = runs.frames[0]
+    copy(runs.unknowns[0], y)
+    copy(own[frame.strokes : frame.strokes + n], s)
+    copy(own[frame.bristles : frame.bristles + n], z)
+    copy(own[frame.displacements : frame.displacements + pumps], d)
+    runs.branched[0] = True
+    before, at_stages, t = np.empty((len(demands), 2 * n)), np.empty((len(demands), 2, count)), 0
+    while t < ticks:
+        double = t >= single and t + 1 < ticks
+        _branch(program, runs, first, t, t + (2 if double else 1))
+        for run in range(len(demands)):
+            if not runs.branched[run]:
+                continue
+            copy(before[run, :n], runs.frames[run, frame.strokes : frame.strokes + n])
+            copy(before[run, n:], runs.unknowns[run, nodes:])
+        for step in range(1 if double else machine.steps):
+            for run in range(len(demands)):
+                if runs.branched[run]:
+                    _pose_valves(program, runs, run, t, step, double, at_stages[run])
+            length = 2.0 * machine.tick_s if double else machine.tick_s / machine.steps
+            copy(own[:nodes], runs.unknowns[0])
+            copy(own[nodes : nodes + n], runs.unknowns[0, nodes:])
+            freeze(program, machine, shared, length, at.NONE)
+            for i in range(n):
+                own[frame.forces + i] += resistance[i]
+            step_all(program, machine, runs, shared, length, at_stages)
+        whole = 2.0 * machine.tick_s if double else machine.tick_s
+        # What a twin promises: a stroke is the trapezoidal integral of the velocities that it answers, one a sample.
+        for run in range(len(demands)):
+            if runs.branched[run]:
+                _move_strokes(program, machine, runs, run, 0.5 * whole, 0, n, before[run])
+        strokes = own[frame.strokes : frame.strokes + n]
+        clamp_outputs(ports, bounds, before[0], runs.unknowns[0], strokes, whole)
+        _clamp_others(ports, bounds, runs, frame.strokes, nodes)
+        t += 2 if double else 1
+        _write(t - 1, ports, bounds.units, runs, frame.strokes, nodes, answers)
+        if double:
+            _write_between(t - 2, ports, 0.25 * whole, runs, answers)
+    for run in range(1, len(demands)):
+        for earlier in range(runs.begins[run] if runs.branched[run] else ticks):
+            copy(answers[run, earlier], answers[0, earlier])
+    copy(y, runs.unknowns[0])
+    copy(s, own[frame.strokes : frame.strokes + n])
+    copy(z, own[frame.bristles : frame.bristles + n])
+    copy(d, own[frame.displacements : frame.displacements + pumps])
+    for k in range(len(history) - 1, -1, -1):
+        copy(history[k], demands[0, ticks - 1 - k] if k < ticks else history[k - ticks])
+
+
+@inner
+def _branch(program: GreyProgram, runs: NearRuns, first: IntArray, t: int, end: int) -> None:
+    """Let the runs begin at sample `t` that branch off before `end`, from the state of the first run."""
+    frame = program.frame
+    for run in range(1, len(first)):
+        if runs.branched[run] or first[run] >= end:
+            continue
+        runs.branched[run], runs.begins[run] = True, t
+        copy(runs.unknowns[run], runs.unknowns[0])
+        for place in range(frame.displacements, frame.tangents):
+            runs.frames[run, place] = runs.frames[0, place]
+
+
+@inlined
+def _pose_valves(
+    program: GreyProgram, runs: NearRuns, run: int, t: int, step: int, double: bool, at_stages: Array
+) -> None:
+    """Set the pilots of a step, and the spools at its stages; a double step has those of two samples."""
+    spools, pilots = runs.spools[run, t], runs.pilots[run, t]
+    for j in range(spools.shape[1]):
+        place = program.frame.valves + at.VALVE_STATES * j + at.PILOT_2
+        if double:
+            after, later = runs.spools[run, t + 1], runs.pilots[run, t + 1]
+            at_stages[0, j] = (1.0 - BETWEEN) * spools[0, j] + BETWEEN * spools[1, j]
+            at_stages[1, j] = after[1, j]
+            runs.frames[run, place] = (1.0 - GAMMA) * pilots[0, j] + GAMMA * later[0, j]
+        else:
+            at_stages[0, j], at_stages[1, j] = spools[2 * step, j], spools[2 * step + 1, j]
+            runs.frames[run, place] = pilots[step, j]

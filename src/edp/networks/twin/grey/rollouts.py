@@ -1,0 +1,361 @@
+"""Batched simulation of grey boxes: free runs with measured ports, and the normal equations of a fit."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey.correction import (
+    Cell,
+    OutputBounds,
+    Trace,
+    correct,
+    fed_ports,
+    note_bounds,
+    note_slopes,
+    seed,
+    state_rows,
+)
+from edp.networks.twin.grey.equations import GAMMA
+from edp.networks.twin.grey.jit import compiled, inlined, inner
+from edp.networks.twin.grey.program import GreyProgram
+from edp.networks.twin.grey.tick import (
+    MachineArrays,
+    RunValues,
+    advance_valves,
+    clear_rows,
+    copy,
+    copy_rows,
+    move_bristles,
+    move_pumps,
+    tick,
+    work_arrays,
+)
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+class RunBatch(NamedTuple):
+    """Runs side by side, in units of the grey box.
+
+    Attributes:
+        demands: commands of the valves, shape (run, tick, valve).
+        measured: readings of the ports, NaN where a port is free, shape (run, tick, output).
+        answers: last outputs, shape (run, output); moved, as all that follow.
+        unknowns: pressures and velocities, shape (run, unknown).
+        strokes: shape (run, actuator).
+        bristles: deflections, shape (run, actuator).
+        displacements: of the pumps, shape (run, pump).
+        valves: shape (run, valve, state).
+        history: commands before, newest first, shape (run, tick, valve).
+    """
+
+    demands: Array
+    measured: Array
+    answers: Array
+    unknowns: Array
+    strokes: Array
+    bristles: Array
+    displacements: Array
+    valves: Array
+    history: Array
+
+
+class FitTarget(NamedTuple):
+    """What outputs of a fit should be, and the errors of one run.
+
+    Attributes:
+        truth: shape (run, tick, output).
+        weight: of the errors, shape (output,).
+        delta: where the Huber loss turns to a line, in weighted errors.
+        prefix: samples at the start whose errors do not count.
+        followed: samples of the prefix that need no load, since all of it is measured.
+        stride: samples from one that counts to the next.
+        errors: weighted, written, shape (row,); empty: the loss alone is wanted.
+        slopes: of the errors by the parameters, written, shape (row, parameter).
+    """
+
+    truth: Array
+    weight: Array
+    delta: float
+    prefix: int
+    followed: int
+    stride: int
+    errors: Array
+    slopes: Array
+
+
+@inner
+def _set_port(kind: int, which: int, value: float, y: Array, s: Array, nodes: int) -> None:
+    """Write a measured velocity (0), stroke (1) or pressure (2) in place of the state."""
+    if kind == 1:
+        s[which] = value
+    elif kind == 0:
+        y[nodes + which] = value
+    else:
+        y[which] = max(value, at.LEAST_ABSOLUTE - at.ATMOSPHERE)
+
+
+@inner
+def feed(ports: IntArray, measured: Array, y: Array, s: Array) -> None:
+    """Fill the ports with measurements; those that are free stay as they are."""
+    nodes = len(y) - len(s)
+    for c in range(len(ports)):
+        if np.isfinite(measured[c]):
+            _set_port(ports[c, 0], ports[c, 1], measured[c], y, s, nodes)
+
+
+@inner
+def feed_back(ports: IntArray, measured: Array, answers: Array, y: Array, s: Array) -> None:
+    """Fill the ports with measurements, or with the last outputs: the state was rounded to them."""
+    nodes = len(y) - len(s)
+    for c in range(len(ports)):
+        value = measured[c] if np.isfinite(measured[c]) else answers[c]
+        _set_port(ports[c, 0], ports[c, 1], value, y, s, nodes)
+
+
+@inner
+def clear_tangents(ports: IntArray, measured: Array, t_y: Array, t_s: Array) -> None:
+    """Remove the tangents of measured ports."""
+    nodes = len(t_y) - len(t_s)
+    for c in range(len(ports)):
+        kind, which = ports[c, 0], ports[c, 1]
+        if not np.isfinite(measured[c]):
+            continue
+        row = t_s[which] if kind == 1 else t_y[which + (nodes if kind == 0 else 0)]
+        for k in range(len(row)):
+            row[k] = 0.0
+
+
+@inner
+def clamp_outputs(ports: IntArray, bounds: OutputBounds, before: Array, y: Array, s: Array, time: float) -> None:
+    """Limit outputs to their bounds: first velocities, then strokes; no velocity into an end stop.
+
+    Args:
+        ports: kind and number of the state behind each output.
+        bounds: of the outputs.
+        before: strokes and velocities, `time` seconds ago.
+        y: unknowns; moved.
+        s: strokes; moved.
+        time: s.
+    """
+    n, nodes = len(s), len(y) - len(s)
+    for turn in range(2):
+        for c in range(len(ports)):
+            kind, which = ports[c, 0], ports[c, 1]
+            if (kind == 1) != (turn == 1):
+                continue
+            low, high = bounds.low[c], bounds.high[c]
+            if kind == 1:
+                value = before[which] + 0.5 * time * (before[n + which] + y[nodes + which])
+                s[which] = min(max(value, low), high)
+                speed = y[nodes + which]
+                y[nodes + which] = min(speed, 0.0) if value > high else (max(speed, 0.0) if value < low else speed)
+            else:
+                index = which + (nodes if kind == 0 else 0)
+                y[index] = min(max(y[index], low), high)
+
+
+@inner
+def _begin(program: GreyProgram, work: RunValues, batch: RunBatch, run: int) -> None:
+    """Copy the state of a run to its inputs; all tangents are zero."""
+    (n, _, pumps, nodes, _), frame = program.sizes, program.frame
+    copy(work.frame[: nodes + n], batch.unknowns[run])
+    copy(work.frame[frame.strokes : frame.strokes + n], batch.strokes[run])
+    copy(work.frame[frame.bristles : frame.bristles + n], batch.bristles[run])
+    copy(work.frame[frame.displacements : frame.displacements + pumps], batch.displacements[run])
+    for j in range(batch.valves.shape[1]):
+        for k in range(at.VALVE_STATES):
+            work.frame[frame.valves + at.VALVE_STATES * j + k] = batch.valves[run, j, k]
+    clear_rows(work.tangents)
+    clear_rows(work.own)
+
+
+@inner
+def _end(program: GreyProgram, work: RunValues, batch: RunBatch, run: int) -> None:
+    """Copy the state of a run back."""
+    (n, _, pumps, nodes, _), frame = program.sizes, program.frame
+    copy(batch.unknowns[run], work.frame[: nodes + n])
+    copy(batch.strokes[run], work.frame[frame.strokes : frame.strokes + n])
+    copy(batch.bristles[run], work.frame[frame.bristles : frame.bristles + n])
+    copy(batch.displacements[run], work.frame[frame.displacements : frame.displacements + pumps])
+    for j in range(batch.valves.shape[1]):
+        for k in range(at.VALVE_STATES):
+            batch.valves[run, j, k] = work.frame[frame.valves + at.VALVE_STATES * j + k]
+
+
+@inner
+def _remember(history: Array, demands: Array) -> None:
+    """Put the commands of a sample before those of earlier ones."""
+    for k in range(len(history) - 1, 0, -1):
+        copy(history[k], history[k - 1])
+    copy(history[0], demands)
+
+
+@inner
+def _follow(program: GreyProgram, machine: MachineArrays, work: RunValues, history: Array, columns_by: int) -> None:
+    """Advance a sample with fully measured load: only valves, displacements and bristles move."""
+    n, frame, by_numbers = program.sizes[0], program.frame, columns_by == at.BY_NUMBERS
+    advance_valves(program, machine, work, history, GAMMA * machine.tick_s, by_numbers)
+    move_pumps(program, machine, work, machine.tick_s, columns_by)
+    advance_valves(program, machine, work, history, (1.0 - GAMMA) * machine.tick_s, by_numbers)
+    work.frame[frame.step] = machine.tick_s
+    copy(work.frame[frame.bristle_base : frame.bristle_base + n], work.frame[frame.bristles : frame.bristles + n])
+    if columns_by:
+        copy_rows(
+            work.tangents[frame.bristle_base : frame.bristle_base + n],
+            work.tangents[frame.bristles : frame.bristles + n],
+        )
+    move_bristles(program, machine, work, columns_by)
+
+
+@compiled
+def judge_run(program: GreyProgram, machine: MachineArrays, batch: RunBatch, run: int, target: FitTarget) -> float:
+    """Simulate one run of a batch, which moves, and return its Huber loss.
+
+    Args:
+        program: of the form.
+        machine: its parameters.
+        batch: of runs.
+        run: number of the run.
+        target: what the outputs should be.
+    """
+    (n, _, _, nodes, parameters), ports, history = program.sizes, machine.ports, batch.history[run]
+    full = len(target.errors) > 0
+    columns_by = at.BY_NUMBERS if full else at.NONE
+    work = work_arrays(program, parameters if full else 0)
+    first = program.frame.strokes
+    y, s = work.frame[: nodes + n], work.frame[first : first + n]
+    t_y, t_s = work.tangents[: nodes + n], work.tangents[first : first + n]
+    _begin(program, work, batch, run)
+    loss, used, ticks = 0.0, 0, batch.demands.shape[1]
+    for t in range(ticks):
+        feed(ports, batch.measured[run, t], y, s)
+        if full:
+            clear_tangents(ports, batch.measured[run, t], t_y, t_s)
+        _remember(history, batch.demands[run, t])
+        if t < target.followed:
+            _follow(program, machine, work, history, columns_by)
+            continue
+        tick(program, machine, work, history, columns_by)
+        done = t + 1 - target.prefix
+        if done > 0 and (done % target.stride == 0 or t + 1 == ticks):
+            loss += _sum_errors(target, run, t, ports, nodes, work, first, used)
+            used += len(ports) if full else 0
+    _end(program, work, batch, run)
+    return loss
+
+
+@inner
+def _sum_errors(
+    target: FitTarget, run: int, t: int, ports: IntArray, nodes: int, work: RunValues, strokes: int, used: int
+) -> float:
+    """Return the Huber loss of one sample; write its weighted errors and their slopes behind those that are used."""
+    loss = 0.0
+    for c in range(len(ports)):
+        kind = ports[c, 0]
+        place = ports[c, 1] + (nodes if kind == 0 else (strokes if kind == 1 else 0))
+        error = target.weight[c] * (work.frame[place] - target.truth[run, t, c])
+        size = abs(error)
+        loss += 0.5 * error * error if size <= target.delta else target.delta * (size - 0.5 * target.delta)
+        if len(target.errors) > 0:
+            # Rows beyond delta count as much as their gradient says (iteratively reweighted least squares).
+            share = 1.0 if size <= target.delta else math.sqrt(target.delta / size)
+            target.errors[used + c] = share * error
+            for k in range(work.tangents.shape[1]):
+                target.slopes[used + c, k] = share * target.weight[c] * work.tangents[place, k]
+    return loss
+
+
+@compiled
+def run_batch(
+    program: GreyProgram,
+    machine: MachineArrays,
+    bounds: OutputBounds,
+    batch: RunBatch,
+    answers: Array,
+    cell: Cell | None,
+    trace: Trace | None,
+) -> None:
+    """Simulate runs side by side, each port measured or fed back; outputs are bounded and rounded.
+
+    Args:
+        program: of the form.
+        machine: its parameters.
+        bounds: of the outputs.
+        batch: of runs; moved.
+        answers: outputs, written, shape (run, tick, output), SI units.
+        cell: a network's part in the outputs; None without one.
+        trace: written for `edp.networks.twin.grey.correction.run_back`; None: nothing is.
+    """
+    (n, _, _, nodes, _), frame, ports = program.sizes, program.frame, machine.ports
+    columns = 0
+    if trace is not None:
+        columns = trace.slopes.shape[2]
+    work = work_arrays(program, columns)
+    values, tangents = work.frame, work.tangents
+    y, s = values[: nodes + n], values[frame.strokes : frame.strokes + n]
+    before, fed, proposed = np.zeros(2 * n), np.zeros(len(ports)), np.zeros(len(ports))
+    rows = state_rows(program)
+    for run in range(len(batch.demands)):
+        history, by_weights = batch.history[run], False
+        _begin(program, work, batch, run)
+        for t in range(batch.demands.shape[1]):
+            measured = batch.measured[run, t]
+            feed_back(ports, measured, batch.answers[run], y, s)
+            _remember(history, batch.demands[run, t])
+            copy(before[:n], s)
+            copy(before[n:], y[nodes:])
+            columns_by = at.NONE
+            if cell is not None:
+                fed_ports(ports, y, s, fed)
+            if trace is not None:
+                by_weights = by_weights or not _are_finite(measured)
+                columns_by = at.BY_STATE if by_weights else at.NONE
+                seed(rows, tangents)
+            tick(program, machine, work, history, columns_by)
+            if trace is not None and by_weights:
+                note_slopes((t, run), rows, tangents, trace)
+            if cell is not None:
+                correct((t, run), y, s, fed, ports, cell, trace)
+                fed_ports(ports, y, s, proposed)
+            clamp_outputs(ports, bounds, before, y, s, machine.tick_s)
+            if trace is not None:
+                note_bounds((t, run), y, s, ports, bounds, proposed, trace)
+            # A state as single precision keeps it, so that a chunk and its samples give the same bits.
+            _round(values[: frame.goals])
+            for row in history:
+                _round(row)
+            _write_answers(ports, bounds, y, s, answers[run, t], batch.answers[run])
+        _end(program, work, batch, run)
+
+
+@inlined
+def _are_finite(values: Array) -> bool:
+    finite = True
+    for value in values:
+        finite = finite and np.isfinite(value)
+    return finite
+
+
+@inlined
+def _round(values: Array) -> None:
+    for k in range(len(values)):
+        values[k] = np.float32(values[k])
+
+
+@inner
+def _write_answers(ports: IntArray, bounds: OutputBounds, y: Array, s: Array, answers: Array, last: Array) -> None:
+    """Write outputs in SI units, and in units of the grey box, rounded to single precision."""
+    nodes = len(y) - len(s)
+    for c in range(len(ports)):
+        kind, which = ports[c, 0], ports[c, 1]
+        value = s[which] if kind == 1 else y[which + (nodes if kind == 0 else 0)]
+        answer = np.float32(value * bounds.units[c])
+        answers[c] = answer
+        last[c] = answer / bounds.units[c]

@@ -1,0 +1,1 @@
+"""Equations as expressions: written once with operators, differentiated automatically, compiled to machine code."""

@@ -1,0 +1,230 @@
+"""Scalar expressions and their derivatives.
+
+Equal expressions are one object, so that what several results share is computed once. Derivatives are found by
+automatic differentiation in reverse (Griewank and Walther, Evaluating Derivatives, 2008).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+FUNCTIONS = ("sqrt", "exp", "tanh", "sin", "cos")
+
+
+@dataclass(eq=False, slots=True)
+class Expression:
+    """One operation on other expressions.
+
+    Attributes:
+        graph: to which it belongs.
+        index: in the order of creation; arguments come before what is made of them.
+        operation: ``constant``, ``input``, ``+``, ``-``, ``*``, ``/``, ``less`` (of four: if a < b then c, else d), or
+            one of `FUNCTIONS`.
+        arguments: of the operation.
+        value: of a constant.
+    """
+
+    graph: Graph
+    index: int
+    operation: str
+    arguments: tuple[Expression, ...] = ()
+    value: float = 0.0
+
+    def __add__(self, other: Any) -> Expression:
+        return self.graph.add(self, self.graph.of(other))
+
+    def __radd__(self, other: Any) -> Expression:
+        return self.graph.add(self.graph.of(other), self)
+
+    def __sub__(self, other: Any) -> Expression:
+        return self.graph.subtract(self, self.graph.of(other))
+
+    def __rsub__(self, other: Any) -> Expression:
+        return self.graph.subtract(self.graph.of(other), self)
+
+    def __mul__(self, other: Any) -> Expression:
+        return self.graph.multiply(self, self.graph.of(other))
+
+    def __rmul__(self, other: Any) -> Expression:
+        return self.graph.multiply(self.graph.of(other), self)
+
+    def __truediv__(self, other: Any) -> Expression:
+        return self.graph.divide(self, self.graph.of(other))
+
+    def __rtruediv__(self, other: Any) -> Expression:
+        return self.graph.divide(self.graph.of(other), self)
+
+    def __neg__(self) -> Expression:
+        return self.graph.subtract(self.graph.of(0.0), self)
+
+
+@dataclass(eq=False)
+class Graph:
+    """All expressions of one set of equations.
+
+    Attributes:
+        nodes: every expression, arguments first.
+    """
+
+    nodes: list[Expression] = field(default_factory=list)
+    _known: dict[tuple[object, ...], Expression] = field(default_factory=dict)
+    _slopes: dict[int, tuple[Expression, Expression]] = field(default_factory=dict)
+
+    def _node(self, operation: str, *arguments: Expression, value: float = 0.0, key: object = None) -> Expression:
+        identity = (operation, *(argument.index for argument in arguments), value, key)
+        if identity not in self._known:
+            node = Expression(self, len(self.nodes), operation, arguments, value)
+            self.nodes.append(node)
+            self._known[identity] = node
+        return self._known[identity]
+
+    def of(self, value: Expression | float) -> Expression:
+        """Return an expression, or the constant of a number."""
+        return value if isinstance(value, Expression) else self._node("constant", value=float(value))
+
+    def inputs(self, name: str, count: int) -> list[Expression]:
+        """Return new inputs."""
+        return [self._node("input", key=(name, place)) for place in range(count)]
+
+    def link(self, values: Sequence[Expression], argument: Expression) -> None:
+        """State that inputs are a function of an expression and its derivatives: each the derivative of the last."""
+        for value, slope in pairwise(values):
+            self._slopes[value.index] = (argument, slope)
+
+    def add(self, a: Expression, b: Expression) -> Expression:
+        """Return a + b."""
+        if a.operation == b.operation == "constant":
+            return self.of(a.value + b.value)
+        if _is(a, 0.0) or _is(b, 0.0):
+            return b if _is(a, 0.0) else a
+        return self._node("+", a, b)
+
+    def subtract(self, a: Expression, b: Expression) -> Expression:
+        """Return a - b."""
+        if a.operation == b.operation == "constant":
+            return self.of(a.value - b.value)
+        return a if _is(b, 0.0) else self._node("-", a, b)
+
+    def multiply(self, a: Expression, b: Expression) -> Expression:
+        """Return a * b."""
+        if a.operation == b.operation == "constant":
+            return self.of(a.value * b.value)
+        if _is(a, 0.0) or _is(b, 0.0):
+            return self.of(0.0)
+        if _is(a, 1.0) or _is(b, 1.0):
+            return b if _is(a, 1.0) else a
+        return self._node("*", a, b)
+
+    def divide(self, a: Expression, b: Expression) -> Expression:
+        """Return a / b."""
+        if a.operation == b.operation == "constant":
+            return self.of(a.value / b.value)
+        if b.operation == "constant":
+            return self.multiply(a, self.of(1.0 / b.value))
+        # Quotients by one value share its reciprocal, and so do their derivatives.
+        return self.multiply(a, self._node("/", self.of(1.0), b))
+
+    def less(self, a: Any, b: Any, then: Any, otherwise: Any) -> Expression:
+        """Return `then` where a < b, `otherwise` elsewhere, also where one of them is not a number."""
+        chosen = self.of(then), self.of(otherwise)
+        return chosen[0] if chosen[0] is chosen[1] else self._node("less", self.of(a), self.of(b), *chosen)
+
+    def least(self, a: Any, b: Any) -> Expression:
+        """Return the smaller of two."""
+        return self.less(a, b, a, b)
+
+    def largest(self, a: Any, b: Any) -> Expression:
+        """Return the larger of two."""
+        return self.less(a, b, b, a)
+
+    def absolute(self, a: Any) -> Expression:
+        """Return |a|."""
+        return self.less(a, 0.0, -a, a)
+
+    def function(self, name: str, a: Any) -> Expression:
+        """Return one of `FUNCTIONS` of an expression."""
+        argument = self.of(a)
+        if argument.operation == "constant":
+            return self.of(getattr(math, name)(argument.value))
+        return self._node(name, argument)
+
+    def gradient(self, result: Expression) -> dict[int, Expression]:
+        """Return the derivatives of an expression by all that it is made of, by their index; zeros are left out."""
+        adjoint: dict[int, Expression] = {result.index: self.of(1.0)}
+        for node in self._below([result]):
+            weight = adjoint.get(node.index)
+            if weight is None:
+                continue
+            for argument, along in self._shares(node, weight):
+                if not _is(along, 0.0):
+                    before = adjoint.get(argument.index)
+                    adjoint[argument.index] = along if before is None else before + along
+        return adjoint
+
+    def jacobian(
+        self, results: Sequence[Expression], variables: Sequence[Expression]
+    ) -> dict[tuple[int, int], Expression]:
+        """Return the derivatives that are not zero everywhere, by the places of result and variable."""
+        entries = {}
+        for row, result in enumerate(results):
+            slopes = self.gradient(result)
+            for column, variable in enumerate(variables):
+                if variable.index in slopes:
+                    entries[row, column] = slopes[variable.index]
+        return entries
+
+    def needed(self, results: Iterable[Expression]) -> list[Expression]:
+        """Return all that results are made of, arguments first."""
+        return self._below(results)[::-1]
+
+    def _below(self, results: Iterable[Expression]) -> list[Expression]:
+        seen = {node.index for node in results}
+        waiting = list(seen)
+        while waiting:
+            for argument in self._dependencies(self.nodes[waiting.pop()]):
+                if argument.index not in seen:
+                    seen.add(argument.index)
+                    waiting.append(argument.index)
+        return [self.nodes[index] for index in sorted(seen, reverse=True)]
+
+    def _dependencies(self, node: Expression) -> tuple[Expression, ...]:
+        linked = self._slopes.get(node.index)
+        return node.arguments if linked is None else (linked[0],)
+
+    def _shares(self, node: Expression, weight: Expression) -> list[tuple[Expression, Expression]]:
+        """Return arguments, each with `weight` times the derivative of an expression by it."""
+        if node.index in self._slopes:
+            argument, slope = self._slopes[node.index]
+            return [(argument, weight * slope)]
+        if node.operation in ("constant", "input"):
+            return []
+        if node.operation == "less":
+            a, b, then, otherwise = node.arguments
+            return [(then, self.less(a, b, weight, 0.0)), (otherwise, self.less(a, b, 0.0, weight))]
+        if node.operation in ("+", "-"):
+            a, b = node.arguments
+            return [(a, weight), (b, weight if node.operation == "+" else -weight)]
+        if node.operation == "*":
+            a, b = node.arguments
+            return [(a, weight * b), (b, weight * a)]
+        if node.operation == "/":
+            return [(node.arguments[1], -(weight * (node * node)))]
+        (a,) = node.arguments
+        return [(a, weight * self._slope_of_function(node, a))]
+
+    def _slope_of_function(self, node: Expression, a: Expression) -> Expression:
+        if node.operation == "sqrt":
+            return 0.5 / node
+        if node.operation == "exp":
+            return node
+        if node.operation == "tanh":
+            return 1.0 - node * node
+        return self.function("cos", a) if node.operation == "sin" else -self.function("sin", a)
+
+
+def _is(node: Expression, value: float) -> bool:
+    return node.operation == "constant" and node.value == value

@@ -1,0 +1,154 @@
+"""Machine code of expressions, made by LLVM without a C compiler, and its cache on disk.
+
+Operations run in double precision and in the order written; none are fused. Every function has four arguments, arrays
+of double precision: parameters, constants and inputs, which it reads, and results, which it writes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from llvmlite import binding, ir
+from numba import types
+from numba.extending import intrinsic
+
+from edp.errors import StorageError
+from edp.networks.twin.symbolic.expression import Expression, Graph
+from edp.storage import write_bytes
+
+DOUBLE, INDEX, VOID = ir.DoubleType(), ir.IntType(64), ir.VoidType()
+OPERATORS = {"+": "fadd", "-": "fsub", "*": "fmul", "/": "fdiv"}
+
+
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """Machine code in memory.
+
+    Attributes:
+        addresses: of the functions by name.
+        engine: owner of the code, which frees it.
+    """
+
+    addresses: Mapping[str, int]
+    engine: object
+
+
+class CodeModule:
+    """Functions of one graph, in the order in which they are added.
+
+    Args:
+        graph: of the expressions.
+        groups: parameters, constants and inputs.
+    """
+
+    def __init__(self, graph: Graph, groups: Sequence[Sequence[Expression]]) -> None:
+        self._graph, self._code = graph, ir.Module("equations")
+        self._places = {node.index: (at, k) for at, group in enumerate(groups) for k, node in enumerate(group)}
+        self.names: list[str] = []
+
+    def add(self, name: str, results: Sequence[Expression]) -> None:
+        """Add a function that writes `results` in their order."""
+        self.names.append(name)
+        pointer = DOUBLE.as_pointer()
+        function = ir.Function(self._code, ir.FunctionType(VOID, [pointer] * 4), name)
+        for argument in function.args:
+            argument.add_attribute("noalias")
+        build = ir.IRBuilder(function.append_basic_block())
+        values: dict[int, ir.Value] = {}
+        for node in self._graph.needed(results):
+            values[node.index] = self._value(build, function, node, values)
+        for k, node in enumerate(results):
+            build.store(values[node.index], build.gep(function.args[-1], [INDEX(k)]))
+        build.ret_void()
+
+    def _value(self, build: Any, function: Any, node: Expression, values: Mapping[int, ir.Value]) -> ir.Value:
+        if node.operation == "constant":
+            return ir.Constant(DOUBLE, node.value)
+        if node.operation == "input":
+            group, place = self._places[node.index]
+            return build.load(build.gep(function.args[group], [INDEX(place)]))
+        arguments = [values[argument.index] for argument in node.arguments]
+        if node.operation == "less":
+            return build.select(build.fcmp_ordered("<", *arguments[:2]), *arguments[2:])
+        if node.operation in OPERATORS:
+            return getattr(build, OPERATORS[node.operation])(*arguments)
+        return build.call(self._library(node.operation), arguments)
+
+    def _library(self, name: str) -> ir.Function:
+        full = "llvm.sqrt.f64" if name == "sqrt" else name
+        if full not in self._code.globals:
+            made = ir.Function(self._code, ir.FunctionType(DOUBLE, [DOUBLE]), full)
+            made.attributes.add("nounwind")
+        return self._code.globals[full]
+
+    def object_code(self) -> bytes:
+        """Return the machine code for this processor."""
+        machine = _target_machine()
+        parsed = binding.parse_assembly(str(self._code))
+        options = binding.create_pipeline_tuning_options(speed_level=2)
+        passes = binding.create_pass_builder(machine, options)
+        passes.getModulePassManager().run(parsed, passes)
+        return bytes(machine.emit_object(parsed))
+
+
+def digest_of(*parts: object) -> str:
+    """Return the name of machine code in a cache: what it is made of, processor and version of LLVM."""
+    state = hashlib.blake2b(digest_size=16)
+    features = binding.get_host_cpu_features().flatten()
+    for part in (*parts, binding.get_host_cpu_name(), features, binding.llvm_version_info):
+        state.update(repr(part).encode() + b"\0")
+    return state.hexdigest()
+
+
+def load(code: bytes, names: Sequence[str]) -> Loaded:
+    """Return functions that can be called."""
+    _target_machine()
+    engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _target_machine())
+    engine.add_object_file(binding.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    return Loaded({name: engine.get_function_address(name) for name in names}, engine)
+
+
+def read_or_make(file: Path | None, make: Any) -> bytes:
+    """Return machine code from a file; where there is none, make it and keep it there if possible."""
+    if file is not None:
+        with contextlib.suppress(OSError):
+            return file.read_bytes()
+    code: bytes = make()
+    if file is not None:
+        with contextlib.suppress(OSError, StorageError):
+            write_bytes(file, code)
+    return code
+
+
+def _target_machine() -> Any:
+    binding.initialize_native_target()
+    binding.initialize_native_asmprinter()
+    target = binding.Target.from_default_triple()
+    features = binding.get_host_cpu_features().flatten()
+    return target.create_target_machine(
+        opt=2, cpu=binding.get_host_cpu_name(), features=features, reloc="pic", codemodel="jitdefault", jit=True
+    )
+
+
+def _call(typing: Any, address: Any, parameters: Any, constants: Any, inputs: Any, results: Any) -> Any:
+    """Call a function of `Loaded` at an address, from code that Numba compiles."""
+    signature = types.void(address, parameters, constants, inputs, results)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        arrays = zip(signature.args[1:], arguments[1:], strict=True)
+        pointers = [context.make_array(kind)(context, builder, value).data for kind, value in arrays]
+        kind = ir.FunctionType(VOID, [pointer.type for pointer in pointers])
+        builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), pointers)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+call: Any = intrinsic(_call)
+"""``call(address, parameters, constants, inputs, results)``, in code that Numba compiles."""
