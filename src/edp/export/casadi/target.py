@@ -38,6 +38,8 @@ KNOWN: frozenset[type[Layer]] = frozenset(
 )
 """Kinds of layers that the module builds."""
 
+LAYOUT_IMPORT = "from edp.networks.twin.grey import layout as at"
+EQUATIONS_IMPORT = "from edp.networks.twin.grey.equations import"
 GOLDEN = ("inputs", "stream", "tolerance")
 
 
@@ -46,8 +48,8 @@ GOLDEN = ("inputs", "stream", "tolerance")
 class CasadiTarget:
     """CasADi, float32 runs: ``edp_casadi.py``, ``NAME.json`` and ``NAME.npz``, and C with ``NAME_casadi.c`` (external).
 
-    ``edp_horizon.py`` runs a horizon of the compiled C. A grey box has ``edp_hydraulics.py`` in place of all that is C:
-    the C code of its equations has no tangents.
+    ``edp_horizon.py`` runs a horizon of the compiled C. A grey box has ``edp_hydraulics.py``, ``edp_equations.py`` and
+    ``edp_layout.py`` in place of all that is C: the C code of its equations has no tangents.
     """
 
     def write(self, bundle: Bundle, name: str, folder: Path) -> list[Path]:
@@ -67,12 +69,27 @@ class CasadiTarget:
             ),
         }
         if has_equations(graph):
-            return write_export(folder, files | {"edp_hydraulics.py": here.joinpath("hydraulics.py").read_bytes()})
+            return write_export(folder, files | equation_files())
         files["edp_horizon.py"] = here.joinpath("horizon.py").read_bytes()
         files[f"{name}_casadi.c"] = external(graph, name).encode()
         model = make_model(name, bundle, tangent=True)
         files |= {file: text.encode() for file, text in core_files(model).items()}
         return write_export(folder, files)
+
+
+def equation_files() -> dict[str, bytes]:
+    """Return the modules of a grey box's equations, which import one another beside each other."""
+    grey = resources.files("edp.networks.twin.grey")
+    modules = {
+        "edp_hydraulics.py": resources.files("edp.export.casadi").joinpath("hydraulics.py"),
+        "edp_equations.py": grey.joinpath("equations.py"),
+        "edp_layout.py": grey.joinpath("layout.py"),
+    }
+    files = {}
+    for name, source in modules.items():
+        text = source.read_text(encoding="utf-8").replace(LAYOUT_IMPORT, "import edp_layout as at")
+        files[name] = text.replace(EQUATIONS_IMPORT, "from edp_equations import").encode()
+    return files
 
 
 def content(described: Description) -> dict[str, object]:

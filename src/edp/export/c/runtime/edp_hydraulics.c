@@ -365,7 +365,8 @@ static double content(const edp_hydraulics *h, double p, double *slope) {
     const double inverse = 1.0 / ((absolute > LEAST_ABSOLUTE) ? absolute : LEAST_ABSOLUTE);
     const double air = circuit(h, AIR) * ATMOSPHERE * inverse;
     *slope = 1.0 + circuit(h, BULK) * air * inverse;
-    return p - circuit(h, BULK) * air;
+    /* Below the least pressure the curve goes on as its tangent: a pole there would end the iteration. */
+    return p - circuit(h, BULK) * (air * (2.0 - absolute * inverse));
 }
 
 /* Row of one pressure. */

@@ -311,7 +311,13 @@ class Equations:
         everywhere, so that Newton's method finds the pressure of a chamber that is near to boiling, too.
         """
         air = self.circuit[at.BULK] * self.circuit[at.AIR] * at.ATMOSPHERE
-        return [p - air / self._largest(p + at.ATMOSPHERE, at.LEAST_ABSOLUTE) for p in pressures]
+        contents = []
+        for p in pressures:
+            absolute = p + at.ATMOSPHERE
+            # Below the least pressure the curve goes on as its tangent: a pole there would end the iteration.
+            inverse = 1.0 / self._largest(absolute, at.LEAST_ABSOLUTE)
+            contents.append(p - air * (inverse * (2.0 - absolute * inverse)))
+        return contents
 
     def net_flows(self, pressures: Values, spools: Values, displacements: Values, strokes: Values) -> list[Any]:
         """Return the net flow into each node without tank and supply; Q = a dp / (dp^2 + delta^2)^(1/4)."""
@@ -409,7 +415,9 @@ class Equations:
         tilt = self.algebra.tanh(ratio)
         return z, force + a[at.ASYMMETRY] * (tilt * tilt)
 
-    def stage(self, y: Values, stage: Stage, mass: list[list[Any]], forces: Values) -> list[Any]:
+    def stage(
+        self, y: Values, stage: Stage, mass: list[list[Any]], forces: Values, contents: Values | None = None
+    ) -> list[Any]:
         """Return the residual of an implicit stage of an L-stable SDIRK method of order two (Alexander 1977).
 
             c(p) - b_c - d B / V (net flow - A v) = 0,   M (v - b_v) - d (pressure forces - friction - load - stop) = 0
@@ -419,10 +427,12 @@ class Equations:
             stage: what is known.
             mass: inertia.
             forces: of gravity and turning, against the actuators.
+            contents: of the nodes at these unknowns, where they are known.
         """
         n, nodes, step = self.form.actuators, self.form.nodes, stage.step
         p, v = y[:nodes], y[nodes:]
-        net, contents = self.net_flows(p, stage.spools, stage.displacements, stage.strokes), self.contents(p)
+        net = self.net_flows(p, stage.spools, stage.displacements, stage.strokes)
+        filled = self.contents(p) if contents is None else contents
         rows = []
         for k in range(nodes):
             into = net[k]
@@ -435,7 +445,7 @@ class Equations:
                 volume, into = actuator[at.HEAD_DEAD + side] + area * room, into - way * area * v[i]
             else:
                 volume = self.pump[k - 2 * n][at.LINE]
-            rows.append(contents[k] - stage.base[k] - step * self.circuit[at.BULK] / volume * into)
+            rows.append(filled[k] - stage.base[k] - step * self.circuit[at.BULK] / volume * into)
         change = [v[i] - stage.base[nodes + i] for i in range(n)]
         for i in range(n):
             actuator = self.actuator[i]

@@ -12,6 +12,8 @@ compiler = Compiler(
     # The cell on top of a grey box is that of the recurrent twin.
     lambda: (
         _FOLDER / "layout.py",
+        _FOLDER / "equations.py",
+        *sorted((_FOLDER.parent / "symbolic").glob("*.py")),
         _FOLDER.parent / "steps.py",
         *files_with(_FOLDER, "from edp.networks.twin.grey.jit import"),
     ),
