@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from edp.networks.twin.symbolic.expression import FUNCTIONS, Graph
+from edp.networks.twin.symbolic.expression import FUNCTIONS, ExpressionGraph
 from edp.networks.twin.symbolic.machine_code import CodeModule, digest_of, load, read_or_make
 
 
@@ -52,7 +52,7 @@ def all_operations(graph, x):
 
 @pytest.mark.parametrize("values", [(0.3, -0.7, 1.2), (2.0, 0.4, -0.9), (-1.5, 3.0, 0.2)])
 def test_machine_code_gives_values_and_derivatives(values):
-    graph = Graph()
+    graph = ExpressionGraph()
     x = graph.inputs("x", 3)
     made, expected = all_operations(graph, x)
     slopes = graph.jacobian(made, x)
@@ -70,7 +70,7 @@ def test_machine_code_gives_values_and_derivatives(values):
 
 
 def test_equal_expressions_are_one_and_constants_are_folded():
-    graph = Graph()
+    graph = ExpressionGraph()
     x, y = graph.inputs("x", 2)
     assert x * y + 1.0 is x * y + 1.0
     assert x * 0.0 is graph.of(0.0)
@@ -82,7 +82,7 @@ def test_equal_expressions_are_one_and_constants_are_folded():
 
 
 def test_an_input_that_is_a_function_of_another_has_its_derivatives():
-    graph = Graph()
+    graph = ExpressionGraph()
     x, value, first, second = graph.inputs("x", 4)
     graph.link([value, first, second], x)
     slopes = graph.jacobian([value * value, first], [x])
@@ -91,7 +91,7 @@ def test_an_input_that_is_a_function_of_another_has_its_derivatives():
 
 
 def test_comparisons_with_what_is_no_number_take_the_second_branch():
-    graph = Graph()
+    graph = ExpressionGraph()
     (x,) = graph.inputs("x", 1)
     function = compiled(graph, [x], [graph.less(x, 1.0, 2.0, x)])
     assert math.isnan(function([math.nan])[0])

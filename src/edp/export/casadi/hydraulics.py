@@ -61,7 +61,7 @@ class HydraulicMachine:
         self.tick_s, self.steps, self.remembered = layer["tick_s"], layer["steps"], layer["remembered"]
         linkage = self.w["linkage"] if len(self.w["linkage"]) > 1 else np.zeros(at.JOINTS)
         self.joints = linkage[at.JOINTS :].reshape(-1, at.JOINT_VALUES)
-        form = self._form(layer)
+        form = self._form(layer["load"], layer["circuit"])
         self.n, self.valves, self.pumps = form.actuators, form.valves, form.pumps
         self.nodes, self.unknown = form.nodes, form.unknowns
         constants = [*self.w["middle"].tolist(), *self.w["scale"].tolist(), *linkage[: at.JOINTS].tolist()]
@@ -76,18 +76,18 @@ class HydraulicMachine:
         self.root, self.left = self._stage(GAMMA * step)
         self.bristles = self._bristle_function(GAMMA * step)
 
-    def _form(self, layer: dict[str, Any]) -> GreyForm:
+    def _form(self, load: tuple[int, int, int], circuit_at: int) -> GreyForm:
         def signed(name: str) -> Any:
             return np.where(self.at[name] == NONE, -1, self.at[name]).tolist()
 
-        inertia_at, inertia_terms, potential_at = layer["load"]
+        inertia_at, inertia_terms, potential_at = load
         return GreyForm(
             valve_at=tuple(map(tuple, signed("valve_at"))),
             valve_actuator=tuple(signed("valve_actuator")),
             valve_pump=tuple(signed("valve_pump")),
             actuator_at=tuple(signed("actuator_at")),
             pump_at=tuple(first for first in signed("pump_at") if first >= 0),
-            circuit_at=layer["circuit"],
+            circuit_at=circuit_at,
             inertia_at=inertia_at,
             inertia_terms=inertia_terms,
             potential_at=potential_at,

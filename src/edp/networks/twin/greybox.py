@@ -15,7 +15,7 @@ from edp.ir import Builder
 from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinRunner, TwinState
 from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.connections import check_elements
-from edp.networks.twin.grey.correction import Cell, OutputBounds, Trace
+from edp.networks.twin.grey.correction import Cell, OutputBounds, RunTrace
 from edp.networks.twin.grey.elements import (
     CylinderElement,
     Elements,
@@ -375,7 +375,7 @@ class GreyTwin(Twin):
         measured: Array,
         state: TwinState,
         cell: Cell | None = None,
-        trace: Trace | None = None,
+        trace: RunTrace | None = None,
     ) -> tuple[Array, TwinState]:
         """`rollout` of checked arrays, with a cell on top; see `edp.networks.twin.grey.rollouts.run_batch`."""
         now = [np.array(state[name], np.float64, order="C") for name in ("answer", *STATES)]

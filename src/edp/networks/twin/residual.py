@@ -17,7 +17,7 @@ from edp.ir import Builder
 from edp.ir.layers import BinaryOperation, Dense, ScaleShift
 from edp.ir.memory import Gru
 from edp.networks.twin.base import TWINS, TwinRunner, TwinState, solved_columns
-from edp.networks.twin.grey.correction import Cell, Trace, run_back
+from edp.networks.twin.grey.correction import Cell, RunTrace, run_back
 from edp.networks.twin.greybox import Doubles, GreyBox, GreyTwin
 from edp.networks.twin.recurrent_cell import CellWeights, weight_gradients
 from edp.networks.twin.scales import Array, TwinScales
@@ -201,7 +201,7 @@ class _Corrected(torch.autograd.Function):
         units, sizes = twin.network.units, twin.sizes
         h = np.zeros((lanes, units), np.float32)
         solved = len(solved_columns(twin.channels))
-        trace = Trace(
+        trace = RunTrace(
             read=np.zeros((ticks, lanes, answers + solved), np.float32),
             free=np.zeros((ticks, lanes, answers), np.float32),
             gates=np.zeros((ticks, lanes, 3 * units), np.float32),

@@ -13,7 +13,7 @@ from edp.networks.twin.grey.equations import Equations, GreyForm
 from edp.networks.twin.grey.jit import compiled
 from edp.networks.twin.grey.linkage import joint_actuators, joint_angle
 from edp.networks.twin.grey.program import ANGLES, ExpressionAlgebra, loaded_module
-from edp.networks.twin.symbolic.expression import Graph
+from edp.networks.twin.symbolic.expression import ExpressionGraph
 from edp.networks.twin.symbolic.machine_code import CodeModule, Loaded, call
 
 Array = NDArray[np.float64]
@@ -21,8 +21,8 @@ PARAMETERS = at.BODIES * at.BODY_VALUES
 
 
 @dataclass(frozen=True, eq=False)
-class Moments:
-    """Moments and inertias of all bodies about their joints: X, Y, H of the first body, of the second ...
+class BodyMoments:
+    """BodyMoments and inertias of all bodies about their joints: X, Y, H of the first body, of the second ...
 
     Attributes:
         values: shape (BASE,).
@@ -35,7 +35,7 @@ class Moments:
 
 @cache
 def _functions(joints: tuple[int, ...]) -> Loaded:
-    graph, n = Graph(), len(joints)
+    graph, n = ExpressionGraph(), len(joints)
     parameters, constants = graph.inputs("parameter", PARAMETERS), graph.inputs("constant", 2 * n + at.JOINTS)
     inputs = graph.inputs("input", 3 * n + ANGLES * n + at.BASE)
     strokes, speeds, accelerations = inputs[:n], inputs[n : 2 * n], inputs[2 * n : 3 * n]
@@ -51,14 +51,20 @@ def _functions(joints: tuple[int, ...]) -> Loaded:
         Equations(form, parameters, constants, algebra),
         CodeModule(graph, (parameters, constants, inputs)),
     )
-    made = equations.moments()
-    module.add("moments", [*made, *(slope for row in algebra.derivatives(made, parameters) for slope in row)])
+    moments_by_parameters = equations.moments()
+    module.add(
+        "moments",
+        [
+            *moments_by_parameters,
+            *(slope for row in algebra.derivatives(moments_by_parameters, parameters) for slope in row),
+        ],
+    )
     forces = equations.balance(moments, strokes, speeds, accelerations, angles[::ANGLES])
     module.add("balance", [slope for row in algebra.derivatives(forces, moments) for slope in row])
     return loaded_module(module, ("bodies", joints))
 
 
-def moments_of(values: Array, inertia_at: int, linkage: Array) -> Moments:
+def moments_of(values: Array, inertia_at: int, linkage: Array) -> BodyMoments:
     """Return the moments and inertias of bodies.
 
     Args:
@@ -73,7 +79,7 @@ def moments_of(values: Array, inertia_at: int, linkage: Array) -> Moments:
     )
     constants = np.concatenate([np.zeros(2 * len(joints)), linkage[: at.JOINTS]])
     _call(_functions(joints).addresses["moments"], own, constants, np.zeros(1), results)
-    return Moments(results[: at.BASE], results[at.BASE :].reshape(at.BASE, PARAMETERS))
+    return BodyMoments(results[: at.BASE], results[at.BASE :].reshape(at.BASE, PARAMETERS))
 
 
 def forces_by_moments(strokes: Array, speeds: Array, accelerations: Array, linkage: Array) -> Array:
@@ -106,9 +112,9 @@ def _balance(address: int, constants: Array, linkage: Array, motion: Array, forc
         for k in range(3 * n):
             inputs[k] = motion[row, k]
         for a in range(at.BODIES):
-            joint, place = at.JOINTS + a * at.JOINT_VALUES, 3 * n + ANGLES * a
+            joint, first = at.JOINTS + a * at.JOINT_VALUES, 3 * n + ANGLES * a
             stroke = inputs[int(linkage[joint + at.ACTUATOR])]
-            inputs[place], inputs[place + 1], inputs[place + 2], inputs[place + 3] = joint_angle(linkage, joint, stroke)
+            inputs[first], inputs[first + 1], inputs[first + 2], inputs[first + 3] = joint_angle(linkage, joint, stroke)
         call(address, inputs, constants, inputs, results)
         for i in range(n):
             for k in range(at.BASE):

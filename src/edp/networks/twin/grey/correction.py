@@ -63,7 +63,7 @@ class Cell(NamedTuple):
     solved: IntArray
 
 
-class Trace(NamedTuple):
+class RunTrace(NamedTuple):
     """What a run leaves for its adjoint, tick first; without rows there is none.
 
     Attributes:
@@ -102,7 +102,7 @@ def fed_ports(ports: IntArray, y: Array, s: Array, fed: Array) -> None:
 
 @inner
 def correct(
-    now: tuple[int, int], y: Array, s: Array, fed: Array, ports: IntArray, cell: Cell, trace: Trace | None
+    now: tuple[int, int], y: Array, s: Array, fed: Array, ports: IntArray, cell: Cell, trace: RunTrace | None
 ) -> None:
     """Advance the cell of one run by one sample, and correct pressures and velocities.
 
@@ -141,7 +141,7 @@ def correct(
 
 @inner
 def note_bounds(
-    now: tuple[int, int], y: Array, s: Array, ports: IntArray, bounds: OutputBounds, proposed: Array, trace: Trace
+    now: tuple[int, int], y: Array, s: Array, ports: IntArray, bounds: OutputBounds, proposed: Array, trace: RunTrace
 ) -> None:
     """Record in the trace where no bound was active on an output, from the ports before bounding."""
     n, nodes = len(s), len(y) - len(s)
@@ -160,8 +160,8 @@ def state_rows(program: GreyProgram) -> IntArray:
     (n, _, pumps, nodes, _), frame = program.sizes, program.frame
     rows, k = np.empty(nodes + 3 * n + pumps, np.int64), 0
     for first, count in ((0, nodes + n), (frame.strokes, n), (frame.bristles, n), (frame.displacements, pumps)):
-        for place in range(first, first + count):
-            rows[k] = place
+        for row in range(first, first + count):
+            rows[k] = row
             k += 1
     return rows
 
@@ -177,7 +177,7 @@ def seed(rows: IntArray, tangents: Array) -> None:
 
 
 @inner
-def note_slopes(now: tuple[int, int], rows: IntArray, tangents: Array, trace: Trace) -> None:
+def note_slopes(now: tuple[int, int], rows: IntArray, tangents: Array, trace: RunTrace) -> None:
     """Write the Jacobian of a sample by the state before it to the trace."""
     for row in range(len(rows)):
         for k in range(tangents.shape[1]):
@@ -192,7 +192,7 @@ def run_back(
     cell: Cell,
     ports: IntArray,
     sizes: tuple[int, int, float],
-    trace: Trace,
+    trace: RunTrace,
     grads: tuple[Singles, Singles, Singles],
 ) -> None:
     """Compute the adjoint of a free run of grey box and cell, from the last sample to the first.
@@ -249,14 +249,21 @@ def run_back(
                 along = by_read[row, answers + j] / change[j]
                 by_tick[row, where[solved[j]]] += along
                 by_fed[row, where[solved[j]]] -= along
-            _before(t, row, port, where, trace, by_fed[row], by_tick[row], by_state[row])
+            _before((t, row), port, where, trace, by_fed[row], by_tick[row], by_state[row])
 
 
 @inner
 def _before(
-    t: int, row: int, port: Singles, where: IntArray, trace: Trace, by_fed: Array, by_tick: Array, by_state: Array
+    now: tuple[int, int],
+    port: Singles,
+    where: IntArray,
+    trace: RunTrace,
+    by_fed: Array,
+    by_tick: Array,
+    by_state: Array,
 ) -> None:
     """Compute the gradient by the state before a sample from those by the fed values and the grey-box result."""
+    (t, row) = now
     by_state[:] = 0.0
     if trace.counts[t, row] == 0.0:
         # All that was fed so far was measured: no weight has a part in it.

@@ -195,8 +195,8 @@ class Equations:
                     pilot = pilots[j]
                     size = self.algebra.less(pilot, 0.0, -pilot, pilot)
                     gain = self.algebra.less(pilot, 0.0, self._valve(j, at.GAIN + 1), self._valve(j, at.GAIN))
-                    wanted = self._least(gain * self._clip((size - start) / span, 0.0, 1.0), 1.0)
-                    demand = self._largest(demand, wanted)
+                    share = self._least(gain * self._clip((size - start) / span, 0.0, 1.0), 1.0)
+                    demand = self._largest(demand, share)
             demands.append(demand)
             power = power + pump[at.FLOW] * demand * self._largest(pressures[m], 0.0)
         limit = self._least(1.0, self.circuit[at.POWER] / self._largest(power, IDLE))

@@ -161,8 +161,8 @@ def _begin_step(program: GreyProgram, machine: MachineArrays, runs: NearRuns, wo
         if not runs.branched[run]:
             continue
         if run > 0:
-            for place, count in ((frame.frozen, n), (frame.mass, n * n + n)):
-                copy(values[place : place + count], work.frame[place : place + count])
+            copy(values[frame.frozen : frame.frozen + n], work.frame[frame.frozen : frame.frozen + n])
+            copy(values[frame.mass : frame.joints], work.frame[frame.mass : frame.joints])
             copy(values[frame.speeds : frame.speeds + n], runs.unknowns[run, nodes:])
         _contents(program, machine, values, runs.unknowns[run], runs.out, values[base : base + size])
         copy(values[frame.bristle_base : frame.bristle_base + n], values[frame.bristles : frame.bristles + n])
@@ -252,26 +252,21 @@ def step_all(
         _end_stage(program, machine, runs, work, which == 0)
     for run in range(len(runs.frames)):
         if runs.branched[run]:
-            _move_strokes(program, machine, runs, run, 0.5 * length, frame.strokes, frame.speeds, runs.frames[run])
+            values = runs.frames[run]
+            strokes, speeds = values[frame.strokes : frame.bristles], values[frame.speeds : frame.reached]
+            _move_strokes(program, machine, runs, run, 0.5 * length, strokes, speeds)
 
 
 @inlined
 def _move_strokes(
-    program: GreyProgram,
-    machine: MachineArrays,
-    runs: NearRuns,
-    run: int,
-    half: float,
-    strokes: int,
-    speeds: int,
-    source: Array,
+    program: GreyProgram, machine: MachineArrays, runs: NearRuns, run: int, half: float, strokes: Array, speeds: Array
 ) -> None:
-    """Integrate strokes by the trapezoidal rule from values of `source` at places of strokes and velocities."""
+    """Integrate the strokes of a run by the trapezoidal rule, from strokes and velocities before."""
     n, nodes = program.sizes[0], program.sizes[3]
     for i in range(n):
         weight = half if machine.scale[i] > 0.0 else 0.0
-        moved = weight * (source[speeds + i] + runs.unknowns[run, nodes + i])
-        runs.frames[run, program.frame.strokes + i] = source[strokes + i] + moved
+        moved = weight * (speeds[i] + runs.unknowns[run, nodes + i])
+        runs.frames[run, program.frame.strokes + i] = strokes[i] + moved
 
 
 @inner
@@ -419,7 +414,7 @@ def run_near(
         # What a twin promises: a stroke is the trapezoidal integral of the velocities that it answers, one a sample.
         for run in range(len(demands)):
             if runs.branched[run]:
-                _move_strokes(program, machine, runs, run, 0.5 * whole, 0, n, before[run])
+                _move_strokes(program, machine, runs, run, 0.5 * whole, before[run, :n], before[run, n:])
         strokes = own[frame.strokes : frame.strokes + n]
         clamp_outputs(ports, bounds, before[0], runs.unknowns[0], strokes, whole)
         _clamp_others(ports, bounds, runs, frame.strokes, nodes)
@@ -447,8 +442,9 @@ def _branch(program: GreyProgram, runs: NearRuns, first: IntArray, t: int, end: 
             continue
         runs.branched[run], runs.begins[run] = True, t
         copy(runs.unknowns[run], runs.unknowns[0])
-        for place in range(frame.displacements, frame.tangents):
-            runs.frames[run, place] = runs.frames[0, place]
+        copy(
+            runs.frames[run, frame.displacements : frame.tangents], runs.frames[0, frame.displacements : frame.tangents]
+        )
 
 
 @inlined
@@ -458,12 +454,12 @@ def _pose_valves(
     """Set the pilots of a step, and the spools at its stages; a double step has those of two samples."""
     spools, pilots = runs.spools[run, t], runs.pilots[run, t]
     for j in range(spools.shape[1]):
-        place = program.frame.valves + at.VALVE_STATES * j + at.PILOT_2
+        pilot = program.frame.valves + at.VALVE_STATES * j + at.PILOT_2
         if double:
             after, later = runs.spools[run, t + 1], runs.pilots[run, t + 1]
             at_stages[0, j] = (1.0 - BETWEEN) * spools[0, j] + BETWEEN * spools[1, j]
             at_stages[1, j] = after[1, j]
-            runs.frames[run, place] = (1.0 - GAMMA) * pilots[0, j] + GAMMA * later[0, j]
+            runs.frames[run, pilot] = (1.0 - GAMMA) * pilots[0, j] + GAMMA * later[0, j]
         else:
             at_stages[0, j], at_stages[1, j] = spools[2 * step, j], spools[2 * step + 1, j]
-            runs.frames[run, place] = pilots[step, j]
+            runs.frames[run, pilot] = pilots[step, j]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.equations import Equations, GreyForm, Stage
 from edp.networks.twin.grey.jit import compiler
-from edp.networks.twin.symbolic.expression import Expression, Graph
+from edp.networks.twin.symbolic.expression import Expression, ExpressionGraph
 from edp.networks.twin.symbolic.machine_code import CodeModule, Loaded, digest_of, load, read_or_make
 
 IntArray = NDArray[np.int64]
@@ -118,7 +118,7 @@ class GreyProgram(NamedTuple):
 class ExpressionAlgebra:
     """Algebra of expressions, see `edp.networks.twin.grey.equations.Algebra`."""
 
-    def __init__(self, graph: Graph) -> None:
+    def __init__(self, graph: ExpressionGraph) -> None:
         self.graph, self.less = graph, graph.less
 
     def __getattr__(self, name: str) -> Any:
@@ -126,9 +126,9 @@ class ExpressionAlgebra:
 
     def derivatives(self, results: Sequence[Any], variables: Sequence[Expression]) -> list[list[Expression]]:
         """Return the derivatives of results by variables, a row for each result."""
-        known = self.graph.jacobian([self.graph.of(result) for result in results], variables)
+        slopes = self.graph.jacobian([self.graph.of(result) for result in results], variables)
         zero = self.graph.of(0.0)
-        return [[known.get((i, k), zero) for k in range(len(variables))] for i in range(len(results))]
+        return [[slopes.get((i, k), zero) for k in range(len(variables))] for i in range(len(results))]
 
 
 def frame_of(form: GreyForm) -> FramePlaces:
@@ -145,8 +145,8 @@ def frame_of(form: GreyForm) -> FramePlaces:
 @cache
 def program_of(form: GreyForm) -> GreyProgram:
     """Return the program of a form; the first one on a computer takes a second, which is kept on disk."""
-    made = _Functions(form)
-    return made.program(loaded_module(made.module, form))
+    functions = _Functions(form)
+    return functions.program(loaded_module(functions.module, form))
 
 
 def loaded_module(module: CodeModule, identity: object) -> Loaded:
@@ -184,7 +184,7 @@ class _Functions:
     """All functions of a form, as expressions."""
 
     def __init__(self, form: GreyForm) -> None:
-        self.form, self.frame, self.graph = form, frame_of(form), Graph()
+        self.form, self.frame, self.graph = form, frame_of(form), ExpressionGraph()
         self.parameters = self.graph.inputs("parameter", form.parameters)
         constants = self.graph.inputs("constant", form.constants)
         self.inputs = self.graph.inputs("input", self.frame.size)
@@ -210,9 +210,9 @@ class _Functions:
     ) -> list[Expression]:
         """Return derivatives by variables, given by their columns, and note where they will be written."""
         columns = list(variables)
-        known = self.graph.jacobian([self.graph.of(result) for result in results], list(variables.values()))
-        self._note(group, first, [(row, columns[k]) for row, k in known])
-        return list(known.values())
+        slopes = self.graph.jacobian([self.graph.of(result) for result in results], list(variables.values()))
+        self._note(group, first, [(row, columns[k]) for row, k in slopes])
+        return list(slopes.values())
 
     def _note(self, group: int, first: int, places: Sequence[tuple[int, int]]) -> None:
         begin = len(self.entries)
@@ -289,13 +289,13 @@ class _Functions:
         states = self._part(frame.valves, form.valves * at.VALVE_STATES)
         goals, length = self._part(frame.goals, form.valves), self.inputs[frame.length]
         remains = [self.equations.remains(j, length) for j in range(form.valves)]
-        known = self._part(frame.remains, 2 * form.valves)
+        computed = self._part(frame.remains, 2 * form.valves)
         after: list[Expression] = []
         followed: list[Expression] = []
         for j in range(form.valves):
             own = states[at.VALVE_STATES * j : at.VALVE_STATES * (j + 1)]
             after += self.equations.advance_valve(own, goals[j], remains[j])
-            followed += self.equations.advance_valve(own, goals[j], known[2 * j : 2 * j + 2])
+            followed += self.equations.advance_valve(own, goals[j], computed[2 * j : 2 * j + 2])
         self._add("remains", [part for parts in remains for part in parts])
         self._add("follow", followed)
         written = [*after]

@@ -12,7 +12,7 @@ from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.correction import (
     Cell,
     OutputBounds,
-    Trace,
+    RunTrace,
     correct,
     fed_ports,
     note_bounds,
@@ -245,7 +245,7 @@ def judge_run(program: GreyProgram, machine: MachineArrays, batch: RunBatch, run
         tick(program, machine, work, history, columns_by)
         done = t + 1 - target.prefix
         if done > 0 and (done % target.stride == 0 or t + 1 == ticks):
-            loss += _sum_errors(target, run, t, ports, nodes, work, first, used)
+            loss += _sum_errors(program, machine, target, target.truth[run, t], work, used)
             used += len(ports) if full else 0
     _end(program, work, batch, run)
     return loss
@@ -253,14 +253,15 @@ def judge_run(program: GreyProgram, machine: MachineArrays, batch: RunBatch, run
 
 @inner
 def _sum_errors(
-    target: FitTarget, run: int, t: int, ports: IntArray, nodes: int, work: RunValues, strokes: int, used: int
+    program: GreyProgram, machine: MachineArrays, target: FitTarget, truth: Array, work: RunValues, used: int
 ) -> float:
     """Return the Huber loss of one sample; write its weighted errors and their slopes behind those that are used."""
-    loss = 0.0
-    for c in range(len(ports)):
-        kind = ports[c, 0]
-        place = ports[c, 1] + (nodes if kind == 0 else (strokes if kind == 1 else 0))
-        error = target.weight[c] * (work.frame[place] - target.truth[run, t, c])
+    loss, nodes = 0.0, program.sizes[3]
+    for c in range(len(machine.ports)):
+        kind = machine.ports[c, 0]
+        first = nodes if kind == 0 else (program.frame.strokes if kind == 1 else 0)
+        row = first + machine.ports[c, 1]
+        error = target.weight[c] * (work.frame[row] - truth[c])
         size = abs(error)
         loss += 0.5 * error * error if size <= target.delta else target.delta * (size - 0.5 * target.delta)
         if len(target.errors) > 0:
@@ -268,7 +269,7 @@ def _sum_errors(
             share = 1.0 if size <= target.delta else math.sqrt(target.delta / size)
             target.errors[used + c] = share * error
             for k in range(work.tangents.shape[1]):
-                target.slopes[used + c, k] = share * target.weight[c] * work.tangents[place, k]
+                target.slopes[used + c, k] = share * target.weight[c] * work.tangents[row, k]
     return loss
 
 
@@ -280,7 +281,7 @@ def run_batch(
     batch: RunBatch,
     answers: Array,
     cell: Cell | None,
-    trace: Trace | None,
+    trace: RunTrace | None,
 ) -> None:
     """Simulate runs side by side, each port measured or fed back; outputs are bounded and rounded.
 

@@ -344,9 +344,9 @@ def freeze(program: GreyProgram, machine: MachineArrays, work: RunValues, length
                 work.tangents[frame.frozen + i, k] = work.tangents[frame.strokes + i, k] + half * speed
     if len(machine.linkage) > 0:
         for a in range(at.BODIES):
-            joint, place = at.JOINTS + a * at.JOINT_VALUES, frame.joints + ANGLES * a
+            joint, angle = at.JOINTS + a * at.JOINT_VALUES, frame.joints + ANGLES * a
             stroke = values[frame.frozen + int(machine.linkage[joint + at.ACTUATOR])]
-            values[place], values[place + 1], values[place + 2], values[place + 3] = joint_angle(
+            values[angle], values[angle + 1], values[angle + 2], values[angle + 3] = joint_angle(
                 machine.linkage, joint, stroke
             )
     call(program.addresses[code.LOAD], machine.parameters, machine.constants, values, work.out)

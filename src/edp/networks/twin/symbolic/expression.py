@@ -28,7 +28,7 @@ class Expression:
         value: of a constant.
     """
 
-    graph: Graph
+    graph: ExpressionGraph
     index: int
     operation: str
     arguments: tuple[Expression, ...] = ()
@@ -63,7 +63,7 @@ class Expression:
 
 
 @dataclass(eq=False)
-class Graph:
+class ExpressionGraph:
     """All expressions of one set of equations.
 
     Attributes:
@@ -88,7 +88,7 @@ class Graph:
 
     def inputs(self, name: str, count: int) -> list[Expression]:
         """Return new inputs."""
-        return [self._node("input", key=(name, place)) for place in range(count)]
+        return [self._node("input", key=(name, index)) for index in range(count)]
 
     def link(self, values: Sequence[Expression], argument: Expression) -> None:
         """State that inputs are a function of an expression and its derivatives: each the derivative of the last."""

@@ -18,7 +18,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from edp.errors import StorageError
-from edp.networks.twin.symbolic.expression import Expression, Graph
+from edp.networks.twin.symbolic.expression import Expression, ExpressionGraph
 from edp.storage import write_bytes
 
 DOUBLE, INDEX, VOID = ir.DoubleType(), ir.IntType(64), ir.VoidType()
@@ -46,7 +46,7 @@ class CodeModule:
         groups: parameters, constants and inputs.
     """
 
-    def __init__(self, graph: Graph, groups: Sequence[Sequence[Expression]]) -> None:
+    def __init__(self, graph: ExpressionGraph, groups: Sequence[Sequence[Expression]]) -> None:
         self._graph, self._code = graph, ir.Module("equations")
         self._places = {node.index: (at, k) for at, group in enumerate(groups) for k, node in enumerate(group)}
         self.names: list[str] = []
@@ -70,8 +70,8 @@ class CodeModule:
         if node.operation == "constant":
             return ir.Constant(DOUBLE, node.value)
         if node.operation == "input":
-            group, place = self._places[node.index]
-            return build.load(build.gep(function.args[group], [INDEX(place)]))
+            group, index = self._places[node.index]
+            return build.load(build.gep(function.args[group], [INDEX(index)]))
         arguments = [values[argument.index] for argument in node.arguments]
         if node.operation == "less":
             return build.select(build.fcmp_ordered("<", *arguments[:2]), *arguments[2:])
@@ -82,8 +82,8 @@ class CodeModule:
     def _library(self, name: str) -> ir.Function:
         full = "llvm.sqrt.f64" if name == "sqrt" else name
         if full not in self._code.globals:
-            made = ir.Function(self._code, ir.FunctionType(DOUBLE, [DOUBLE]), full)
-            made.attributes.add("nounwind")
+            library = ir.Function(self._code, ir.FunctionType(DOUBLE, [DOUBLE]), full)
+            library.attributes.add("nounwind")
         return self._code.globals[full]
 
     def object_code(self) -> bytes:
