@@ -49,23 +49,16 @@ def lstm_steps(
     Returns:
         h at every tick, ``(time, batch, units)``, and (h, c) after the last.
     """
-    gains = (None, None, None) if norm is None else norm
-    h, c = _Steps.apply(projected, recurrent, *gains, torch.stack(state), share)  # type: ignore[no-untyped-call]
+    h, c = _Steps.apply(projected, recurrent, torch.stack(state), share, *(norm or ()))  # type: ignore[no-untyped-call]
     return h, (h[-1], c)
 
 
 class _Steps(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        projected: Tensor,
-        recurrent: Tensor,
-        gain: Tensor | None,
-        c_gain: Tensor | None,
-        c_shift: Tensor | None,
-        state: Tensor,
-        share: Shares,
+        ctx: Any, projected: Tensor, recurrent: Tensor, state: Tensor, share: Shares, *norm: Tensor
     ) -> tuple[Tensor, Tensor]:
+        gain, c_gain, c_shift = norm or (None, None, None)
         ticks, batch, units = len(projected), state.shape[1], state.shape[2]
         hs, cs = (projected.new_empty(ticks + 1, batch, units) for _ in range(2))
         hs[0], cs[0] = state
@@ -127,9 +120,9 @@ class _Steps(torch.autograd.Function):
             dc = total * f[t] if keep is None else torch.addcmul(dc - fresh_c, total, f[t])
             dh = row @ recurrent if base is None else torch.addmm(base, row, recurrent)
         rows = grads if norms is None else norms.rows()
-        by_norm = (None, None, None) if norms is None else norms.gradients(grads)
+        by_norm = () if norms is None else norms.gradients(grads)
         by_recurrent = rows.flatten(0, 1).t() @ hs[:-1].flatten(0, 1)
-        return grads, by_recurrent, *by_norm, torch.stack([dh, dc]), None
+        return grads, by_recurrent, torch.stack([dh, dc]), None, *by_norm
 
 
 def _each(share: Shares, ticks: int) -> tuple[Sequence[Tensor | float], Sequence[Tensor | float]] | None:

@@ -315,7 +315,7 @@ class RecurrentRunner(TwinRunner):
         start = (np.where(np.isfinite(read), read, state["answer"][0]), state["h"][0])
         answers, h = np.empty((rows.shape[1], len(rows), count), np.float32), np.empty(units, np.float32)
         bounds = twin.bounds
-        run_branches((rows, mapped), self._weights, bounds.arrays, bounds.velocities, start, first, answers, h)
+        run_branches((rows, mapped), self._weights, bounds.arrays, bounds.velocities, start, first, (answers, h))
         after = {"answer": twin.scaled(answers[0, -1])[None], "h": h[None]}
         return answers, after if twin.static is None else after | {"commands": memory}
 

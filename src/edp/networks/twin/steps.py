@@ -68,11 +68,10 @@ def gates_of(into: Array, up: Array, bias: Array, h: Array, gates: Array, inner:
 
 
 @compiler.compiled
-def _answer(
-    fed: Array, change: Array, low: Array, high: Array, trapezoid: Array, velocities: int, answer: Array, free: Array
-) -> None:
+def _answer(fed: Array, change: Array, bounds: tuple[Array, ...], velocities: int, answer: Array, free: Array) -> None:
     """Compute outputs within the bounds, and a mask of inactive bounds ``(batch, answer)``."""
     batch, answers = fed.shape
+    _, low, high, trapezoid = bounds
     strokes = len(trapezoid)
     for row in range(batch):
         for j in range(answers):
@@ -120,7 +119,7 @@ def run_forward(
     """
     projected, measured, port, mapped = inputs
     feedback_weight, h_weight, inner_bias, out_weight, out_bias, pull = weights
-    scale, low, high, trapezoid = bounds
+    scale = bounds[0]
     answers, fed, free, gates, inner, hs = saved
     ticks, batch, width = measured.shape
     into, up = np.empty_like(gates[0]), np.empty_like(gates[0])
@@ -143,7 +142,7 @@ def run_forward(
                 change[row, j] = scale[j] * (change[row, j] + out_bias[j])
             for j in range(len(pull)):
                 change[row, j] += pull[j] * (mapped[t, row, j] - fed[t, row, j])
-        _answer(fed[t], change, low, high, trapezoid, velocities, answers[t], free[t])
+        _answer(fed[t], change, bounds, velocities, answers[t], free[t])
 
 
 @compiler.compiled
@@ -154,8 +153,7 @@ def run_branches(
     velocities: int,
     start: tuple[Array, Array],
     first: NDArray[np.int64],
-    answers: Array,
-    last_h: Array,
+    results: tuple[Array, Array],
 ) -> None:
     """Simulate branches of one run in free run; the common part before each branch is computed once.
 
@@ -169,12 +167,12 @@ def run_branches(
         velocities: number of them.
         start: what the ports read at the first tick ``(answer,)``, and h ``(units,)``, of all lanes.
         first: tick at which each lane branches off lane 0 ``(lane,)``, ascending, that of lane 0 zero.
-        answers: written, SI units ``(lane, time, answer)``; before a lane branches off, those of lane 0.
-        last_h: written: h of lane 0 after the last tick ``(units,)``.
+        results: written: answers, SI units ``(lane, time, answer)``, before a lane branches off those of lane 0; and h
+            of lane 0 after the last tick ``(units,)``.
     """
+    answers, last_h = results
     commands, mapped = inputs
     input_weight, bias, h_weight, inner_bias, out_weight, out_bias, pull, offset, width = weights
-    _, low, high, trapezoid = bounds
     ticks, lanes, commanded = commands.shape
     units, count = out_weight.shape
     read = np.empty((lanes, commanded + count), np.float32)
@@ -208,7 +206,7 @@ def run_branches(
                 change[row, j] += out_bias[j]
             for j in range(len(pull)):
                 change[row, j] += pull[j] * (mapped[t, row, j] - fed[row, j])
-        _answer(fed[:running], change, low, high, trapezoid, velocities, answer, free)
+        _answer(fed[:running], change, bounds, velocities, answer, free)
         for row in range(running):
             for j in range(count):
                 fed[row, j] = answer[row, j]

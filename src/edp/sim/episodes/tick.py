@@ -12,6 +12,7 @@ from edp.sim.machine import layout as at
 from edp.sim.physics import commands, plant, terramechanics
 from edp.sim.physics import scratch as places
 from edp.sim.physics.jit import compiled, inlined, pasted
+from edp.sim.physics.scratch import MovingParts, SpoolCommands
 from edp.sim.sensors import chain, logbook
 
 Array = NDArray[np.float64]
@@ -100,7 +101,7 @@ def move(memory: Array, lever: Array, setup: Setup, room: Array) -> int:
     demands = room[at.SPOOLS : at.SPOOLS * (count + 2)].reshape(count + 1, at.SPOOLS)
     commands.shape_commands(lever, hand, numbers[blocks.HAND_S], past, setup, demands, one_demand)
     row = blocks.line(blocks.ROW, memory, memory)
-    return plant.run_sample(state, valves, demands, count, times, setup, row, one_demand)
+    return plant.run_sample(MovingParts(state, valves), SpoolCommands(demands, one_demand), count, times, setup, row)
 
 
 @inlined
@@ -122,7 +123,7 @@ def look(memory: Array, drawn: Array, setup: Setup, work: Array) -> None:
     past, row = blocks.table(blocks.PAST, memory, memory), blocks.table(blocks.ROW, memory, memory)
     tick = int(blocks.line(blocks.NUMBER, memory, memory)[blocks.TICK])
     # The newest demand is that of the sample that ends here: the next one is not yet decided.
-    logbook.write_log(state, valves, past[past.shape[0] - 1], setup[0], setup[1], setup[3], row[0])
+    logbook.write_log(MovingParts(state, valves), past[past.shape[0] - 1], setup, row[0])
     sensor_setup = (
         blocks.line(blocks.SENSOR_NUMBERS, memory, memory),
         blocks.table(blocks.SENSOR_AXES, memory, memory),

@@ -36,6 +36,7 @@ from edp.sim.physics.motors import Motors
 # Side by side, as they are in their file: one a line would be a page.
 # isort: off
 from edp.sim.physics.scratch import (
+    MovingParts,
     ACROSS, ANCHOR, ANCHOR_COS, ANCHOR_SIN, ANGLES, BYPASS, C_HEAD, C_PUMP_1, C_ROD, CONTACT, F_BY_V, F_BY_Z, FROZEN,
     FROZEN_W, GRAVITY_T, HEAD_BY_1, HEAD_BY_2, HEAD_BY_HEAD, K1, K2, LEVERS, LOST_1, MASS, OPENED, PER_HEAD, PER_ROD,
     PUMP_ROW, RATES, RHS, ROD_BY_1, ROD_BY_2, ROD_BY_ROD, SINES, SLOPE, SLOPES, STAGE, STROKES_W, Z_BY_V, Z_BY_Z,
@@ -244,8 +245,7 @@ def clamp_pressures(state: Array, long: bool) -> int:
 
 @inlined
 def step(
-    state: Array,
-    valves: Array,
+    moving: MovingParts,
     demand: Array,
     clock: tuple[float, float, Array],
     setup: tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]],
@@ -256,8 +256,7 @@ def step(
     """Advance plant and spools by one step with the spool demands held; returns the number of clamped pressures.
 
     Args:
-        state: plant state.
-        valves: pilots, play and spools.
+        moving: state of the plant and its valves; moved.
         demand: of each spool, shape (6,).
         clock: step length (s), displacement share and filters of half a step.
         setup: axes, plant, work, and the arrays of the ground.
@@ -265,7 +264,7 @@ def step(
         motors: swing and travel, where they move.
         fine: whether the step is a fine one of theirs.
     """
-    h, share, filters = clock
+    (state, valves), (h, share, filters) = moving, clock
     axes, plant, work, ground = setup
     # Half steps before and after ROS2 in mirrored order: Strang splitting has order 2 only if it is symmetric.
     valve.pilot_half_step(demand, filters, axes, valves)

@@ -18,6 +18,7 @@ from edp.sim.physics.commands import shape_commands
 from edp.sim.physics.jit import compiled, inlined
 from edp.sim.physics.motor_circuit import MotorCircuit
 from edp.sim.physics.motors import Motors
+from edp.sim.physics.scratch import MovingParts, SpoolCommands
 from edp.sim.sensors import logbook
 
 Array = NDArray[np.float64]
@@ -46,20 +47,19 @@ def near_end(row: Array, axes: Array) -> bool:
 
 @inlined
 def run_sample(
-    state: Array,
-    valves: Array,
-    demands: Array,
+    moving: MovingParts,
+    commands: SpoolCommands,
     newest: int,
     times: tuple[Array, tuple[Clock, Clock]],
     setup: tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]],
     row: Array,
-    held_commands: Array,
     motors: Motors | None = None,
 ) -> int:
     """From one logged instant, whose log is `row`, to the next; returns the number of clamped pressures.
 
-    `newest` is the row of `demands` that belongs to the sample; the rest as in `run_samples`.
+    `newest` is the row of the demands that belongs to the sample; the rest as in `run_samples`.
     """
+    state, (demands, held_commands) = moving.state, commands
     delays, clocks = times
     axes, plant, work, ground = setup
     # Steps in a sample times their length: fine and coarse clocks give the same.
@@ -82,39 +82,37 @@ def run_sample(
             held_commands[j] = demands[max(int(np.floor(when)), 0), j]
         clock = (step_s, share, filters)
         if motors is None:
-            clamps += integrator.step(state, valves, held_commands, clock, setup, near)
+            clamps += integrator.step(moving, held_commands, clock, setup, near)
         else:
             places.hold_commands(motors, newest + (n + 0.5) / steps)
-            clamps += integrator.step(state, valves, held_commands, clock, setup, near, motors, fine)
+            clamps += integrator.step(moving, held_commands, clock, setup, near, motors, fine)
     return clamps
 
 
 @compiled
 def run_samples(
-    state: Array,
-    valves: Array,
-    demands: Array,
+    moving: MovingParts,
+    commands: SpoolCommands,
     times: tuple[Array, tuple[Clock, Clock]],
     setup: tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]],
     log: Array,
-    held_commands: Array,
     motors: Motors | None = None,
 ) -> int:
     """Run one sample per row of `log`; returns the number of clamped pressures.
 
-    `demands` holds past demands first: its last rows belong to `log`. `times` are delays in samples, and clocks: the
-    number of steps in a sample and the clock of one step, for coarse and for fine steps. `held_commands` is scratch,
-    one value per spool. `motors` move, where given, and log into an array of their own.
+    The demands hold past ones first: the last rows belong to `log`. `times` are delays in samples, and clocks: the
+    number of steps in a sample and the clock of one step, for coarse and for fine steps. `motors` move, where given,
+    and log into an array of their own.
     """
+    demands = commands.demands
     first = demands.shape[0] - log.shape[0]
-    axes, plant, _, ground = setup
     clamps = 0
     for k in range(log.shape[0]):
         # Logged before the steps: row k is the instant at which lever k is applied.
-        logbook.write_log(state, valves, demands[first + k], axes, plant, ground, log[k], motors)
+        logbook.write_log(moving, demands[first + k], setup, log[k], motors)
         if motors is not None:
             places.write_log(motors, k, first + k)
-        clamps += run_sample(state, valves, demands, first + k, times, setup, log[k], held_commands, motors)
+        clamps += run_sample(moving, commands, first + k, times, setup, log[k], motors)
     return clamps
 
 
@@ -304,14 +302,15 @@ class Plant:
         samples = len(demands) - self._past
         log = np.empty((samples, at.LOG_COLUMNS if self.ground is None else at.LOG_GROUND + at.GROUND_POINTS))
         times = (self.delays, self.clocks)
+        moving, commands = MovingParts(self.state, self.valves), SpoolCommands(demands, self._held)
         if self.motors is None:
-            self._counts[0] += run_samples(self.state, self.valves, demands, times, setup, log, self._held)
+            self._counts[0] += run_samples(moving, commands, times, setup, log)
             return log
         if motor_demands is None:
             motor_demands = self.motors.demands_of(np.zeros((samples, at.MOTORS)), 0.0)
         turned = np.empty((samples, at.MOTOR_COLUMNS))
         motors = self.motors.arrays(motor_demands, turned)
-        self._counts[0] += run_samples(self.state, self.valves, demands, times, setup, log, self._held, motors)
+        self._counts[0] += run_samples(moving, commands, times, setup, log, motors)
         return np.hstack((log, turned))
 
 

@@ -1,6 +1,26 @@
-"""Positions of values in the scratch arrays of one integrator step."""
+"""Arrays of one integrator step: what moves, commands, and positions of values in scratch arrays."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class MovingParts(NamedTuple):
+    """State of the plant, and pilots, play and spools of its valves."""
+
+    state: NDArray[np.float64]
+    valves: NDArray[np.float64]
+
+
+class SpoolCommands(NamedTuple):
+    """Commands of the spools, shape (sample, spool), and scratch with one value per spool."""
+
+    demands: NDArray[np.float64]
+    present: NDArray[np.float64]
+
 
 # frozen[...]: numbers of one step; three of a kind stand together, one per cylinder
 LEVERS, GRAVITY_T, PER_HEAD, PER_ROD, SINES, MASS, BYPASS, ANGLES = 0, 3, 6, 9, 12, 15, 21, 23

@@ -12,6 +12,7 @@ from edp.sim.physics import lines, linkage, pump
 from edp.sim.physics import motors as places
 from edp.sim.physics.jit import compiled
 from edp.sim.physics.motors import Motors
+from edp.sim.physics.scratch import MovingParts
 
 Array = NDArray[np.float64]
 
@@ -71,16 +72,14 @@ def write_tip(state: Array, axes: Array, row: Array) -> None:
 
 @compiled
 def write_log(
-    state: Array,
-    valves: Array,
+    moving: MovingParts,
     demand: Array,
-    axes: Array,
-    plant: Array,
-    ground: tuple[Array, ...],
+    setup: tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]],
     row: Array,
     motors: Motors | None = None,
 ) -> None:
     """One sample: plant state, demands, strokes (m from closed), velocities (m/s), then what else is true."""
+    (state, valves), (axes, plant, _, ground) = moving, setup
     heights, memory = ground[3], ground[4]
     for n in range(at.LOGGED_STATES):
         row[n] = state[n]
