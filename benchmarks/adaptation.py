@@ -51,9 +51,9 @@ from edp.networks.backbones import HybridSpec
 from edp.networks.predictor import Predictor, build_model
 from edp.networks.running import stream_hidden, stream_predictions
 from edp.networks.twin import fit_scales
+from edp.networks.twin.adaptive_twin import TunedSpec
 from edp.networks.twin.grey.fit_spec import GreyFitSpec
 from edp.networks.twin.greybox import GreyTwin
-from edp.networks.twin.tuned import TunedSpec
 from edp.recording import Recording
 from edp.sim.machine import machine_files
 from edp.storage import make_folder

@@ -16,7 +16,7 @@ from edp.evaluation.ahead import EACH, look_ahead
 from edp.jobs import IN_PROCESS
 from edp.logs.source import DataSource
 from edp.networks.twin import Twin
-from edp.networks.twin.load import LoadEstimate
+from edp.networks.twin.disturbance_observer import DisturbanceObserver
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.training.twin_bundle import load_twin
 from edp.workflows.twin import train_twin
@@ -189,7 +189,7 @@ def _with_load(twin: Twin, series: Sequence[Series], share: float) -> dict[str, 
     errors: dict[int, list[Any]] = {ticks: [] for ticks in AHEAD}
     for part in series:
         runner, first = twin.runner(), np.zeros(1, np.int64)
-        estimate = LoadEstimate(runner, np.arange(count), share)
+        estimate = DisturbanceObserver(runner, np.arange(count), share)
         state = twin.reset(part.inputs[None, : twin.prefix_ticks], part.targets[None, : twin.prefix_ticks])
         moments = np.linspace(twin.prefix_ticks, part.samples - longest - 1, EACH).astype(np.int64)
         for tick in range(twin.prefix_ticks, int(moments[-1]) + 1):

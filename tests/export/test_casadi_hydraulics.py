@@ -11,7 +11,7 @@ import pytest
 from edp.export.golden import random_inputs
 from edp.ir.hydraulics import NONE
 from edp.networks.twin import TwinPlant
-from edp.networks.twin.grey import layout, linkage, tick
+from edp.networks.twin.grey import linkage, parameter_index, tick
 from edp.networks.twin.greybox import GreyBox
 from edp.networks.twin.residual import Residual
 from edp.testing.twins import sample_front, sample_twin
@@ -99,7 +99,7 @@ def test_what_nodes_hold_gives_their_pressure_back(network_of):
     part = next(layer for layer in built.about["layers"] if layer["kind"] == "HydraulicTick")
     arrays = {name: built._arrays[f"{part['name']}/{name}"] for name in part["constants"]}
     machine = hydraulics.HydraulicMachine(part, arrays)
-    p = np.r_[np.geomspace(1e-6, 40.0, machine.nodes) - layout.ATMOSPHERE, np.zeros(machine.n)]
+    p = np.r_[np.geomspace(1e-6, 40.0, machine.nodes) - parameter_index.ATMOSPHERE, np.zeros(machine.n)]
     assert np.allclose(np.array(machine.pressures(machine.contents(casadi.DM(p)))).ravel(), p, rtol=1e-9, atol=1e-9)
 
 

@@ -10,7 +10,7 @@ import pytest
 from edp.errors import ConfigError, ExportError
 from edp.export.follower import FollowerParts, write_follower
 from edp.networks.twin import fit_scales
-from edp.networks.twin.tuned import TunedSpec
+from edp.networks.twin.adaptive_twin import TunedSpec
 from edp.testing.bench import bench_channels, bench_grey_box, bench_series
 from edp.training.twin_bundle import TwinBundle, plant_bundle
 

@@ -18,7 +18,7 @@ from edp.export.c.sizes import constant_bytes
 from edp.export.golden import grown_tolerance, random_inputs, stream
 from edp.ir.hydraulics import NONE, HydraulicTick
 from edp.networks.twin import TwinPlant, fit_scales
-from edp.networks.twin.grey import equations, layout, linkage, tick
+from edp.networks.twin.grey import equations, linkage, parameter_index, tick
 from edp.networks.twin.grey.elements import CylinderElement, MotorElement, PumpElement, ValveElement
 from edp.networks.twin.greybox import GreyBox
 from edp.networks.twin.residual import Residual
@@ -118,18 +118,18 @@ def enumerated(first, code=C):
 def test_tables_of_places_are_those_of_the_kernel(first):
     rows = enumerated(first)
     assert len(rows) >= 6
-    assert rows == {name: getattr(layout, name) for name in rows}
+    assert rows == {name: getattr(parameter_index, name) for name in rows}
 
 
 def test_places_and_constants_of_a_linkage_are_those_of_the_kernel():
     code, header = LINKAGE, (RUNTIME / "edp_linkage.h").read_text()
     for first in ("MASS", "GRAVITY", "ACTUATOR"):
         rows = enumerated(first, code)
-        assert rows == {name: getattr(layout, name) for name in rows}
-    assert list(enumerated("STROKE", code).values()) == list(range(layout.KNOT_VALUES + 1))
+        assert rows == {name: getattr(parameter_index, name) for name in rows}
+    assert list(enumerated("STROKE", code).values()) == list(range(parameter_index.KNOT_VALUES + 1))
     assert float(re.search(r"#define BEYOND ([0-9.]+)", code)[1]) == linkage.BEYOND
     counts = {name: int(value) for name, value in re.findall(r"#define EDP_(\w+) (\d+)u", header)}
-    assert counts == {"BODIES": layout.BODIES, "LINKAGE_KNOTS": layout.LINKAGE_KNOTS}
+    assert counts == {"BODIES": parameter_index.BODIES, "LINKAGE_KNOTS": parameter_index.LINKAGE_KNOTS}
 
 
 @pytest.mark.parametrize("mixed", [True, False], ids=["mixed", "free"])
@@ -150,7 +150,7 @@ def test_constants_are_those_of_the_kernel():
     defined = {name: float(value) for name, value in re.findall(r"^#define (\w+) ([0-9.e-]+)", C, re.M)}
     # The Stribeck effect is left out where it is below rounding.
     assert math.exp(-(defined.pop("NEGLIGIBLE") ** 2)) < np.finfo(float).eps
-    theirs = dict.fromkeys(("ATMOSPHERE", "LEAST_ABSOLUTE"), layout)
+    theirs = dict.fromkeys(("ATMOSPHERE", "LEAST_ABSOLUTE"), parameter_index)
     theirs |= dict.fromkeys(("SMOOTH2", "CHECK", "IDLE", "GAMMA"), equations)
     theirs |= dict.fromkeys(("TOLERANCE", "LARGEST", "AHEAD"), tick)
     assert defined == pytest.approx({name: getattr(room, name) for name, room in theirs.items()}, rel=1e-15)

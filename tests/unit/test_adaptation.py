@@ -181,7 +181,7 @@ def saved_twin(kind, sessions, folder, rate_hz=100.0):
 
 def test_a_grey_box_that_follows_the_machine_moves_what_is_replayed(adapted, lever_sessions, tmp_path, monkeypatch):
     folder, command = str(adapted[0]), CliRunner()
-    monkeypatch.setattr("edp.networks.twin.tuned_correction.JUDGED_S", 0.5)  # the logs take three seconds
+    monkeypatch.setattr("edp.networks.twin.adaptive_correction.JUDGED_S", 0.5)  # the logs take three seconds
     twin = saved_twin(GreyBox(), lever_sessions, tmp_path / "grey")
     plain, moved = (
         json.loads(

@@ -15,7 +15,7 @@ from edp.errors import ConfigError, closest
 from edp.evaluation.free_run import FreeRunJudgeSpec
 from edp.networks.twin import TWINS, TwinSpec
 from edp.networks.twin.grey.ground import GROUNDS
-from edp.networks.twin.kinds import KINDS, AutoTwin
+from edp.networks.twin.model_selection import KINDS, AutoTwin
 from edp.settings.tree import SettingsTree
 from edp.training.free_run import FreeRunSpec
 from edp.training.optimizers import OPTIMIZERS

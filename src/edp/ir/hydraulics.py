@@ -26,7 +26,8 @@ class HydraulicTick(Layer):
         scale: see there.
         offset: of each answer, in units within; `answer_width` likewise.
         answer_width: see there.
-        linkage: of three cylinders, as `edp.networks.twin.grey.layout` orders it; one zero: the load is polynomials.
+        linkage: of three cylinders, as `edp.networks.twin.grey.parameter_index` orders it; one zero: the load is
+            polynomials.
         sides: commands that extend and retract ``(valve, 2)``.
         valve_at: places of each valve's numbers ``(valve, 13)``.
         valve_actuator: of each valve.

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from edp.data.series import Series
 from edp.errors import DataError
-from edp.networks.twin.grey.numbers import coarse_by_fine
-from edp.networks.twin.grey.plausible import STRETCHES
+from edp.networks.twin.grey.parameters import coarse_by_fine
+from edp.networks.twin.grey.priors import STRETCHES
 from edp.networks.twin.grey.rollouts import RunBatch
 from edp.networks.twin.greybox import GreyTwin, RunTarget
 from edp.storage.reading import Table

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.data.series import Series
+from edp.networks.twin.disturbance_observer import LOG_SHARE, DisturbanceObserver
 from edp.networks.twin.grey.ground import GROUNDS, GroundLaw, check_grounded
 from edp.networks.twin.greybox import GreyTwin
-from edp.networks.twin.load import LOG_SHARE, LoadEstimate
 
 Array = NDArray[np.float64]
 Log = tuple[Array, Array, Array]
@@ -67,12 +67,12 @@ def fit_ground(
 def logged_forces(twin: GreyTwin, series: Series) -> Log:
     """Strokes (m), velocities (m/s) and forces (N) against each actuator ``(tick, actuator)`` along a log.
 
-    Forces are `LoadEstimate`'s, told all channels tick by tick; ticks of the prefix have no row.
+    Forces are `DisturbanceObserver`'s, told all channels tick by tick; ticks of the prefix have no row.
     """
     columns, prefix = twin.wiring.columns, twin.prefix_ticks
     speeds, strokes = (np.array([column[k] for column in columns]) for k in (0, 1))
     runner = twin.runner()
-    estimate = LoadEstimate(runner, np.arange(len(columns)), LOG_SHARE)
+    estimate = DisturbanceObserver(runner, np.arange(len(columns)), LOG_SHARE)
     state = twin.reset(series.inputs[None, :prefix], series.targets[None, :prefix])
     forces = np.zeros((max(series.samples - prefix, 0), len(columns)))
     for row, tick in enumerate(range(prefix, series.samples)):

@@ -7,10 +7,10 @@ import pytest
 
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, DataError
-from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.equations import GAMMA
-from edp.networks.twin.grey.numbers import number_table
-from edp.networks.twin.grey.plausible import Travel, opening_knots
+from edp.networks.twin.grey.parameters import number_table
+from edp.networks.twin.grey.priors import Travel, opening_knots
 from edp.signals import VOCABULARY, Channel, Kind
 from edp.sim.machine.machine_files import load_machine, parse_machine
 from edp.sim.machine.parameters import pack

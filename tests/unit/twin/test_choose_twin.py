@@ -15,8 +15,8 @@ from edp.jobs import IN_PROCESS
 from edp.networks.twin import TWINS, fit_scales
 from edp.networks.twin.arx import Arx
 from edp.networks.twin.elements import ElementsBox
-from edp.networks.twin.kinds import AutoTwin
 from edp.networks.twin.lumped.parts import MassElement
+from edp.networks.twin.model_selection import AutoTwin
 from edp.networks.twin.recurrent import Recurrent, averaged, member_seed
 from edp.networks.twin.static_map import StaticMap
 from edp.progress import SilentProgress

@@ -12,11 +12,11 @@ from edp.data.series import Series
 from edp.data.twin_channels import twin_channels
 from edp.errors import ConfigError
 from edp.networks.twin import fit_scales
-from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.datasheet import datasheet, datasheet_text
 from edp.networks.twin.grey.elements import CylinderElement, Elements, ValveElement
-from edp.networks.twin.grey.numbers import monomials, number_table
-from edp.networks.twin.grey.plausible import Travel
+from edp.networks.twin.grey.parameters import monomials, number_table
+from edp.networks.twin.grey.priors import Travel
 from edp.networks.twin.grey.rollouts import RunBatch
 from edp.networks.twin.greybox import GreyBox, GreyFitSpec, RunTarget
 from edp.storage.seals import HASH, content_digest

@@ -12,7 +12,8 @@ from edp.config.twin import load_twin_experiment, twin_toml
 from edp.data.series import Series
 from edp.errors import ConfigError
 from edp.networks.twin import fit_scales
-from edp.networks.twin.grey import layout as at
+from edp.networks.twin.disturbance_observer import DisturbanceObserver
+from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.bodies import forces_by_moments, moments_of
 from edp.networks.twin.grey.datasheet import datasheet, datasheet_text
 from edp.networks.twin.grey.elements import MotorElement, ValveElement
@@ -20,7 +21,6 @@ from edp.networks.twin.grey.known_linkage import BODY_NAMES
 from edp.networks.twin.grey.rollouts import RunBatch
 from edp.networks.twin.grey.runner import SINGLE_TICKS
 from edp.networks.twin.greybox import RunTarget
-from edp.networks.twin.load import LoadEstimate
 from edp.signals import Channel, Kind
 from edp.sim.machine import layout as sim
 from edp.sim.machine.machine_files import load_machine
@@ -359,7 +359,7 @@ def test_forces_that_the_model_does_not_know_of_are_found_from_velocities(twin):
     commands, state, row, _ = near(twin, runs=1, ticks=60)
     plant, model = twin.runner(), twin.runner()
     plant.resistance = np.array([3e4, -2e4, 1e4])
-    estimate, free = LoadEstimate(model, np.arange(3), 0.2), np.full(len(row), np.nan, np.float32)
+    estimate, free = DisturbanceObserver(model, np.arange(3), 0.2), np.full(len(row), np.nan, np.float32)
     now = state
     for command in commands[0]:
         estimate.update(row[:3].astype(float))
@@ -375,7 +375,7 @@ def test_forces_that_the_model_does_not_know_of_are_found_from_velocities(twin):
 def test_a_missing_velocity_leaves_an_estimate_of_forces_as_it_is(twin):
     commands, state, row, _ = near(twin, runs=1)
     runner = twin.runner()
-    estimate = LoadEstimate(runner, np.arange(3), 0.2)
+    estimate = DisturbanceObserver(runner, np.arange(3), 0.2)
     estimate.expect(commands[0, 0], row, state, runner.step(commands[0, 0], state, row))
     estimate.update(np.array([0.1, np.nan, 0.0]))
     assert not runner.resistance.any()

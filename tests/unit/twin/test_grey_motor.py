@@ -10,7 +10,7 @@ from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError
 from edp.networks.twin import TWINS, fit_scales
-from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.datasheet import datasheet
 from edp.networks.twin.grey.elements import CylinderElement, MotorElement, PumpElement, ValveElement
 from edp.networks.twin.grey.rollouts import RunBatch

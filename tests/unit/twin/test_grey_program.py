@@ -7,7 +7,7 @@ import pytest
 from grey_front import front, front_channels, series_of
 
 from edp.networks.twin import fit_scales
-from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey import program as code
 
 

@@ -6,8 +6,8 @@ import pytest
 from edp.data.twin_channels import twin_channels
 from edp.errors import ConfigError
 from edp.networks.twin import TWINS, fit_scales
-from edp.networks.twin.tuned import BOUND, NUMBER_GROUPS, TunedSpec, TunedTwin, group_matrix
-from edp.networks.twin.tuned_correction import TunedCorrection
+from edp.networks.twin.adaptive_correction import TunedCorrection
+from edp.networks.twin.adaptive_twin import BOUND, NUMBER_GROUPS, AdaptiveTwin, TunedSpec, group_matrix
 from edp.testing.bench import bench_channels, bench_series
 from edp.testing.twins import sample_actuators
 
@@ -41,10 +41,10 @@ def followed(tuned, levers, measured):
 @pytest.mark.long
 def test_it_finds_a_wider_dead_band_and_forecasts_with_it(bench):
     twin, levers, measured = bench
-    tuned = followed(TunedTwin(twin, BAND), levers[:-K], measured[:-K])
+    tuned = followed(AdaptiveTwin(twin, BAND), levers[:-K], measured[:-K])
     assert tuned.labels == ("ram.dead_band",)
     assert np.exp(tuned.logs[0]) == pytest.approx(1.5, rel=0.05)
-    frozen = TunedTwin(twin, BAND)
+    frozen = AdaptiveTwin(twin, BAND)
     frozen.learn = False
     errors = [[], []]
     for at, (command, row) in enumerate(zip(levers[:-K], measured[:-K], strict=True)):
@@ -58,7 +58,7 @@ def test_it_finds_a_wider_dead_band_and_forecasts_with_it(bench):
 def test_a_machine_as_it_was_teaches_nothing(bench):
     twin, levers, measured = bench
     answers, _ = twin.rollout(levers[None, :-1], twin.initial_state(levers[None, 0], measured[None, 0]))
-    tuned = followed(TunedTwin(twin, BAND), levers[1:], answers[0])
+    tuned = followed(AdaptiveTwin(twin, BAND), levers[1:], answers[0])
     assert tuned.learned > 20
     np.testing.assert_allclose(tuned.logs, 0.0, atol=5e-3)
 
@@ -70,7 +70,7 @@ def test_noise_faults_and_gaps_leave_numbers_within_their_bounds(bench):
     rough[100:110, 0], rough[200] = np.nan, np.nan
     lever = levers.copy()
     lever[300] = np.nan
-    tuned = followed(TunedTwin(twin), lever, rough)
+    tuned = followed(AdaptiveTwin(twin), lever, rough)
     deviations = np.array([NUMBER_GROUPS[name].deviation for name in tuned.spec.groups])
     assert (np.abs(tuned.logs) <= BOUND * deviations).all()
     assert np.isfinite(tuned.forecast(K)).all()
@@ -78,7 +78,7 @@ def test_noise_faults_and_gaps_leave_numbers_within_their_bounds(bench):
 
 def test_frozen_it_learns_nothing_and_a_gap_keeps_what_was_learned(bench):
     twin, levers, measured = bench
-    tuned = TunedTwin(twin, BAND)
+    tuned = AdaptiveTwin(twin, BAND)
     tuned.learn = False
     followed(tuned, levers[:200], measured[:200])
     assert (tuned.learned, tuned.logs.tolist()) == (0, [0.0])
@@ -102,7 +102,7 @@ def test_predictions_move_to_what_is_better_and_stay_where_nothing_is(bench):
     twin, levers, measured = bench
     limit = np.full((1, 1), 0.5)
     truth = np.concatenate([measured[K:, :1], np.repeat(measured[-1:, :1], K, axis=0)])
-    correction = TunedCorrection(TunedTwin(twin, BAND), ["speed"], [K], limit)
+    correction = TunedCorrection(AdaptiveTwin(twin, BAND), ["speed"], [K], limit)
     # A network that knows all is not moved; one that says what is now has much to gain.
     np.testing.assert_allclose(corrected(correction, levers, measured, truth), truth, atol=1e-6)
     assert correction.weight.max() < 1e-6
@@ -112,21 +112,21 @@ def test_predictions_move_to_what_is_better_and_stay_where_nothing_is(bench):
     late = slice(-150, -K)
     assert np.abs(moved[late] - truth[late]).mean() < 0.8 * np.abs(present[late] - truth[late]).mean()
     np.testing.assert_array_equal(moved[:900], present[:900])  # before ten seconds of motion
-    tight = TunedCorrection(TunedTwin(twin, BAND), ["speed"], [K], limit * 1e-3)
+    tight = TunedCorrection(AdaptiveTwin(twin, BAND), ["speed"], [K], limit * 1e-3)
     assert 0 < np.abs(corrected(tight, levers, measured, present) - present).max() <= 5e-4 * (1 + 1e-3)
     assert np.isnan(tight.step(levers[0], measured[0], np.full((1, 1), np.nan))).all()
 
 
 def test_a_thermometer_tells_the_oil_at_once(bench):
     twin, levers, measured = bench
-    tuned = TunedTwin(twin, TunedSpec(oil_c=20.0))
+    tuned = AdaptiveTwin(twin, TunedSpec(oil_c=20.0))
     tuned.step(levers[0], measured[0], 60.0)
     assert tuned.factors["oil"] == pytest.approx(np.exp(-1.4))
     assert tuned.factors["ram.friction"] == tuned.factors["ram.dead_band"] == 1.0
     for broken in (np.nan, np.inf, 4000.0):
         tuned.step(levers[1], measured[1], broken)
     assert tuned.factors["oil"] == pytest.approx(np.exp(-1.4))
-    unknown = TunedTwin(twin)
+    unknown = AdaptiveTwin(twin)
     unknown.step(levers[0], measured[0], 60.0)
     assert unknown.factors["oil"] == 1.0
 
@@ -145,7 +145,7 @@ def test_thinner_oil_leaks_more_rubs_less_and_is_softer(bench):
 
 def test_equations_that_come_apart_begin_anew(bench):
     twin, levers, measured = bench
-    tuned = followed(TunedTwin(twin, BAND), levers[:100], measured[:100])
+    tuned = followed(AdaptiveTwin(twin, BAND), levers[:100], measured[:100])
     assert np.isfinite(tuned.forecast(K)).all()
     tuned._state = {name: np.full_like(rows, np.nan) for name, rows in tuned._state.items()}
     tuned.step(levers[100], measured[100])
@@ -164,7 +164,7 @@ def test_what_cannot_follow_is_refused(bench):
         TunedSpec(learn_ticks=1)
     with pytest.raises(ConfigError, match="oil_c = 400"):
         TunedSpec(oil_c=400.0)
-    tuned = TunedTwin(twin, BAND)
+    tuned = AdaptiveTwin(twin, BAND)
     with pytest.raises(ConfigError, match="'swing' is predicted, but no velocity"):
         TunedCorrection(tuned, ["swing"], [K], np.ones((1, 1)))
     with pytest.raises(ConfigError, match="limit"):
@@ -176,4 +176,4 @@ def test_what_cannot_follow_is_refused(bench):
     series = [channels.task().series(recording)]
     static = TWINS["static"]().start(channels, fit_scales(channels, series), series, 0)
     with pytest.raises(ConfigError, match="only a grey box"):
-        TunedTwin(static)
+        AdaptiveTwin(static)

@@ -12,7 +12,7 @@ from edp.control.plant import PILOTS, STROKES, VELOCITIES, PlantInterface
 from edp.errors import ConfigError, closest
 from edp.networks.twin import Twin
 from edp.networks.twin.base import TwinState
-from edp.networks.twin.load import LoadEstimate
+from edp.networks.twin.disturbance_observer import DisturbanceObserver
 from edp.wording import typed
 
 Array = NDArray[np.float64]
@@ -53,7 +53,7 @@ class TwinModel:
         self._pilots = np.array([PILOTS.index(name) for name in commands])
         self._strokes = _columns([answers.index(name) for name in STROKES])
         velocities = np.array([answers.index(name) for name in VELOCITIES])
-        self._velocities, self._load = velocities, LoadEstimate(self._runner, velocities, load)
+        self._velocities, self._load = velocities, DisturbanceObserver(self._runner, velocities, load)
         self._pressures = _columns([n for n, name in enumerate(answers) if name.startswith("CylPressures_")])
         self.pressures = sum(name.startswith("CylPressures_") for name in answers)
         self._free = np.full(len(answers), np.nan, np.float32)

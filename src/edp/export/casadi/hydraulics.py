@@ -13,7 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.equations import GAMMA, Equations, GreyForm, Stage
 
 NONE = 65535

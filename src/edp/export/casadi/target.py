@@ -38,7 +38,7 @@ KNOWN: frozenset[type[Layer]] = frozenset(
 )
 """Kinds of layers that the module builds."""
 
-LAYOUT_IMPORT = "from edp.networks.twin.grey import layout as at"
+INDEX_IMPORT = "from edp.networks.twin.grey import parameter_index as at"
 EQUATIONS_IMPORT = "from edp.networks.twin.grey.equations import"
 GOLDEN = ("inputs", "stream", "tolerance")
 
@@ -49,7 +49,7 @@ class CasadiTarget:
     """CasADi, float32 runs: ``edp_casadi.py``, ``NAME.json`` and ``NAME.npz``, and C with ``NAME_casadi.c`` (external).
 
     ``edp_horizon.py`` runs a horizon of the compiled C. A grey box has ``edp_hydraulics.py``, ``edp_equations.py`` and
-    ``edp_layout.py`` in place of all that is C: the C code of its equations has no tangents.
+    ``edp_parameter_index.py`` in place of all that is C: the C code of its equations has no tangents.
     """
 
     def write(self, bundle: Bundle, name: str, folder: Path) -> list[Path]:
@@ -83,11 +83,11 @@ def equation_files() -> dict[str, bytes]:
     modules = {
         "edp_hydraulics.py": resources.files("edp.export.casadi").joinpath("hydraulics.py"),
         "edp_equations.py": grey.joinpath("equations.py"),
-        "edp_layout.py": grey.joinpath("layout.py"),
+        "edp_parameter_index.py": grey.joinpath("parameter_index.py"),
     }
     files = {}
     for name, source in modules.items():
-        text = source.read_text(encoding="utf-8").replace(LAYOUT_IMPORT, "import edp_layout as at")
+        text = source.read_text(encoding="utf-8").replace(INDEX_IMPORT, "import edp_parameter_index as at")
         files[name] = text.replace(EQUATIONS_IMPORT, "from edp_equations import").encode()
     return files
 

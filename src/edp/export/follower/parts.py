@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.networks.twin.adaptive_correction import TunedCorrection
+from edp.networks.twin.adaptive_twin import AdaptiveTwin, TunedSpec
 from edp.networks.twin.greybox import GreyTwin
-from edp.networks.twin.tuned import TunedSpec, TunedTwin
-from edp.networks.twin.tuned_correction import TunedCorrection
 
 Array = NDArray[np.float32]
 GOLDEN_TICKS = 160
@@ -61,7 +61,7 @@ class FollowerParts:
         Raises:
             ConfigError: a target that is no velocity of the twin, or a group that it has no number of.
         """
-        return TunedCorrection(TunedTwin(self.twin, self.spec), self.targets, self.horizons, self.limit)
+        return TunedCorrection(AdaptiveTwin(self.twin, self.spec), self.targets, self.horizons, self.limit)
 
     def golden(self) -> GoldenTicks:
         """Return samples of a machine whose parameter groups have changed."""

@@ -29,8 +29,8 @@ from edp.export.hashes import model_hash, scale_hash
 from edp.export.si_names import si_channels
 from edp.export.sizes import check_sizes
 from edp.ir.hydraulics import HydraulicTick
-from edp.networks.twin.tuned import LEAST, TunedTwin
-from edp.networks.twin.tuned_correction import JUDGED_S
+from edp.networks.twin.adaptive_correction import JUDGED_S
+from edp.networks.twin.adaptive_twin import LEAST, AdaptiveTwin
 from edp.signals import Channel
 from edp.training.bundle import Bundle
 
@@ -80,7 +80,7 @@ class FollowerFiles:
         return texts
 
     @cached_property
-    def tuned(self) -> TunedTwin:
+    def tuned(self) -> AdaptiveTwin:
         """The follower in Python."""
         return self.parts.correction().tuned
 

@@ -76,44 +76,6 @@ class BlockSpec(Protocol):
     space: ClassVar[dict[str, Any]]
 
 
-class BranchesSpec(BlockSpec, Protocol):
-    """A block that replaces the single convolution stack."""
-
-    def build(self, make_branch: BranchMaker) -> Streaming: ...
-
-
-class ChannelsSpec(BlockSpec, Protocol):
-    """A block that works on the channels of the convolutions."""
-
-    def build(self, width: int, window: int) -> Streaming: ...
-
-
-class FeaturesSpec(BlockSpec, Protocol):
-    """A block that adds features derived from the recurrent states."""
-
-    def extra(self, width: int) -> int: ...
-
-    def build(self, width: int, window: int) -> Streaming: ...
-
-
-class GateSpec(BlockSpec, Protocol):
-    """A block that gives each output its own view of the representation."""
-
-    def build(self, width: int, outputs: int) -> Streaming: ...
-
-
-class MixSpec(BlockSpec, Protocol):
-    """A block that lets the heads of the outputs see one another."""
-
-    def build(self, hidden: int, outputs: int) -> Streaming: ...
-
-
-class BypassSpec(BlockSpec, Protocol):
-    """A block that adds a direct path from the scaled features to the output."""
-
-    def build(self, space: OutputSpace) -> Streaming: ...
-
-
 class TaskView(Protocol):
     """Properties of a task that a part may check before it is built."""
 

@@ -13,8 +13,8 @@ from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, closest
 from edp.ir import Builder
 from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinRunner, TwinState
-from edp.networks.twin.grey import layout as at
-from edp.networks.twin.grey.connections import check_elements
+from edp.networks.twin.grey import parameter_index as at
+from edp.networks.twin.grey.channel_map import GreyChannelMap, turning_scales
 from edp.networks.twin.grey.correction import Cell, OutputBounds, RunTrace
 from edp.networks.twin.grey.elements import (
     CylinderElement,
@@ -26,17 +26,17 @@ from edp.networks.twin.grey.elements import (
 )
 from edp.networks.twin.grey.equations import GreyForm
 from edp.networks.twin.grey.fit_spec import GreyFitSpec
+from edp.networks.twin.grey.initial_guess import load_start
 from edp.networks.twin.grey.known_linkage import KnownLinkage, check_linkage
 from edp.networks.twin.grey.linkage import joint_actuators
 from edp.networks.twin.grey.lowering import add_layer
-from edp.networks.twin.grey.numbers import LEFT_OUT, NumberTable, finer_values, number_table
-from edp.networks.twin.grey.plausible import STRETCHES, Travel
+from edp.networks.twin.grey.parameters import LEFT_OUT, ParameterTable, finer_values, number_table
+from edp.networks.twin.grey.priors import STRETCHES, Travel
 from edp.networks.twin.grey.program import GreyProgram, program_of
 from edp.networks.twin.grey.rollouts import FitTarget, RunBatch, judge_run, run_batch
 from edp.networks.twin.grey.runner import GreyRunner
-from edp.networks.twin.grey.start import load_start
 from edp.networks.twin.grey.tick import MachineArrays
-from edp.networks.twin.grey.wiring import Wiring, turning_scales
+from edp.networks.twin.grey.validation import check_elements
 from edp.networks.twin.scales import FASTEST, HIGHEST, Array, TwinScales
 from edp.settings.bounds import MOST_NAMES, check_bounds, check_count, integer
 
@@ -162,7 +162,7 @@ class GreyBox:
         if not (numbers == numbers[table.leader]).all():
             raise ValueError("both sides of one of its motors have not the same displacement")
         scales = turning_scales(elements, channels, scales)
-        wiring = Wiring.of(elements, channels, scales)
+        wiring = GreyChannelMap.of(elements, channels, scales)
         return GreyTwin(channels, scales, self, (table, wiring), numbers, arrays["full"])
 
     def _network(self, channels: TwinChannels, seed: int) -> dict[str, Array]:
@@ -181,7 +181,7 @@ class GreyBox:
 
     def table(
         self, elements: Elements, channels: TwinChannels, scales: TwinScales, front: KnownLinkage | None
-    ) -> NumberTable:
+    ) -> ParameterTable:
         """Return the parameter table, with initial values from the scales of the data."""
         names = [channel.name for channel in channels.answers]
         count = len(channels.velocities)
@@ -250,14 +250,17 @@ class NormalEquations:
 
 
 class GreyTwin(Twin):
-    """State: ``answer`` (outputs) in SI units, and the element states in units of `edp.networks.twin.grey.layout`."""
+    """Twin of a grey box; its state is ``answer`` (outputs, SI units) and the states of its elements.
+
+    These are in the units of `edp.networks.twin.grey.parameter_index`.
+    """
 
     def __init__(
         self,
         channels: TwinChannels,
         scales: TwinScales,
         spec: GreyBox,
-        parts: tuple[NumberTable, Wiring],
+        parts: tuple[ParameterTable, GreyChannelMap],
         numbers: Doubles,
         full: Array,
     ) -> None:

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError
-from edp.networks.twin.grey.layout import BODY_VALUES
-from edp.networks.twin.grey.numbers import NumberTable
+from edp.networks.twin.grey.parameter_index import BODY_VALUES
+from edp.networks.twin.grey.parameters import ParameterTable
 from edp.sim.machine import layout as sim
 from edp.sim.machine.machine import Bodies, Machine
 from edp.sim.machine.parameters import pack
@@ -97,7 +97,7 @@ def load_by_base(poses: Poses, lengths: Sequence[float], gravity: float) -> tupl
 
 
 def grey_load(
-    table: NumberTable, load: Doubles, z_of: tuple[Doubles, Doubles], poses: Poses
+    table: ParameterTable, load: Doubles, z_of: tuple[Doubles, Doubles], poses: Poses
 ) -> tuple[Doubles, Doubles]:
     """Gravity torques ``(pose, 3)``, N m, and joint inertia ``(pose, 3, 3)``, kg m^2, of a grey box.
 

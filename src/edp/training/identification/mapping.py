@@ -20,10 +20,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.networks.twin.grey import layout as grey
+from edp.networks.twin.grey import parameter_index as grey
 from edp.networks.twin.grey.equations import GAMMA
-from edp.networks.twin.grey.numbers import NumberTable
-from edp.networks.twin.grey.plausible import opening_knots
+from edp.networks.twin.grey.parameters import ParameterTable
+from edp.networks.twin.grey.priors import opening_knots
 from edp.sim.machine import layout as sim
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.parameters import pack
@@ -51,7 +51,7 @@ class GreyParts:
         step_s: of the grey box's solver.
     """
 
-    table: NumberTable
+    table: ParameterTable
     primary: tuple[int, int, int]
     conflux: tuple[int, int, int]
     reach: tuple[float, ...]

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.networks.twin.grey.numbers import NumberTable
+from edp.networks.twin.grey.parameters import ParameterTable
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import BOUNDS
 from edp.training.identification.machine_numbers import MACHINE_NUMBERS, guesses, with_values
@@ -125,7 +125,7 @@ LONGEST_CUSHION = 0.499
 WIDTHS: Doubles = np.array([number.width for number in MACHINE_NUMBERS])
 
 
-def coordinates(table: NumberTable, numbers: Doubles, origin: Doubles) -> Doubles:
+def coordinates(table: ParameterTable, numbers: Doubles, origin: Doubles) -> Doubles:
     """Return coordinates of parameters: prior standard deviations from `origin`, logarithmic for positive ones."""
     safe = np.where(table.positive, numbers / np.where(table.positive, origin, 1.0), 1.0)
     return np.asarray(np.where(table.positive, np.log(safe), numbers - origin) / table.width)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from edp.errors import BundleError, ConfigError, closest
 from edp.export.follower import FollowerParts, write_follower
+from edp.networks.twin.adaptive_twin import TunedSpec
 from edp.networks.twin.greybox import GreyTwin
-from edp.networks.twin.tuned import TunedSpec
 from edp.training import load_bundle
 from edp.training.twin_bundle import load_twin, plant_bundle
 from edp.workflows.adaptation.with_twin import correction_of, tuned_spec

@@ -196,7 +196,7 @@ def replay_run(
         learn: False freezes what was learned.
         progress: receiver of the progress; its units are recordings.
         twin: run folder of a grey box of the machine as it was, whose numbers follow the machine and towards which the
-            network's predictions move before they are corrected (`edp.networks.twin.tuned_correction`); None: none.
+            network's predictions move before they are corrected (`edp.networks.twin.adaptive_correction`); None: none.
 
     Raises:
         EdpError: a run without adaptation, logs that do not go with its network, or a twin that does not.

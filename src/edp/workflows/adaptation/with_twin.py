@@ -14,8 +14,8 @@ from edp.data.task import Task
 from edp.errors import BundleError, ConfigError, DataError
 from edp.ir.rls import Adaptation
 from edp.networks.twin import Twin
-from edp.networks.twin.tuned import HOTTEST_C, TunedSpec, TunedTwin
-from edp.networks.twin.tuned_correction import TunedCorrection
+from edp.networks.twin.adaptive_correction import TunedCorrection
+from edp.networks.twin.adaptive_twin import HOTTEST_C, AdaptiveTwin, TunedSpec
 from edp.recording import Recording
 from edp.training.twin_bundle import OIL_C, TwinBundle
 from edp.wording import typed
@@ -56,7 +56,7 @@ def correction_of(twin: Twin, adaptation: Adaptation, task: Task, spec: TunedSpe
             "network's rate"
         )
     limit = adaptation.spec.limit * adaptation.unit.astype(np.float64)
-    return TunedCorrection(TunedTwin(twin, spec), task.targets, adaptation.horizons, limit)
+    return TunedCorrection(AdaptiveTwin(twin, spec), task.targets, adaptation.horizons, limit)
 
 
 class TwinMoves:

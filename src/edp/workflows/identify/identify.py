@@ -23,7 +23,7 @@ from edp.networks.twin import TWINS, TwinSpec, fit_scales
 from edp.networks.twin.grey.datasheet import BASIS, UNEXCITED
 from edp.networks.twin.grey.elements import Elements
 from edp.networks.twin.greybox import POLYNOMIALS, GreyBox, GreyTwin
-from edp.networks.twin.kinds import KINDS, AutoTwin
+from edp.networks.twin.model_selection import KINDS, AutoTwin
 from edp.networks.twin.residual import Residual
 from edp.progress import SILENT, Progress
 from edp.recording import Recording

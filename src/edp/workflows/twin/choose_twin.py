@@ -17,7 +17,7 @@ from edp.evaluation.free_run_file import MAX_TEXT, CandidateRow
 from edp.evaluation.guard import free_run_error
 from edp.networks.twin import TWINS, TwinSpec, fit_scales
 from edp.networks.twin.elements import ElementsBox
-from edp.networks.twin.kinds import AutoTwin
+from edp.networks.twin.model_selection import AutoTwin
 from edp.networks.twin.recurrent import Recurrent, member_seed
 from edp.storage.runs import PARTS, KeyedRun, part_of
 from edp.training.free_run import FreeRunSpec

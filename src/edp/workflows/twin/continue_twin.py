@@ -16,7 +16,7 @@ from edp.errors import ConfigError, DataError
 from edp.evaluation.free_run import free_run_scores, free_runs
 from edp.evaluation.guard import free_run_error
 from edp.networks.twin import TWINS, Twin
-from edp.networks.twin.kinds import AutoTwin
+from edp.networks.twin.model_selection import AutoTwin
 from edp.networks.twin.recurrent import RecurrentTwin, averaged, member_seed
 from edp.networks.twin.recurrent_members import scales_for, separated, with_scales
 from edp.networks.twin.static_map import StaticMap, StaticTwin

@@ -20,10 +20,10 @@ from edp.evaluation.step_response import step_responses
 from edp.jobs import IN_PROCESS, Workers
 from edp.logs.source import DataSource
 from edp.networks.twin import fit_scales
+from edp.networks.twin.grey.channel_map import FARTHEST_TURN
 from edp.networks.twin.grey.datasheet import BASIS, datasheet_text
-from edp.networks.twin.grey.wiring import FARTHEST_TURN
 from edp.networks.twin.greybox import GreyBox
-from edp.networks.twin.kinds import AutoTwin
+from edp.networks.twin.model_selection import AutoTwin
 from edp.networks.twin.recurrent_members import scales_for
 from edp.progress import SILENT, Progress
 from edp.recording import Recording

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.equations import Equations, GreyForm
 from edp.networks.twin.grey.jit import compiled
 from edp.networks.twin.grey.linkage import joint_actuators, joint_angle
@@ -70,7 +70,7 @@ def moments_of(values: Array, inertia_at: int, linkage: Array) -> BodyMoments:
     Args:
         values: parameters of the grey box, shape (parameter,).
         inertia_at: place of the first body's.
-        linkage: of `edp.networks.twin.grey.layout`.
+        linkage: of `edp.networks.twin.grey.parameter_index`.
     """
     joints = tuple(joint_actuators(linkage).tolist())
     own, results = (
@@ -89,7 +89,7 @@ def forces_by_moments(strokes: Array, speeds: Array, accelerations: Array, linka
         strokes: m, shape (row, actuator).
         speeds: m/s, shape (row, actuator).
         accelerations: m/s^2, shape (row, actuator).
-        linkage: of `edp.networks.twin.grey.layout`.
+        linkage: of `edp.networks.twin.grey.parameter_index`.
     """
     joints = joint_actuators(linkage)
     motion = np.ascontiguousarray(np.concatenate([strokes, speeds, accelerations], axis=1))

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.bodies import forces_by_moments, moments_of
 from edp.networks.twin.grey.known_linkage import GIGA
-from edp.networks.twin.grey.numbers import NumberTable
+from edp.networks.twin.grey.parameters import ParameterTable
 from edp.storage.reading import Table
 from edp.wording import typed
 
@@ -25,7 +25,7 @@ BASIS = (
 )
 
 
-def datasheet(table: NumberTable, values: Doubles, information: Doubles) -> list[dict[str, object]]:
+def datasheet(table: ParameterTable, values: Doubles, information: Doubles) -> list[dict[str, object]]:
     """Return one row per fitted parameter, and one for the derived inertia of each actuator; SI units.
 
     Args:
@@ -59,7 +59,7 @@ def datasheet(table: NumberTable, values: Doubles, information: Doubles) -> list
     return rows + _inertias(table, values, information)
 
 
-def _inertias(table: NumberTable, values: Doubles, information: Doubles) -> list[dict[str, object]]:
+def _inertias(table: ParameterTable, values: Doubles, information: Doubles) -> list[dict[str, object]]:
     """Return one row for the inertia of each actuator with the others at rest, at the middle of all strokes.
 
     It is the sum of squares of its row of the root, whose first coefficients are the root there; its interval follows
@@ -80,7 +80,7 @@ def _inertias(table: NumberTable, values: Doubles, information: Doubles) -> list
     return rows
 
 
-def _body_inertias(table: NumberTable, values: Doubles, covariance: Doubles) -> list[dict[str, object]]:
+def _body_inertias(table: ParameterTable, values: Doubles, covariance: Doubles) -> list[dict[str, object]]:
     """Return the inertia rows of a known linkage, at the middle of the strokes of its machine."""
     span, n = slice(table.inertia_at, table.potential_at), len(table.actuator_at)
     joints = table.linkage[at.JOINTS :].reshape(at.BODIES, at.JOINT_VALUES)

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey import parameter_index as at
 
 SMOOTH2 = 0.1**2
 """Square of the pressure difference (MPa) below which an orifice turns laminar."""
@@ -65,7 +65,7 @@ class GreyForm:
     """What a machine consists of: which equations there are, apart from all parameters.
 
     Attributes:
-        valve_at: places of the parameters of each valve, see `edp.networks.twin.grey.layout`; -1: it has none.
+        valve_at: places of the parameters of each valve, see `edp.networks.twin.grey.parameter_index`; -1: it has none.
         valve_actuator: actuator of each valve.
         valve_pump: pump of each valve; -1: supply.
         actuator_at: place of the first parameter of each actuator.
@@ -130,7 +130,7 @@ class Equations:
 
     Args:
         form: what it consists of.
-        parameters: values or symbols, in the order of `edp.networks.twin.grey.layout`.
+        parameters: values or symbols, in the order of `edp.networks.twin.grey.parameter_index`.
         constants: middle and scale of the strokes, gravity (m/s^2), lengths of the first two bodies (m).
         algebra: operations on them.
     """

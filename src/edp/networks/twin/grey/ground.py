@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from edp.errors import ConfigError
 from edp.networks.twin.base import Twin, TwinRunner, TwinState
-from edp.networks.twin.load import force_slopes
+from edp.networks.twin.disturbance_observer import force_slopes
 from edp.registry import Registry
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.networks.twin.grey import jit
-from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.linkage import joint_angle
 from edp.storage.machine_code import Compiler
 
@@ -44,7 +44,7 @@ def tip_at(linkage: Array, bucket_m: float, strokes: Array, tip: Array, slopes: 
     """Place of the tip in the frame of the boom foot, and its slopes by the strokes.
 
     Args:
-        linkage: of `layout`.
+        linkage: of `parameter_index`.
         bucket_m: length of the last body, m.
         strokes: ``(actuator,)``, m.
         tip: written ``(2,)``, m.

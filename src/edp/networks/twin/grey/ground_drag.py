@@ -23,9 +23,9 @@ from scipy.optimize import lsq_linear
 from scipy.signal import lfilter
 
 from edp.errors import DataError
+from edp.networks.twin.disturbance_observer import LOG_SHARE
 from edp.networks.twin.grey import ground_contact as contact
 from edp.networks.twin.grey.ground import GROUNDS, GroundContact, GroundLaw
-from edp.networks.twin.load import LOG_SHARE
 from edp.settings.bounds import above, span
 
 if TYPE_CHECKING:

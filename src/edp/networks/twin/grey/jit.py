@@ -11,7 +11,7 @@ compiler = Compiler(
     "grey",
     # The cell on top of a grey box is that of the recurrent twin.
     lambda: (
-        _FOLDER / "layout.py",
+        _FOLDER / "parameter_index.py",
         _FOLDER / "equations.py",
         *sorted((_FOLDER.parent / "symbolic").glob("*.py")),
         _FOLDER.parent / "steps.py",

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError
-from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.elements import Elements
-from edp.networks.twin.grey.plausible import GreyNumber
+from edp.networks.twin.grey.priors import GreyParameter
 from edp.networks.twin.scales import TwinScales
 from edp.wording import typed
 
@@ -37,7 +37,7 @@ class KnownLinkage:
     """Three bodies in a row, each turned by one cylinder.
 
     Attributes:
-        values: as `layout` orders them ``(LINKAGE_VALUES,)``, rounded to what a bundle keeps.
+        values: as `parameter_index` orders them ``(LINKAGE_VALUES,)``, rounded to what a bundle keeps.
         bodies: mass (Gg), centre of gravity (m) and inertia about it (Gg m^2) of each body, in that order; a fit
             starts from them ``(BODIES * BODY_VALUES,)``.
     """
@@ -107,7 +107,7 @@ class KnownLinkage:
         """For a bundle."""
         return {"linkage": self.values.astype(np.float32), "bodies": self.bodies.astype(np.float32)}
 
-    def numbers(self) -> list[GreyNumber]:
+    def numbers(self) -> list[GreyParameter]:
         """Return masses, centres of gravity and inertias, beginning with the first body."""
         lengths = [*self.values[at.LENGTH : at.JOINTS], 0.0]
         rows = []
@@ -117,10 +117,10 @@ class KnownLinkage:
             element = f"{name}_body"
             along, across = (share * size for share in CENTRE_WIDTH)
             rows += [
-                GreyNumber(element, "mass", "kg", GIGA, own[at.MASS], MASS_WIDTH),
-                GreyNumber(element, "centre_along", "m", 1.0, own[at.CENTRE_X], along, False),
-                GreyNumber(element, "centre_across", "m", 1.0, own[at.CENTRE_Y], across, False),
-                GreyNumber(element, "inertia_about_centre", "kg m^2", GIGA, own[at.INERTIA], INERTIA_WIDTH),
+                GreyParameter(element, "mass", "kg", GIGA, own[at.MASS], MASS_WIDTH),
+                GreyParameter(element, "centre_along", "m", 1.0, own[at.CENTRE_X], along, False),
+                GreyParameter(element, "centre_across", "m", 1.0, own[at.CENTRE_Y], across, False),
+                GreyParameter(element, "inertia_about_centre", "kg m^2", GIGA, own[at.INERTIA], INERTIA_WIDTH),
             ]
         return rows
 

@@ -13,7 +13,7 @@ from edp.ir.base import INPUT
 from edp.ir.builder import indices
 from edp.ir.hydraulics import NONE, HydraulicTick
 from edp.ir.reference import STEPS
-from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.correction import OutputBounds
 from edp.networks.twin.grey.equations import GreyForm
 from edp.networks.twin.grey.linkage import joint_actuators

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey import program as code
 from edp.networks.twin.grey.correction import OutputBounds
 from edp.networks.twin.grey.equations import GAMMA

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.equations import Equations, GreyForm, Stage
 from edp.networks.twin.grey.jit import compiler
 from edp.networks.twin.symbolic.expression import Expression, ExpressionGraph

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.correction import (
     Cell,
     OutputBounds,

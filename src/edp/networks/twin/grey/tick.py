@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey import program as code
 from edp.networks.twin.grey.equations import GAMMA
 from edp.networks.twin.grey.jit import inlined, inner
@@ -33,7 +33,7 @@ class MachineArrays(NamedTuple):
         parameters: shape (parameter,).
         constants: see `edp.networks.twin.grey.equations.GreyForm.constants`.
         scale: of the strokes; 0 where a stroke is not measured, shape (actuator,).
-        linkage: of `edp.networks.twin.grey.layout`; empty if the load is a polynomial of the strokes.
+        linkage: of `edp.networks.twin.grey.parameter_index`; empty if the load is a polynomial of the strokes.
         ports: kind and number of the state behind each output, shape (output, 2).
         tick_s: length of a sample, s.
         steps: implicit steps in it.
@@ -443,7 +443,7 @@ def tick(program: GreyProgram, machine: MachineArrays, work: RunValues, history:
         machine: its parameters.
         work: values of the run; moved.
         history: commands of the valves, shape (tick, valve), newest first.
-        columns_by: by what tangents are carried along: `layout.NONE`, `BY_NUMBERS` or `BY_STATE`.
+        columns_by: by what tangents are carried along: `parameter_index.NONE`, `BY_NUMBERS` or `BY_STATE`.
 
     Returns:
         Iterations of all stages together.

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.data.series import Series
-from edp.networks.twin.grey import layout as at
-from edp.networks.twin.grey.numbers import NumberTable
-from edp.networks.twin.grey.start_linkage import balance_columns, balanced_bodies
+from edp.networks.twin.grey import parameter_index as at
+from edp.networks.twin.grey.initial_bodies import balance_columns, balanced_bodies
+from edp.networks.twin.grey.parameters import ParameterTable
 
 Array = NDArray[np.float64]
 REACH = 2
@@ -30,7 +30,7 @@ SHARE_RANGE = (0.2, 1.0)
 
 
 def load_start(
-    table: NumberTable,
+    table: ParameterTable,
     train: Sequence[Series],
     columns: Sequence[tuple[int, int, int, int]],
     z_of: tuple[Array, Array],
@@ -80,7 +80,7 @@ def load_start(
     return _taken(table, solution, declared, values)
 
 
-def _load_columns(table: NumberTable, rows: Array, z_of: tuple[Array, Array]) -> Array:
+def _load_columns(table: ParameterTable, rows: Array, z_of: tuple[Array, Array]) -> Array:
     """Return the actuator forces per linear load parameter ``(actuator, row, column)``."""
     if table.front is not None:
         return balance_columns(table, rows)
@@ -104,7 +104,7 @@ def _entries(n: int) -> list[tuple[int, int]]:
     return [(a, c) for a in range(n) for c in range(a + 1)]
 
 
-def _taken(table: NumberTable, solution: Array, declared: Sequence[bool], values: Array) -> Array:
+def _taken(table: ParameterTable, solution: Array, declared: Sequence[bool], values: Array) -> Array:
     """Insert the solution into the parameters where it is plausible."""
     n = len(table.actuator_at)
     inertia = _entries(n)
@@ -123,7 +123,7 @@ def _taken(table: NumberTable, solution: Array, declared: Sequence[bool], values
     return _with_friction(table, solution[len(inertia) + potential :], declared, values)
 
 
-def _with_friction(table: NumberTable, solution: Array, declared: Sequence[bool], values: Array) -> Array:
+def _with_friction(table: ParameterTable, solution: Array, declared: Sequence[bool], values: Array) -> Array:
     """Insert friction and rod areas into the parameters where they are plausible."""
     for i in range(len(table.actuator_at)):
         a, own = table.actuator_at[i], 3 * i

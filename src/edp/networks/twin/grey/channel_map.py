@@ -17,7 +17,7 @@ FARTHEST_TURN = 1e6
 
 
 @dataclass(frozen=True, eq=False)
-class Wiring:
+class GreyChannelMap:
     """Assignment of channels to grey-box states.
 
     Attributes:
@@ -39,7 +39,7 @@ class Wiring:
     nodes: int
 
     @staticmethod
-    def of(elements: Elements, channels: TwinChannels, scales: TwinScales) -> Wiring:
+    def of(elements: Elements, channels: TwinChannels, scales: TwinScales) -> GreyChannelMap:
         """Return the wiring of connected elements."""
         names = [channel.name for channel in channels.answers]
         commands = [channel.name for channel in channels.commands]
@@ -65,7 +65,7 @@ class Wiring:
         actuators = [actuator.name for actuator in elements.actuators]
         pumps = [pump.name for pump in elements.pumps]
         sides = [(commands.index(v.extend), commands.index(v.retract) if v.retract else -1) for v in elements.valves]
-        return Wiring(
+        return GreyChannelMap(
             np.array(sides),
             np.array([actuators.index(v.actuator) for v in elements.valves]),
             np.array([pumps.index(v.supply) if v.supply else -1 for v in elements.valves]),

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.bodies import forces_by_moments, moments_of
-from edp.networks.twin.grey.numbers import NumberTable
+from edp.networks.twin.grey.parameters import ParameterTable
 
 Array = NDArray[np.float64]
 LEAST_ERROR = 0.02
@@ -17,7 +17,7 @@ INDEPENDENT = 1_000
 STEPS, TRIES = 30, 12
 
 
-def balance_columns(table: NumberTable, rows: Array) -> Array:
+def balance_columns(table: ParameterTable, rows: Array) -> Array:
     """Return the cylinder forces per linear parameter (nine) ``(actuator, row, BASE)``.
 
     Args:
@@ -28,7 +28,7 @@ def balance_columns(table: NumberTable, rows: Array) -> Array:
     return np.moveaxis(forces_by_moments(strokes, speeds, pulls, table.linkage), 0, 1)
 
 
-def balanced_bodies(table: NumberTable, matrix: Array, goal: Array) -> tuple[Array, Array]:
+def balanced_bodies(table: ParameterTable, matrix: Array, goal: Array) -> tuple[Array, Array]:
     """Return parameters whose bodies balance the forces within plausible limits, and the other linear parameters.
 
     Args:
@@ -66,7 +66,7 @@ def balanced_bodies(table: NumberTable, matrix: Array, goal: Array) -> tuple[Arr
     return _numbers(table, theta), of_goal - of_bodies @ base
 
 
-def _cost(table: NumberTable, theta: Array, square: Array, pull: Array) -> tuple[float, Array, Array]:
+def _cost(table: ParameterTable, theta: Array, square: Array, pull: Array) -> tuple[float, Array, Array]:
     """Return cost (residual balance and deviation from typical values), nine parameters and derivatives."""
     values, span = _numbers(table, theta), slice(table.inertia_at, table.potential_at)
     moments = moments_of(values, table.inertia_at, table.linkage)
@@ -75,7 +75,7 @@ def _cost(table: NumberTable, theta: Array, square: Array, pull: Array) -> tuple
     return float(0.5 * base @ square @ base - pull @ base + 0.5 * theta @ theta), base, slopes
 
 
-def _numbers(table: NumberTable, theta: Array) -> Array:
+def _numbers(table: ParameterTable, theta: Array) -> Array:
     """Return all grey-box parameters, with rigid-body parameters from `theta` (in prior standard deviations)."""
     values, span = table.nominal, slice(table.inertia_at, table.potential_at)
     moved = table.width[span] * theta

@@ -44,7 +44,7 @@ def force_slopes(
     return slopes
 
 
-class LoadEstimate:
+class DisturbanceObserver:
     """Resistance against each cylinder, from velocities one tick ahead.
 
     In a tick chambers hardly give way, so that what a velocity differs by from what the model expects is a force on

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError, closest
-from edp.networks.twin.tuned import REST, TunedTwin
+from edp.networks.twin.adaptive_twin import REST, AdaptiveTwin
 
 Array = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -44,7 +44,7 @@ class TunedCorrection:
         ConfigError: a target that is no velocity of the twin, a horizon below 1, or a limit that is not positive.
     """
 
-    def __init__(self, tuned: TunedTwin, targets: Sequence[str], horizons: Sequence[int], limit: Doubles) -> None:
+    def __init__(self, tuned: AdaptiveTwin, targets: Sequence[str], horizons: Sequence[int], limit: Doubles) -> None:
         names = [channel.name for channel in tuned.twin.channels.velocities]
         for name in targets:
             if name not in names:

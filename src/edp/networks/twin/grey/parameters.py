@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError
-from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.elements import Actuator, Elements, MotorElement
 from edp.networks.twin.grey.known_linkage import KnownLinkage
-from edp.networks.twin.grey.plausible import (
+from edp.networks.twin.grey.priors import (
     MEGA,
     STRETCHES,
-    GreyNumber,
+    GreyParameter,
     Travel,
     circuit_numbers,
     cylinder_numbers,
@@ -44,13 +44,13 @@ LEFT_OUT = {
 
 
 @dataclass(frozen=True, eq=False)
-class NumberTable:
+class ParameterTable:
     """All parameters in order, and the position of each element's first one.
 
     With a known linkage `inertia_at` is the place of the first body's, and the load has no terms.
     """
 
-    numbers: tuple[GreyNumber, ...]
+    numbers: tuple[GreyParameter, ...]
     valve_at: IntArray
     actuator_at: IntArray
     pump_at: IntArray
@@ -78,7 +78,7 @@ class NumberTable:
 
     @property
     def linkage(self) -> Array:
-        """Linkage values in the order of `layout`; empty if the load is a polynomial of the strokes."""
+        """Linkage values in the order of `parameter_index`; empty if the load is a polynomial of the strokes."""
         return np.zeros(0) if self.front is None else self.front.values
 
     @property
@@ -141,7 +141,7 @@ def number_table(
     left_out: Sequence[str] = (),
     front: KnownLinkage | None = None,
     stretches: int = STRETCHES[0],
-) -> NumberTable:
+) -> ParameterTable:
     """Return the parameters of connected elements, with initial values from the data.
 
     Args:
@@ -158,7 +158,7 @@ def number_table(
     """
     degrees = degrees if front is None else (0, 0)
     _check_load(elements, degrees)
-    numbers: list[GreyNumber] = []
+    numbers: list[GreyParameter] = []
     actuator_at, areas = [], []
     for actuator, travel in zip(elements.actuators, travels, strict=True):
         actuator_at.append(len(numbers))
@@ -188,13 +188,13 @@ def number_table(
     numbers += _potential(elements.actuators, sizes, travels, exponents)
     neutral = {name: value for part in left_out for name, value in LEFT_OUT[part].items()}
     every = tuple(_fixed(number, neutral[number.name]) if number.name in neutral else number for number in numbers)
-    return NumberTable(
+    return ParameterTable(
         every, valve_at, np.array(actuator_at), np.array(pump_at, dtype=np.int64), circuit_at, inertia_at,
         inertia_terms, potential_at, exponents, front, stretches,
     )  # fmt: skip
 
 
-def finer_values(coarse: NumberTable, values: Array, fine: NumberTable) -> Array:
+def finer_values(coarse: ParameterTable, values: Array, fine: ParameterTable) -> Array:
     """Return the parameters of the same machine with subdivided opening curves of unchanged shape."""
     parts = fine.stretches // coarse.stretches
     divided, result = coarse.in_curves, np.empty(len(fine.numbers))
@@ -204,7 +204,7 @@ def finer_values(coarse: NumberTable, values: Array, fine: NumberTable) -> Array
     return result
 
 
-def coarse_by_fine(coarse: NumberTable, fine: NumberTable) -> Array:
+def coarse_by_fine(coarse: ParameterTable, fine: ParameterTable) -> Array:
     """Return derivatives of coarse coordinates by fine ones with equal curves ``(coarse, fine)``.
 
     Subdivided increments grow together.
@@ -239,7 +239,7 @@ def _load_exponents(elements: Elements, degree: int) -> IntArray:
     return exponents
 
 
-def _inertia(actuators: Sequence[Actuator], areas: Sequence[float], exponents: IntArray) -> list[GreyNumber]:
+def _inertia(actuators: Sequence[Actuator], areas: Sequence[float], exponents: IntArray) -> list[GreyParameter]:
     """Coefficients of the root of the inertia, row by row."""
     numbers = []
     for a, actuator in enumerate(actuators):
@@ -250,13 +250,13 @@ def _inertia(actuators: Sequence[Actuator], areas: Sequence[float], exponents: I
                 # 10 t on the diagonal of a cylinder: a start for where nothing is measured.
                 start = 0.1 * size if a == c and b == 0 else 0.0
                 label = f"inertia_root_{actuator.name}_{actuators[c].name}_{_power(exponent)}"
-                numbers.append(GreyNumber("load", label, unit, 1e3, start, 0.05 * size, False))
+                numbers.append(GreyParameter("load", label, unit, 1e3, start, 0.05 * size, False))
     return numbers
 
 
 def _potential(
     actuators: Sequence[Actuator], areas: Sequence[float], travels: Sequence[Travel], exponents: IntArray
-) -> list[GreyNumber]:
+) -> list[GreyParameter]:
     """Return the coefficients of the potential without the constant one."""
     # Work of a motor's oil over half of its angle, where a cylinder has 30 kJ.
     sizes = [
@@ -264,7 +264,7 @@ def _potential(
         for one, area, travel in zip(actuators, areas, travels, strict=True)
     ]
     return [
-        GreyNumber(
+        GreyParameter(
             "load", f"potential_{_power(exponent)}", "J", MEGA, 0.0,
             0.03 * max(size for size, power in zip(sizes, exponent, strict=True) if power), False,
         )
@@ -272,7 +272,7 @@ def _potential(
     ]  # fmt: skip
 
 
-def _fixed(number: GreyNumber, value: float) -> GreyNumber:
+def _fixed(number: GreyParameter, value: float) -> GreyParameter:
     """Return the parameter fixed at a value."""
     return replace(number, nominal=value, width=0.0, positive=False)
 

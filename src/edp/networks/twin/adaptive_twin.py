@@ -10,7 +10,8 @@ covariance::
     x = a x,  P = a^2 P + (1 - a^2) prior,                 a = exp(-learn_ticks / forgetting)
 
 which is a Kalman filter on numbers that fade to what they were. Forces that no number stands for, as those of soil, are
-estimated tick by tick (`LoadEstimate`). A forecast runs from the observer's state with the numbers and forces of now.
+estimated tick by tick (`DisturbanceObserver`). A forecast runs from the observer's state with the numbers and forces of
+now.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from numpy.typing import NDArray
 
 from edp.errors import ConfigError
 from edp.networks.twin.base import Twin, TwinState
+from edp.networks.twin.disturbance_observer import DisturbanceObserver
 from edp.networks.twin.greybox import GreyTwin
-from edp.networks.twin.load import LoadEstimate
 from edp.registry import Registry
 from edp.settings.bounds import above, check_bounds, integer, span
 from edp.wording import typed
@@ -141,7 +142,7 @@ def group_matrix(twin: GreyTwin, groups: Sequence[str]) -> tuple[tuple[str, ...]
     return tuple(labels), np.stack(columns, axis=1), np.array(deviations), np.array(warmth)
 
 
-class TunedTwin:
+class AdaptiveTwin:
     """A grey box that follows one machine, tick by tick.
 
     Args:
@@ -195,7 +196,7 @@ class TunedTwin:
 
     def _renew(self, forces: Doubles) -> None:
         self._runner = self._with(self.logs).runner()
-        self._load = LoadEstimate(self._runner, self._speeds, self.spec.load_share)
+        self._load = DisturbanceObserver(self._runner, self._speeds, self.spec.load_share)
         self._runner.resistance = forces.copy()
 
     def _with(self, logs: Doubles) -> GreyTwin:

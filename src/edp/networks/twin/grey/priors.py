@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.elements import Actuator, MotorElement
 from edp.wording import typed
 
@@ -42,7 +42,7 @@ def opening_knots(stretches: int) -> Array:
 
 
 @dataclass(frozen=True)
-class GreyNumber:
+class GreyParameter:
     """One number of a grey box.
 
     Attributes:
@@ -98,8 +98,8 @@ def load_size(actuator: Actuator, area: float) -> float:
     return area / PLAUSIBLE_AREAS[0] if isinstance(actuator, MotorElement) else 1.0
 
 
-def cylinder_numbers(name: str, travel: Travel, areas: tuple[float, float], declared: bool) -> list[GreyNumber]:
-    """Return the parameters of a cylinder in the order of `layout`; `declared`: its areas are given."""
+def cylinder_numbers(name: str, travel: Travel, areas: tuple[float, float], declared: bool) -> list[GreyParameter]:
+    """Return the parameters of a cylinder in the order of `parameter_index`; `declared`: its areas are given."""
     head, rod = areas
     length = travel.high - travel.low
     hard = 30.0 * head  # MN at the pressure of a main relief
@@ -123,15 +123,15 @@ def cylinder_numbers(name: str, travel: Travel, areas: tuple[float, float], decl
         ("bristle_stiffness", "N/m", MEGA, 15.0 * head / 0.015, 1.0),
         ("bristle_damping", "N s/m", MEGA, 0.1 * head / 0.015, 1.0),
     ]
-    numbers = [GreyNumber(name, label, unit, factor, start, width) for label, unit, factor, start, width in rows]
-    numbers.append(GreyNumber(name, "stop_closed", "m", 1.0, travel.low + 0.4 * play, play, False))
-    numbers.append(GreyNumber(name, "stop_open", "m", 1.0, travel.high - 0.4 * play, play, False))
-    numbers.append(GreyNumber(name, "stop_stiffness", "N/m", MEGA, 100.0 * head / 0.015, 0.7))
-    numbers.append(GreyNumber(name, "friction_asymmetry", "N", MEGA, 0.0, 0.005 * hard, False))
+    numbers = [GreyParameter(name, label, unit, factor, start, width) for label, unit, factor, start, width in rows]
+    numbers.append(GreyParameter(name, "stop_closed", "m", 1.0, travel.low + 0.4 * play, play, False))
+    numbers.append(GreyParameter(name, "stop_open", "m", 1.0, travel.high - 0.4 * play, play, False))
+    numbers.append(GreyParameter(name, "stop_stiffness", "N/m", MEGA, 100.0 * head / 0.015, 0.7))
+    numbers.append(GreyParameter(name, "friction_asymmetry", "N", MEGA, 0.0, 0.005 * hard, False))
     return numbers
 
 
-def motor_numbers(name: str, travel: Travel, areas: tuple[float, float], declared: bool) -> list[GreyNumber]:
+def motor_numbers(name: str, travel: Travel, areas: tuple[float, float], declared: bool) -> list[GreyParameter]:
     """Return the parameters of a motor in the order of a cylinder's.
 
     Speed-dependent where a cylinder's depend on stroke.
@@ -162,14 +162,15 @@ def motor_numbers(name: str, travel: Travel, areas: tuple[float, float], declare
         ("stop_stiffness", "N m/rad", MEGA, 0.0, 0.0),
     ]
     numbers = [
-        GreyNumber(name, label, unit, factor, start, width, width > 0.0) for label, unit, factor, start, width in rows
+        GreyParameter(name, label, unit, factor, start, width, width > 0.0)
+        for label, unit, factor, start, width in rows
     ]
     numbers[at.ROD_AREA] = replace(numbers[at.ROD_AREA], leader=at.ROD_AREA - at.HEAD_AREA)
-    numbers.append(GreyNumber(name, "friction_asymmetry", "N m", MEGA, 0.0, 0.005 * hard, False))
+    numbers.append(GreyParameter(name, "friction_asymmetry", "N m", MEGA, 0.0, 0.005 * hard, False))
     return numbers
 
 
-def pump_numbers(name: str, flow: float, highest: float) -> list[GreyNumber]:
+def pump_numbers(name: str, flow: float, highest: float) -> list[GreyParameter]:
     """Numbers of a pump, from a plausible flow (m^3/s) and the highest pressure of its line (MPa)."""
     rows = [
         ("full_flow", "m^3/s", 1.0, flow, 0.5),
@@ -180,10 +181,10 @@ def pump_numbers(name: str, flow: float, highest: float) -> list[GreyNumber]:
         ("open_centre_closed_at", "1", 1.0, 0.35, 0.4),
         ("relief", "Pa", MEGA, max(highest / 1.1 * 0.96, 1.0), 0.1),
     ]
-    return [GreyNumber(name, label, unit, factor, start, width) for label, unit, factor, start, width in rows]
+    return [GreyParameter(name, label, unit, factor, start, width) for label, unit, factor, start, width in rows]
 
 
-def circuit_numbers(highest: float, flow: float) -> list[GreyNumber]:
+def circuit_numbers(highest: float, flow: float) -> list[GreyParameter]:
     """Return the parameters common to all elements, from the highest pressure (MPa) and total pump flow (m^3/s)."""
     rows = [
         ("bulk_modulus", "Pa", MEGA, 1400.0, 0.3),
@@ -198,7 +199,7 @@ def circuit_numbers(highest: float, flow: float) -> list[GreyNumber]:
         ("demand_start", "1", 1.0, 0.1, 0.3),
         ("demand_span", "1", 1.0, 0.75, 0.2),
     ]
-    return [GreyNumber("circuit", label, unit, factor, start, width) for label, unit, factor, start, width in rows]
+    return [GreyParameter("circuit", label, unit, factor, start, width) for label, unit, factor, start, width in rows]
 
 
 def valve_numbers(
@@ -209,10 +210,10 @@ def valve_numbers(
     places: IntArray,
     first: int,
     knots: Array,
-) -> list[GreyNumber]:
+) -> list[GreyParameter]:
     """Return the parameters of a spool with opening curves between `knots`; `places` is filled in."""
     rows = [("dead_time", "s", 0.04, 0.5), ("pilot_lag", "s", 0.025, 0.5), ("spool_lag", "s", 0.02, 0.5)]
-    numbers = [GreyNumber(name, label, unit, 1.0, start, width) for label, unit, start, width in rows]
+    numbers = [GreyParameter(name, label, unit, 1.0, start, width) for label, unit, start, width in rows]
     places[at.DELAY : at.BAND] = first + np.arange(3)
     linear, square = START_CURVE
     curve = np.diff(knots * (linear + square * knots))
@@ -220,20 +221,20 @@ def valve_numbers(
     for d, way in enumerate(("extend", "retract")):
         into, out = (areas[0], areas[1]) if d == 0 else (areas[1], areas[0])
         places[at.BAND + d], places[at.GAIN + d] = first + len(numbers), first + len(numbers) + 1
-        numbers.append(GreyNumber(name, f"dead_band_{way}", "1", 1.0, 0.12, 0.4))
-        numbers.append(GreyNumber(name, f"pump_demand_{way}", "1", 1.0, 0.9, 0.5))
+        numbers.append(GreyParameter(name, f"dead_band_{way}", "1", 1.0, 0.12, 0.4))
+        numbers.append(GreyParameter(name, f"pump_demand_{way}", "1", 1.0, 0.9, 0.5))
         fed = [("into", at.INTO, into * travel.fastest / np.sqrt(2.0))]
         if meter_out:
             fed.append(("out_of", at.OUT_OF, out * travel.fastest / np.sqrt(1.5)))
         for label, column, area in fed:
             places[column + d] = first + len(numbers)
             numbers += [
-                GreyNumber(
+                GreyParameter(
                     name, f"{label}_{way}_{typed(100 * knots[k + 1], 6)}", "m^3/s/Pa^0.5", 1e-3, area * step, 1.0
                 )
                 for k, step in enumerate(curve)
             ]
         if meter_out and regeneration:
             places[at.REGENERATION + d] = first + len(numbers)
-            numbers.append(GreyNumber(name, f"regeneration_{way}", "1", 1.0, 0.1, 2.0))
+            numbers.append(GreyParameter(name, f"regeneration_{way}", "1", 1.0, 0.1, 2.0))
     return numbers
