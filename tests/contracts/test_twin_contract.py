@@ -70,8 +70,18 @@ def test_options_of_a_formulation_are_frozen_and_survive_json(name):
 
 
 def test_every_file_of_a_formulation_registers_it():
-    shared = {"__init__", "base", "intervals", "kinds", "lowering", "plant", "recurrent_cell", "scales", "steps"}
-    shared |= {"recurrent_members", "forecast", "load", "tuned", "tuned_correction"}
+    shared = {
+        "__init__",
+        "base",
+        "intervals",
+        "model_selection",
+        "lowering",
+        "plant",
+        "recurrent_cell",
+        "scales",
+        "steps",
+    }
+    shared |= {"recurrent_members", "forecast", "disturbance_observer", "adaptive_twin", "adaptive_correction"}
     files = {path.stem for path in Path(edp.networks.twin.__path__[0]).glob("*.py")} - shared
     assert files == {TWINS[name].__module__.rpartition(".")[2] for name in TWINS}
 
