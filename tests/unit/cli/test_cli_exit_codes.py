@@ -82,7 +82,7 @@ def free_runs(ratios, judged):
 def adapted(*ratios):
     """Replayed recordings whose error with adaptation is 1, and `ratios` without."""
     changes = {f"r{i}": 1.0 / ratio - 1.0 for i, ratio in enumerate(ratios)}
-    return {"change": sum(changes.values()) / len(changes), "change_by_recording": changes}
+    return SimpleNamespace(change=sum(changes.values()) / len(changes), change_by_recording=changes)
 
 
 class Methods:

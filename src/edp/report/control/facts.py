@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from edp.control.run_file import ControlFile
 from edp.errors import count_of
 from edp.recording import Recording
 from edp.report.animation.page import Scene
 from edp.table import Column, Table, Value, figures
 from edp.wording import MISSING, number
+
+if TYPE_CHECKING:
+    from edp.control.run_file import ControlFile
 
 
 @dataclass(frozen=True, eq=False)

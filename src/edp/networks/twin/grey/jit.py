@@ -13,7 +13,8 @@ compiler = Compiler(
     lambda: (
         _FOLDER / "parameter_index.py",
         _FOLDER / "equations.py",
-        *sorted((_FOLDER.parent / "symbolic").glob("*.py")),
+        _FOLDER.parent / "symbolic" / "expression.py",
+        _FOLDER.parent / "symbolic" / "machine_code.py",
         _FOLDER.parent / "steps.py",
         *files_with(_FOLDER, "from edp.networks.twin.grey.jit import"),
     ),
