@@ -177,7 +177,7 @@ def newton(program: GreyProgram, machine: MachineArrays, work: RunValues, tolera
     return ITERATIONS
 
 
-@inner
+@inlined
 def _add_rows(program: GreyProgram, group: int, work: RunValues, target: Array, sign: float) -> None:
     """Add derivatives times the tangents of their variables to the tangents of the results."""
     first, begin, end = program.groups[group]
@@ -189,7 +189,7 @@ def _add_rows(program: GreyProgram, group: int, work: RunValues, target: Array, 
                 target[row, k] += slope * work.tangents[column, k]
 
 
-@inner
+@inlined
 def _add_numbers(program: GreyProgram, group: int, work: RunValues, target: Array, sign: float) -> None:
     """Add derivatives by parameters, each of which is a column."""
     first, begin, end = program.groups[group]
@@ -198,7 +198,7 @@ def _add_numbers(program: GreyProgram, group: int, work: RunValues, target: Arra
         target[row, column] += sign * work.out[first + e - begin]
 
 
-@inner
+@inlined
 def _add_own(program: GreyProgram, group: int, state: int, work: RunValues, target: Array, sign: float) -> None:
     """Add derivatives by a state of each valve, whose tangents are by its own parameters."""
     first, begin, end = program.groups[group]
@@ -219,7 +219,7 @@ def _goal_slope(machine: MachineArrays, program: GreyProgram, history: Array, j:
     return float((history[whole + 1, j] - history[whole, j]) / machine.tick_s)
 
 
-@inner
+@inlined
 def advance_valves(
     program: GreyProgram, machine: MachineArrays, work: RunValues, history: Array, length: float, by_numbers: bool
 ) -> None:
@@ -251,7 +251,7 @@ def advance_valves(
     copy(frame[first : first + states], out)
 
 
-@inner
+@inlined
 def move_pumps(program: GreyProgram, machine: MachineArrays, work: RunValues, length: float, columns_by: int) -> None:
     """Move the displacements of all pumps on by `length` seconds, with their tangents."""
     first, count = program.frame.displacements, program.sizes[2]
@@ -268,7 +268,7 @@ def move_pumps(program: GreyProgram, machine: MachineArrays, work: RunValues, le
     copy(work.frame[first : first + count], work.out)
 
 
-@inner
+@inlined
 def move_bristles(program: GreyProgram, machine: MachineArrays, work: RunValues, columns_by: int) -> None:
     """Compute the deflections after a stage from those of its base, with their tangents."""
     (n, _, _, nodes, _), frame = program.sizes, program.frame
@@ -286,7 +286,7 @@ def move_bristles(program: GreyProgram, machine: MachineArrays, work: RunValues,
         _add_numbers(program, code.BRISTLE_NUMBERS, work, work.tangents[frame.bristles :], 1.0)
 
 
-@inner
+@inlined
 def fill_contents(
     program: GreyProgram, machine: MachineArrays, work: RunValues, contents: Array, tangents: Array, columns_by: int
 ) -> None:
@@ -321,7 +321,7 @@ def stage_tangents(program: GreyProgram, machine: MachineArrays, work: RunValues
     solve(by_y, solved)
 
 
-@inner
+@inlined
 def _extrapolate(base: Array, reached: Array) -> None:
     """Move the tangents of a base along the line to those of the first stage, to the base of the second."""
     for row in range(len(base)):
@@ -329,7 +329,7 @@ def _extrapolate(base: Array, reached: Array) -> None:
             base[row, k] += AHEAD * (reached[row, k] - base[row, k])
 
 
-@inner
+@inlined
 def freeze(program: GreyProgram, machine: MachineArrays, work: RunValues, length: float, columns_by: int) -> None:
     """Compute the strokes in the middle of a step of `length` seconds, and the load there."""
     (n, _, _, nodes, _), frame, values = program.sizes, program.frame, work.frame
