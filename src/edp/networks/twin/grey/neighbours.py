@@ -26,6 +26,7 @@ from edp.networks.twin.grey.tick import (
     RunValues,
     copy,
     factorise,
+    fill_contents,
     freeze,
     newton,
     solve,
@@ -53,6 +54,7 @@ class NearRuns(NamedTuple):
         pilots: in the middle of each step, shape (run, tick, step, valve).
         steps: of Newton's method, shape (unknown, run - 1).
         out: results of functions.
+        slopes: of the contents of the first run by its pressures, shape (node,).
         matrix: factorised, shape (unknown, unknown).
     """
 
@@ -64,6 +66,7 @@ class NearRuns(NamedTuple):
     pilots: Array
     steps: Array
     out: Array
+    slopes: Array
     matrix: Array
 
 
@@ -140,22 +143,11 @@ def _set_valves(program: GreyProgram, values: Array, state: int, positions: Arra
 
 
 @inner
-def _contents(
-    program: GreyProgram, machine: MachineArrays, values: Array, y: Array, out: Array, contents: Array
-) -> None:
-    """Compute contents of the nodes and velocities from unknowns."""
-    nodes = program.sizes[3]
-    copy(values[: len(y)], y)
-    call(program.addresses[code.CONTENTS], machine.parameters, machine.constants, values, out)
-    copy(contents[:nodes], out)
-    copy(contents[nodes:], y[nodes:])
-
-
-@inner
 def _begin_step(program: GreyProgram, machine: MachineArrays, runs: NearRuns, work: RunValues, length: float) -> None:
     """Prepare a step of all runs: frozen load, contents, deflections and displacements."""
     (n, _, pumps, nodes, _), frame = program.sizes, program.frame
-    size, base = nodes + n, frame.base
+    fill_contents(program, machine, work, work.frame[frame.base : frame.bristle_base], work.tangents, at.NONE)
+    copy(runs.slopes, work.out[nodes : 2 * nodes])
     for run in range(len(runs.frames)):
         values = runs.frames[run]
         if not runs.branched[run]:
@@ -164,12 +156,23 @@ def _begin_step(program: GreyProgram, machine: MachineArrays, runs: NearRuns, wo
             copy(values[frame.frozen : frame.frozen + n], work.frame[frame.frozen : frame.frozen + n])
             copy(values[frame.mass : frame.joints], work.frame[frame.mass : frame.joints])
             copy(values[frame.speeds : frame.speeds + n], runs.unknowns[run, nodes:])
-        _contents(program, machine, values, runs.unknowns[run], runs.out, values[base : base + size])
+            copy(values[frame.unknowns : frame.base], runs.unknowns[run])
+            _add_contents(runs, run, work.frame[frame.base : frame.bristle_base], values[frame.base :], 0.0)
         copy(values[frame.bristle_base : frame.bristle_base + n], values[frame.bristles : frame.bristles + n])
         values[frame.length] = length
         call(program.addresses[code.PUMPS], machine.parameters, machine.constants, values, runs.out)
         copy(values[frame.displacements : frame.displacements + pumps], runs.out)
         values[frame.step] = GAMMA * length
+
+
+@inlined
+def _add_contents(runs: NearRuns, run: int, first: Array, contents: Array, keep: float) -> None:
+    """Set contents to a part of their own and the rest of those of the first run, to first order."""
+    size, nodes = runs.unknowns.shape[1], len(runs.slopes)
+    for k in range(size):
+        apart = runs.unknowns[run, k] - runs.unknowns[0, k]
+        reached = first[k] + (runs.slopes[k] * apart if k < nodes else apart)
+        contents[k] = keep * contents[k] + (1.0 - keep) * reached
 
 
 @inner
@@ -203,23 +206,30 @@ def _stage(program: GreyProgram, machine: MachineArrays, runs: NearRuns, work: R
 
 @inner
 def _end_stage(program: GreyProgram, machine: MachineArrays, runs: NearRuns, work: RunValues, first: bool) -> None:
-    """Move deflections, and after the first stage the bases of the second."""
-    (n, _, _, nodes, _), frame = program.sizes, program.frame
-    size = nodes + n
-    for run in range(len(runs.frames)):
-        values = runs.frames[run]
+    """Move deflections, and after the first stage the bases of the second; those of other runs to first order."""
+    (n, _, _, nodes, _), frame, own = program.sizes, program.frame, work.frame
+    call(program.addresses[code.BRISTLES], machine.parameters, machine.constants, own, runs.out)
+    for run in range(1, len(runs.frames)):
         if not runs.branched[run]:
             continue
-        copy(values[:size], runs.unknowns[run])
-        call(program.addresses[code.BRISTLES], machine.parameters, machine.constants, values, runs.out)
-        copy(values[frame.bristles : frame.bristles + n], runs.out)
-        if first:
-            _contents(program, machine, values, runs.unknowns[run], runs.out, work.contents)
-            for k in range(size):
-                values[frame.base + k] += AHEAD * (work.contents[k] - values[frame.base + k])
-            for i in range(n):
-                before = values[frame.bristle_base + i]
-                values[frame.bristle_base + i] = before + AHEAD * (values[frame.bristles + i] - before)
+        values = runs.frames[run]
+        for i in range(n):
+            speed = runs.unknowns[run, nodes + i] - runs.unknowns[0, nodes + i]
+            before = values[frame.bristle_base + i] - own[frame.bristle_base + i]
+            values[frame.bristles + i] = runs.out[i] + runs.out[n + i] * speed + runs.out[2 * n + i] * before
+    copy(own[frame.bristles : frame.bristles + n], runs.out)
+    if not first:
+        return
+    fill_contents(program, machine, work, work.contents, work.tangents, at.NONE)
+    copy(runs.slopes, work.out[nodes : 2 * nodes])
+    for run in range(len(runs.frames)):
+        if not runs.branched[run]:
+            continue
+        values = runs.frames[run]
+        _add_contents(runs, run, work.contents, values[frame.base :], 1.0 - AHEAD)
+        for i in range(n):
+            before = values[frame.bristle_base + i]
+            values[frame.bristle_base + i] = before + AHEAD * (values[frame.bristles + i] - before)
 
 
 @inner
@@ -339,6 +349,7 @@ def _near_runs(program: GreyProgram, count: int, ticks: int, steps: int) -> Near
         np.empty((count, ticks, steps, valves)),
         np.zeros((size, count - 1)),
         np.zeros(program.results),
+        np.zeros(program.sizes[3]),
         np.zeros((size, size)),
     )
 
