@@ -219,7 +219,7 @@ def _goal_slope(machine: MachineArrays, program: GreyProgram, history: Array, j:
     return float((history[whole + 1, j] - history[whole, j]) / machine.tick_s)
 
 
-@inlined
+@inner
 def advance_valves(
     program: GreyProgram, machine: MachineArrays, work: RunValues, history: Array, length: float, by_numbers: bool
 ) -> None:
@@ -251,7 +251,7 @@ def advance_valves(
     copy(frame[first : first + states], out)
 
 
-@inlined
+@inner
 def move_pumps(program: GreyProgram, machine: MachineArrays, work: RunValues, length: float, columns_by: int) -> None:
     """Move the displacements of all pumps on by `length` seconds, with their tangents."""
     first, count = program.frame.displacements, program.sizes[2]
@@ -268,7 +268,7 @@ def move_pumps(program: GreyProgram, machine: MachineArrays, work: RunValues, le
     copy(work.frame[first : first + count], work.out)
 
 
-@inlined
+@inner
 def move_bristles(program: GreyProgram, machine: MachineArrays, work: RunValues, columns_by: int) -> None:
     """Compute the deflections after a stage from those of its base, with their tangents."""
     (n, _, _, nodes, _), frame = program.sizes, program.frame
@@ -286,7 +286,7 @@ def move_bristles(program: GreyProgram, machine: MachineArrays, work: RunValues,
         _add_numbers(program, code.BRISTLE_NUMBERS, work, work.tangents[frame.bristles :], 1.0)
 
 
-@inlined
+@inner
 def fill_contents(
     program: GreyProgram, machine: MachineArrays, work: RunValues, contents: Array, tangents: Array, columns_by: int
 ) -> None:
@@ -329,7 +329,7 @@ def _extrapolate(base: Array, reached: Array) -> None:
             base[row, k] += AHEAD * (reached[row, k] - base[row, k])
 
 
-@inlined
+@inner
 def freeze(program: GreyProgram, machine: MachineArrays, work: RunValues, length: float, columns_by: int) -> None:
     """Compute the strokes in the middle of a step of `length` seconds, and the load there."""
     (n, _, _, nodes, _), frame, values = program.sizes, program.frame, work.frame
