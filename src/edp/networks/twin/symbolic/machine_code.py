@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,8 @@ from edp.networks.twin.symbolic.expression import Expression, ExpressionGraph
 from edp.storage import write_bytes
 
 DOUBLE, INDEX, VOID = ir.DoubleType(), ir.IntType(64), ir.VoidType()
+CHECK = 16
+"""Bytes of the checksum before machine code in a file: LLVM trusts what it loads."""
 OPERATORS = {"+": "fadd", "-": "fsub", "*": "fmul", "/": "fdiv"}
 
 
@@ -99,8 +101,7 @@ class CodeModule:
 def digest_of(*parts: object) -> str:
     """Return the name of machine code in a cache: what it is made of, processor and version of LLVM."""
     state = hashlib.blake2b(digest_size=16)
-    features = binding.get_host_cpu_features().flatten()
-    for part in (*parts, binding.get_host_cpu_name(), features, binding.llvm_version_info):
+    for part in (*parts, binding.get_host_cpu_name(), _features(), binding.llvm_version_info):
         state.update(repr(part).encode() + b"\0")
     return state.hexdigest()
 
@@ -114,26 +115,37 @@ def load(code: bytes, names: Sequence[str]) -> Loaded:
     return Loaded({name: engine.get_function_address(name) for name in names}, engine)
 
 
-def read_or_make(file: Path | None, make: Any) -> bytes:
-    """Return machine code from a file; where there is none, make it and keep it there if possible."""
+def read_or_make(file: Path | None, make: Callable[[], bytes]) -> bytes:
+    """Return machine code from a file; where there is none, or a damaged one, make it and keep it there if possible."""
     if file is not None:
         with contextlib.suppress(OSError):
-            return file.read_bytes()
-    code: bytes = make()
+            content = file.read_bytes()
+            if content[:CHECK] == _check(content[CHECK:]):
+                return content[CHECK:]
+    code = make()
     if file is not None:
         with contextlib.suppress(OSError, StorageError):
-            write_bytes(file, code)
+            write_bytes(file, _check(code) + code)
     return code
+
+
+def _check(code: bytes) -> bytes:
+    return hashlib.blake2b(code, digest_size=CHECK).digest()
 
 
 def _target_machine() -> Any:
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
-    target = binding.Target.from_default_triple()
-    features = binding.get_host_cpu_features().flatten()
-    return target.create_target_machine(
-        opt=2, cpu=binding.get_host_cpu_name(), features=features, reloc="pic", codemodel="jitdefault", jit=True
+    return binding.Target.from_default_triple().create_target_machine(
+        opt=2, cpu=binding.get_host_cpu_name(), features=_features(), reloc="pic", codemodel="jitdefault", jit=True
     )
+
+
+def _features() -> str:
+    try:
+        return str(binding.get_host_cpu_features().flatten())
+    except RuntimeError:  # LLVM does not know them for every processor
+        return ""
 
 
 def _call(typing: Any, address: Any, parameters: Any, constants: Any, inputs: Any, results: Any) -> Any:
