@@ -42,6 +42,24 @@ BETWEEN = GAMMA / (1.0 - GAMMA)
 """Where the first stage of a step over two samples lies between the two stages of the first of them."""
 
 
+class NearPlan(NamedTuple):
+    """Commands of runs that branch off a first one.
+
+    Attributes:
+        demands: of the valves, shape (run, tick, valve).
+        measured: what the ports read at the first sample, in units of the grey box, NaN where one is free, shape
+            (output,).
+        first: sample at which each run branches off the first one, shape (run,).
+        single: number of samples that have steps of their own; behind them a step may go over two, and what is answered
+            between these lies on their velocities' line.
+    """
+
+    demands: Array
+    measured: Array
+    first: IntArray
+    single: int
+
+
 class NearRuns(NamedTuple):
     """Runs near a first one; arrays whose first dimension is the run hold it, too.
 
@@ -359,27 +377,23 @@ def run_near(
     program: GreyProgram,
     machine: MachineArrays,
     bounds: OutputBounds,
-    plan: tuple[Array, Array, IntArray, int],
+    plan: NearPlan,
     state: tuple[Array, ...],
     resistance: Array,
     answers: Array,
 ) -> None:
     """Simulate one machine in free run from the measured state, and neighbouring runs to first order.
 
-    From sample `single` on, a step may go over two samples: what is answered between them lies on their velocities'
-    line.
-
     Args:
         program: of the form.
         machine: its parameters.
         bounds: of the outputs.
-        plan: commands of the valves, shape (run, tick, valve); what the ports read at the first sample, in units of the
-            grey box, NaN where one is free; tick at which each run branches off the first one; `single`.
+        plan: what is simulated.
         state: of the machine: unknowns, strokes, bristles, displacements, valves and history; moved by the first run.
         resistance: forces against each actuator that the load does not know of, MN, shape (actuator,).
         answers: written, SI units, shape (run, tick, output).
     """
-    demands, measured, first, single = plan
+    demands, first = plan.demands, plan.first
     y, s, z, d, valves, history = state
     (n, count, pumps, nodes, _), frame, ports = program.sizes, program.frame, machine.ports
     runs, ticks = _near_runs(program, len(demands), demands.shape[1], machine.steps), demands.shape[1]
@@ -389,12 +403,12 @@ def run_near(
         work.rows_before,
     )  # fmt: skip
     for j in range(count):
-        copy(runs.frames[0, frame.valves + at.VALVE_STATES * j : frame.goals], valves[j])
+        first_state = frame.valves + at.VALVE_STATES * j
+        copy(runs.frames[0, first_state : first_state + at.VALVE_STATES], valves[j])
     follow_commands(program, machine, runs, demands, history, first)
     for j in range(count):
-        for k in range(at.VALVE_STATES):
-            valves[j, k] = runs.frames[0, frame.valves + at.VALVE_STATES * j + k]
-    feed(ports, measured, y, s)
+        copy(valves[j], runs.frames[0, frame.valves + at.VALVE_STATES * j : frame.goals])
+    feed(ports, plan.measured, y, s)
     own = runs.frames[0]
     copy(runs.unknowns[0], y)
     copy(own[frame.strokes : frame.strokes + n], s)
@@ -403,7 +417,7 @@ def run_near(
     runs.branched[0] = True
     before, at_stages, t = np.empty((len(demands), 2 * n)), np.empty((len(demands), 2, count)), 0
     while t < ticks:
-        double = t >= single and t + 1 < ticks
+        double = t >= plan.single and t + 1 < ticks
         _branch(program, runs, first, t, t + (2 if double else 1))
         for run in range(len(demands)):
             if not runs.branched[run]:

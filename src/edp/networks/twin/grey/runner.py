@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from edp.networks.twin.base import TwinRunner, TwinState
 from edp.networks.twin.grey.correction import OutputBounds
-from edp.networks.twin.grey.neighbours import run_near
+from edp.networks.twin.grey.neighbours import NearPlan, run_near
 from edp.networks.twin.scales import Array
 
 if TYPE_CHECKING:
@@ -74,6 +74,6 @@ class GreyRunner(TwinRunner):
         resistance = np.ascontiguousarray(1e-6 * forces[self._speeds])
         row = measured / self._units
         singles = ticks if single is None or not self._double else max(1, single)
-        plan = self._grey.demands(commands), row, first, singles
+        plan = NearPlan(self._grey.demands(commands), row, first, singles)
         run_near(self._program, self._machine, self._bounds, plan, now, resistance, answers)
         return answers, now
