@@ -3,7 +3,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from edp.data.augment import AUGMENTATIONS, Jitter, TimeWarp
@@ -45,6 +45,8 @@ CASES = st.tuples(
 @pytest.mark.long
 @settings(max_examples=40, deadline=None)
 @given(case=CASES)
+@example(case=([300], 5, 2, 40, [0], 0))  # a burn-in of eight chunks
+@example(case=([900, 120], 5, 3, 110, [3], 1))
 def test_chunks_give_each_sample_one_loss_but_for_the_burn_in_at_the_start(case):
     samples, length, lanes, burn_in, horizons, epoch = case
     parts = [series(i, n) for i, n in enumerate(samples)]

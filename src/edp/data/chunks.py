@@ -172,8 +172,10 @@ class ChunkSampler:
         """
         length, lanes = self.spec.length, self.spec.batch
         total = sum(part.samples for part in self.series)
-        # At least a few chunks per piece, so that burn-in stays a small share; at most an even share of a lane.
-        piece = (self.spec.carried or max(8, -(-total // (lanes * length * 4)))) * length
+        # At least a few chunks per piece, and twice the burn-in: a piece that is no longer than it would never end.
+        least = max(8, -(-2 * self.spec.burn_in // length))
+        # At most an even share of a lane.
+        piece = (self.spec.carried or max(least, -(-total // (lanes * length * 4)))) * length
         pieces = list(self._pieces(rng, piece))
         while self.spec.carried and len(pieces) < lanes:  # Short data are walked again, cut elsewhere.
             pieces += self._pieces(rng, piece)
