@@ -104,8 +104,8 @@ def test_what_nodes_hold_gives_their_pressure_back(network_of):
 
 
 def test_constants_are_those_of_the_kernel():
-    assert (hydraulics.NONE, hydraulics.AHEAD) == (NONE, tick.AHEAD)
-    assert (hydraulics.BEYOND, hydraulics.ROOT["abstolStep"]) == (linkage.BEYOND, tick.TOLERANCE)
+    assert (hydraulics.MISSING, hydraulics.STAGE_RATIO) == (NONE, tick.STAGE_RATIO)
+    assert (hydraulics.EXTRAPOLATION, hydraulics.NEWTON["abstolStep"]) == (linkage.BEYOND, tick.TOLERANCE)
 
 
 def test_it_needs_no_edp_and_has_no_c(network_of):

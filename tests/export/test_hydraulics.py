@@ -152,7 +152,7 @@ def test_constants_are_those_of_the_kernel():
     assert math.exp(-(defined.pop("NEGLIGIBLE") ** 2)) < np.finfo(float).eps
     theirs = dict.fromkeys(("ATMOSPHERE", "LEAST_ABSOLUTE"), parameter_index)
     theirs |= dict.fromkeys(("SMOOTH2", "CHECK", "IDLE", "GAMMA"), equations)
-    theirs |= dict.fromkeys(("TOLERANCE", "LARGEST", "AHEAD"), tick)
+    theirs |= dict.fromkeys(("TOLERANCE", "LARGEST", "STAGE_RATIO"), tick)
     assert defined == pytest.approx({name: getattr(room, name) for name, room in theirs.items()}, rel=1e-15)
     assert f"#define EDP_MOST_ITERATIONS {tick.ITERATIONS}u" in HEADER
     assert f"#define EDP_NONE {NONE}u" in HEADER

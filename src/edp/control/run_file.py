@@ -10,18 +10,18 @@ from edp.control.score import LoopScore
 from edp.settings.bounds import check_count
 from edp.settings.results import ResultFile
 
-MOST_LOOPS = 100_000
+MAX_LOOPS = 100_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class ControlSummary:
-    """Scores over all loops: means, and the worst of the two errors of the tip.
+    """Mean scores over all loops, and the worst position and path error of the tip.
 
     Attributes:
-        energy_kj: None if the plant does not report the power of its pumps.
-        violations: number of samples at which a limit was violated.
-        missed: number of samples at which the controller had no answer.
-        solve_us_median: median time of a step of the controller, µs.
+        energy_kj: pump energy, or None if the plant does not report the power of its pumps.
+        violations: number of samples with a violated limit.
+        missed: number of samples without a solution of the controller.
+        solve_us_median: median computing time per controller step, µs.
     """
 
     position_rms_mm: float
@@ -38,7 +38,7 @@ class ControlSummary:
 
 @dataclass(frozen=True, kw_only=True)
 class StepTimes:
-    """Times of a step of the controller, µs."""
+    """Computing times per controller step, µs."""
 
     median: float
     p99: float
@@ -50,13 +50,13 @@ class LoopEntry:
     """One closed loop.
 
     Attributes:
-        name: of its recording.
-        seed: of the task and the plant.
-        seconds: duration of the reference.
-        score: over the judged samples.
-        solve_us: times of a step of the controller.
-        events: events that the controller logged.
-        warnings: events that the guard logged.
+        name: name of the recording.
+        seed: seed of the task and the plant.
+        seconds: duration of the reference, s.
+        score: score over the evaluated samples.
+        solve_us: computing times per controller step.
+        events: events logged by the controller.
+        warnings: events logged by the guard.
     """
 
     name: str
@@ -102,4 +102,4 @@ class ControlFile(ResultFile):
     loops: tuple[LoopEntry, ...]
 
     def __post_init__(self) -> None:
-        check_count("results of closed loops", "loops", self.loops, MOST_LOOPS)
+        check_count("results of closed loops", "loops", self.loops, MAX_LOOPS)

@@ -10,7 +10,7 @@ from edp.settings.results import ResultFile
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayTarget:
-    """Name of a target, and the unit of its errors."""
+    """Name of a target and unit of its errors."""
 
     name: str
     unit: str
@@ -18,14 +18,14 @@ class ReplayTarget:
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayErrors:
-    """Mean absolute errors within a span of the time in motion, one per target, report units.
+    """Mean absolute errors per target within an interval of the time in motion, in report units.
 
     Attributes:
-        horizon: in samples.
-        from_s: begin of the span, s.
-        to_s: end of the span, s; None for the end of the recordings.
-        base: of the network alone.
-        adapted: of the network with its adaptation.
+        horizon: prediction horizon, samples.
+        from_s: start of the interval, s.
+        to_s: end of the interval, s, or None for the end of the recordings.
+        base: errors of the network without adaptation.
+        adapted: errors of the network with adaptation.
     """
 
     horizon: int
@@ -41,12 +41,12 @@ class AdaptationFile(ResultFile):
 
     Attributes:
         recordings: names of the recordings.
-        targets: of the network.
+        targets: targets of the network.
         mae: errors by horizon and time in motion.
-        change: relative change of the error by the adaptation, geometric mean over horizons and targets.
-        change_by_recording: the same for each recording.
-        fallback: fraction of samples at which the adaptation was taken back.
-        taught: number of samples from which the adaptation learned.
+        change: relative change of the error through adaptation, geometric mean over horizons and targets.
+        change_by_recording: relative change of the error for each recording.
+        fallback: fraction of samples at which the adaptation was switched off.
+        taught: number of samples used by the adaptation.
     """
 
     NAME = "adaptation.json"

@@ -169,7 +169,7 @@ class GreyProblem:
         rest = twin.rest(drawn.demands[:, 0], (drawn.measured[:, 0] * twin.units).astype(np.float32))
         state = (np.ascontiguousarray(values, dtype=np.float64) for values in (drawn.measured[:, 0], *rest))
         batch = RunBatch(drawn.demands, drawn.measured, *state)
-        normal = twin.judge(numbers, batch, drawn.target, full)
+        normal = twin.evaluate_runs(numbers, batch, drawn.target, full)
         matrix, gradient = normal.matrix, normal.gradient
         if full and self.tie is not None:
             slopes = self.tie.slopes(theta)

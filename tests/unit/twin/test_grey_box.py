@@ -71,7 +71,7 @@ def errors(twin, numbers, series, starts, full, ticks=8):
     state = (measured[:, 0].copy(), *(np.ascontiguousarray(part, dtype=np.float64) for part in rest))
     weight = twin.units / twin.scales.answer_width.astype(np.float64)
     target = RunTarget(np.ascontiguousarray(values[:, 1:]), weight, 1e9, PREFIX)
-    normal = twin.judge(numbers, RunBatch(demands, measured, *state), target, full)
+    normal = twin.evaluate_runs(numbers, RunBatch(demands, measured, *state), target, full)
     return normal.matrix, normal.gradient, normal.losses
 
 
@@ -262,12 +262,23 @@ def test_monomials_are_sorted_by_degree():
         )
 
 
-@pytest.mark.parametrize("cylinders", [12, 40, 2000])
-def test_a_load_of_too_many_numbers_is_refused_before_they_are_made(cylinders):
-    """A file of a few kilobytes may ask for it; seven to the power of its cylinders were counted through before."""
-    elements = Elements((), tuple(CylinderElement(name=f"c{i}", velocity=f"v{i}") for i in range(cylinders)), ())
-    with pytest.raises(ConfigError, match=rf"load of {cylinders} cylinders .* numbers; at most 5,000 must hold: lower"):
-        number_table(elements, [Travel(0.0, 1.0, 1.0, (1.0, 1.0))] * cylinders, [], (2, 6))
+def elements_of(cylinders, valves=0):
+    actuators = tuple(CylinderElement(name=f"c{i}", velocity=f"v{i}") for i in range(cylinders))
+    spools = tuple(ValveElement(name=f"x{i}", actuator="c0", extend="lever") for i in range(valves))
+    return Elements((), actuators, spools)
+
+
+def test_a_load_of_too_many_parameters_is_refused():
+    with pytest.raises(ConfigError, match=r"load of 12 cylinders .* numbers; at most 5,000 must hold: lower"):
+        number_table(elements_of(12), [Travel(0.0, 1.0, 1.0, (1.0, 1.0))] * 12, [], (2, 6))
+
+
+@pytest.mark.parametrize(("cylinders", "valves"), [(13, 0), (40, 3), (2000, 0), (1, 49)])
+def test_too_many_elements_are_refused_before_their_parameters_are_made(cylinders, valves):
+    """A file of a few kilobytes may ask for them; their equations would take minutes and gigabytes to compile."""
+    message = rf"got {cylinders:,} cylinders and motors and {valves} valves, expected at most 12 and 48; leave channels"
+    with pytest.raises(ConfigError, match=message):
+        number_table(elements_of(cylinders, valves), [Travel(0.0, 1.0, 1.0, (1.0, 1.0))] * cylinders, [], (0, 1))
 
 
 def test_elements_of_a_settings_file_come_back(tmp_path):

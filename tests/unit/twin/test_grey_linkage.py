@@ -110,7 +110,7 @@ def errors(twin, numbers, series, starts, full, ticks=8):
     state = (measured[:, 0].copy(), *(np.ascontiguousarray(part, dtype=np.float64) for part in rest))
     weight = twin.units / twin.scales.answer_width.astype(np.float64)
     target = RunTarget(np.ascontiguousarray(values[:, 1:]), weight, 1e9, PREFIX)
-    normal = twin.judge(numbers, RunBatch(demands, measured, *state), target, full)
+    normal = twin.evaluate_runs(numbers, RunBatch(demands, measured, *state), target, full)
     return normal.matrix, normal.gradient, normal.losses
 
 

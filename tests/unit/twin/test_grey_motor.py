@@ -78,7 +78,7 @@ def loss(twin, numbers, commands, truth, columns):
     state = (measured[:, 0].copy(), *(np.ascontiguousarray(part, dtype=np.float64) for part in rest))
     weight = twin.units / twin.scales.answer_width.astype(np.float64)
     target = RunTarget(np.ascontiguousarray(values[:, 1:]), weight, 1e9, PREFIX)
-    normal = twin.judge(numbers, RunBatch(demands, measured, *state), target, columns > 0)
+    normal = twin.evaluate_runs(numbers, RunBatch(demands, measured, *state), target, columns > 0)
     return normal.losses.sum(), normal.gradient
 
 

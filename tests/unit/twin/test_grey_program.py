@@ -26,14 +26,15 @@ def polynomials():
 def functions(twin, seed=0):
     """Parameters, inputs of a plausible state, and a call of each function."""
     program, rng = twin.program, np.random.default_rng(seed)
-    (n, valves, _, nodes, _), frame = program.sizes, program.frame
+    sizes = program.sizes
+    n, valves, nodes, frame = sizes.actuators, sizes.valves, sizes.nodes, program.frame
     table = twin.table
     drawn = rng.normal(0.0, 0.1, len(table.nominal))
     numbers = np.where(table.positive, table.nominal * np.exp(drawn), table.nominal + table.width * drawn)
     machine, inputs = twin.machine(numbers), rng.uniform(0.1, 0.9, frame.size)
     inputs[:nodes], inputs[nodes : nodes + n] = rng.uniform(2.0, 20.0, nodes), rng.uniform(-0.3, 0.3, n)
     inputs[frame.bristle_base : frame.bristle_base + n] = rng.uniform(-1e-4, 1e-4, n)
-    inputs[frame.valves : frame.goals] = rng.uniform(-0.8, 0.8, valves * at.VALVE_STATES)
+    inputs[frame.valves : frame.delayed_commands] = rng.uniform(-0.8, 0.8, valves * at.VALVE_STATES)
     inputs[frame.step], inputs[frame.half], inputs[frame.length] = 0.003, 0.0015, 0.004
 
     def call(which, numbers=numbers, inputs=inputs):
@@ -67,9 +68,9 @@ def check_group(twin, group, which, variables):
 @pytest.mark.parametrize(
     ("group", "which"),
     [
-        (code.CONTENT_NUMBERS, code.CONTENTS),
-        (code.BRISTLE_NUMBERS, code.BRISTLES),
-        (code.PUMP_NUMBERS, code.PUMPS),
+        (code.CONTENT_PARAMETERS, code.CONTENTS),
+        (code.BRISTLE_PARAMETERS, code.BRISTLES),
+        (code.PUMP_PARAMETERS, code.PUMPS),
     ],
 )
 def test_derivatives_by_parameters_are_those_of_differences(twin, group, which):
@@ -77,24 +78,24 @@ def test_derivatives_by_parameters_are_those_of_differences(twin, group, which):
 
 
 def test_derivatives_of_valves_and_pumps_by_states_are_those_of_differences(twin):
-    frame, states = twin.program.frame, twin.program.sizes[1] * at.VALVE_STATES
+    frame, states = twin.program.frame, twin.program.sizes.valves * at.VALVE_STATES
     check_group(twin, code.VALVE_STATES, code.VALVES, lambda column: ("inputs", frame.valves + column))
     check_group(twin, code.PUMP_FRAME, code.PUMPS, lambda column: ("inputs", column))
     pilots = frame.valves + at.PILOT_2
     check_group(twin, code.PUMP_PILOTS, code.PUMPS, lambda j: ("inputs", pilots + at.VALVE_STATES * j))
-    assert frame.goals - frame.valves == states
+    assert frame.delayed_commands - frame.valves == states
 
 
 def test_a_step_of_newton_solves_the_linear_equations_of_residual_and_matrix(twin):
     _, _, call = functions(twin)
-    size = twin.program.sizes[3] + twin.program.sizes[0]
+    size = twin.program.sizes.nodes + twin.program.sizes.actuators
     matrix = call(code.MATRIX)[: size * size].reshape(size, size)
     np.testing.assert_allclose(matrix @ call(code.NEWTON)[:size], call(code.RESIDUAL)[:size], rtol=1e-9, atol=1e-12)
 
 
 def test_the_matrix_is_that_of_differences(twin):
     _, inputs, call = functions(twin)
-    size = twin.program.sizes[3] + twin.program.sizes[0]
+    size = twin.program.sizes.nodes + twin.program.sizes.actuators
     matrix = call(code.MATRIX)[: size * size].reshape(size, size)
     for k in range(size):
         step = 1e-6 * np.eye(len(inputs))[k]
@@ -105,7 +106,7 @@ def test_the_matrix_is_that_of_differences(twin):
 def test_forces_of_a_polynomial_load_are_those_of_lagrange(polynomials):
     """Coriolis forces by differences of the inertia: c_i = sum (dM_ij/ds_k - dM_jk/ds_i / 2) v_j v_k."""
     _, inputs, call = functions(polynomials)
-    n, frame = polynomials.program.sizes[0], polynomials.program.frame
+    n, frame = polynomials.program.sizes.actuators, polynomials.program.frame
     strokes, speeds = inputs[frame.frozen : frame.frozen + n].copy(), inputs[frame.speeds : frame.speeds + n].copy()
 
     def load(strokes, speeds):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from edp.networks.twin.symbolic.expression import FUNCTIONS, ExpressionGraph
-from edp.networks.twin.symbolic.machine_code import CodeModule, digest_of, load, read_or_make
+from edp.networks.twin.symbolic.machine_code import CodeModule, digest_of, load, read_or_compile
 
 
 def compiled(graph, inputs, results):
@@ -100,14 +100,14 @@ def test_comparisons_with_what_is_no_number_take_the_second_branch():
 
 def test_machine_code_is_kept_and_named_by_what_it_is_made_of(tmp_path):
     file, made = tmp_path / "code.o", []
-    assert read_or_make(file, lambda: made.append(1) or b"code") == b"code"
-    assert read_or_make(file, lambda: made.append(1) or b"other") == b"code"
+    assert read_or_compile(file, lambda: made.append(1) or b"code") == b"code"
+    assert read_or_compile(file, lambda: made.append(1) or b"other") == b"code"
     assert made == [1]
     whole = file.read_bytes()
     for damaged in (b"", whole[:-1], whole[:8] + b"x" + whole[9:], whole + b"x"):
         file.write_bytes(damaged)
-        assert read_or_make(file, lambda: b"code") == b"code"
+        assert read_or_compile(file, lambda: b"code") == b"code"
         assert file.read_bytes() == whole
-    assert read_or_make(None, lambda: b"other") == b"other"
-    assert read_or_make(tmp_path / "none" / "code.o", lambda: b"other") == b"other"
+    assert read_or_compile(None, lambda: b"other") == b"other"
+    assert read_or_compile(tmp_path / "none" / "code.o", lambda: b"other") == b"other"
     assert digest_of((1, 2), "a") == digest_of((1, 2), "a") != digest_of((1, 2), "b")

@@ -1,7 +1,7 @@
-"""One tick of a grey box for CasADi: pumps, valves, cylinders, motors and their load. Needs NumPy and CasADi.
+"""One sample of a grey box for CasADi: pumps, valves, cylinders, motors and their load. Needs NumPy and CasADi.
 
-Each implicit stage is the root of its residual, which CasADi's Newton method finds; derivatives of any order follow
-from the implicit function theorem. A stage whose root is not found answers NaN. Units are m, s, MPa, MN and Gg.
+Newton's method of CasADi solves each implicit stage; derivatives of any order follow from the implicit function
+theorem. A stage without convergence gives NaN. Units are m, s, MPa, MN and Gg.
 """
 
 from __future__ import annotations
@@ -14,22 +14,21 @@ import casadi as ca
 import numpy as np
 
 from edp.networks.twin.grey import parameter_index as at
-from edp.networks.twin.grey.equations import GAMMA, Equations, GreyForm, Stage
+from edp.networks.twin.grey.equations import GAMMA, MISSING, Equations, GreyForm, Stage
 
-NONE = 65535
-"""Entry of a table of places: there is no such thing."""
-AHEAD = (1.0 - GAMMA) / GAMMA
-BEYOND = 1.0
-ROOT = {"abstolStep": 1e-9, "max_iter": 60, "error_on_fail": False}
-"""Of Newton's method: far below the rounding of single precision, in MPa and m/s."""
-LEFT = 1e-6
-"""Of a residual that is taken for a root, in MPa and Gg m/s."""
-DAMPED, LEAST_SHARE = 40, 0.125
-"""Steps of a second search, and the least share of one that is taken."""
+STAGE_RATIO = (1.0 - GAMMA) / GAMMA
+EXTRAPOLATION = 1.0
+"""Maximum extrapolation of a joint angle, in widths of the last knot interval."""
+NEWTON = {"abstolStep": 1e-9, "max_iter": 60, "error_on_fail": False}
+"""Settings of Newton's method; the tolerance (MPa, m/s) is far below the rounding of single precision."""
+MAX_RESIDUAL = 1e-6
+"""Maximum residual of a solution, MPa and Gg m/s."""
+DAMPED_STEPS, MIN_DAMPING = 40, 0.125
+"""Number of damped Newton steps, and the smallest damping factor."""
 
 
 class CasadiAlgebra:
-    """Operations of `Equations` on symbols of CasADi and on numbers."""
+    """Algebra of `Equations` on CasADi symbols and on floats."""
 
     def __init__(self) -> None:
         self.sqrt, self.exp, self.tanh, self.sin, self.cos = ca.sqrt, ca.exp, ca.tanh, ca.sin, ca.cos
@@ -41,17 +40,17 @@ class CasadiAlgebra:
         return ca.if_else(a < b, then, otherwise)
 
     def derivatives(self, results: Any, variables: Any) -> list[list[Any]]:
-        """Return the derivatives of results by variables, a row for each result."""
+        """Return the Jacobian as nested lists, one row per result."""
         slopes = ca.jacobian(ca.vertcat(*results), ca.vertcat(*variables))
         return [[slopes[row, column] for column in range(len(variables))] for row in range(len(results))]
 
 
 class HydraulicMachine:
-    """Constants of one machine, and the functions that make up a time step.
+    """Grey box of one machine as CasADi functions.
 
     Args:
-        layer: what the layer is besides its arrays.
-        w: its arrays by name.
+        layer: options of the layer, from the exported description.
+        w: arrays of the layer by name.
     """
 
     def __init__(self, layer: dict[str, Any], w: Mapping[str, np.ndarray]) -> None:
@@ -61,7 +60,7 @@ class HydraulicMachine:
         self.tick_s, self.steps, self.remembered = layer["tick_s"], layer["steps"], layer["remembered"]
         linkage = self.w["linkage"] if len(self.w["linkage"]) > 1 else np.zeros(at.JOINTS)
         self.joints = linkage[at.JOINTS :].reshape(-1, at.JOINT_VALUES)
-        form = self._form(layer["load"], layer["circuit"])
+        form = GreyForm.from_arrays(self.w, self.w["linkage"], layer["circuit"], layer["load"])
         self.n, self.valves, self.pumps = form.actuators, form.valves, form.pumps
         self.nodes, self.unknown = form.nodes, form.unknowns
         constants = [*self.w["middle"].tolist(), *self.w["scale"].tolist(), *linkage[: at.JOINTS].tolist()]
@@ -73,51 +72,30 @@ class HydraulicMachine:
         self.load = self._load_function()
         self.advance = [self._advance_function(length) for length in (GAMMA * step, step - GAMMA * step)]
         self.displaced = self._displaced_function(step)
-        self.root, self.left = self._stage(GAMMA * step)
+        self.root, self.residual = self._stage(GAMMA * step)
         self.bristles = self._bristle_function(GAMMA * step)
-
-    def _form(self, load: tuple[int, int, int], circuit_at: int) -> GreyForm:
-        def signed(name: str) -> Any:
-            return np.where(self.at[name] == NONE, -1, self.at[name]).tolist()
-
-        inertia_at, inertia_terms, potential_at = load
-        return GreyForm(
-            valve_at=tuple(map(tuple, signed("valve_at"))),
-            valve_actuator=tuple(signed("valve_actuator")),
-            valve_pump=tuple(signed("valve_pump")),
-            actuator_at=tuple(signed("actuator_at")),
-            pump_at=tuple(first for first in signed("pump_at") if first >= 0),
-            circuit_at=circuit_at,
-            inertia_at=inertia_at,
-            inertia_terms=inertia_terms,
-            potential_at=potential_at,
-            exponents=tuple(map(tuple, self.at["exponents"].tolist())),
-            joint_actuators=tuple(self.joints[:, at.ACTUATOR].astype(int).tolist()),
-            knots=tuple(self.w["knots"].tolist()),
-            parameters=len(self.w["numbers"]),
-        )
 
     def demands(self, commands: Any) -> Any:
         """Return the signed commands of the valves as fractions of full scale, extension positive."""
         parts = []
         for j, (extend, retract) in enumerate(self.at["sides"]):
-            signed = commands[int(extend)] - (commands[int(retract)] if retract != NONE else 0.0)
+            signed = commands[int(extend)] - (commands[int(retract)] if retract != MISSING else 0.0)
             share = signed / float(self.w["full"][j])
-            # Limits would swallow what is no number.
+            # fmin and fmax would replace NaN by a limit.
             parts.append(ca.if_else(ca.fabs(share) < math.inf, ca.fmin(ca.fmax(share, -1.0), 1.0), math.nan))
         return ca.vertcat(*parts)
 
     def _advance_function(self, step: float) -> ca.Function:
-        """Dead time, two lags of the pilot, play, two lags of the spool: states of the valves, a column each."""
+        """Return the function that advances dead time, pilot lags, play and spool lags; one column per valve."""
         rows, history = ca.SX.sym("rows", at.VALVE_STATES, self.valves), ca.SX.sym("h", self.valves, self.remembered)
         columns = []
         for j, places in enumerate(self.equations.form.valve_at):
             ticks = self.equations.q[places[at.DELAY]] / self.tick_s
             ticks = min(max(ticks, 0.0), history.shape[1] - 2.0)
             whole = min(int(ticks), history.shape[1] - 2)
-            goal = history[j, whole] + (ticks - whole) * (history[j, whole + 1] - history[j, whole])
-            state = ca.vertsplit(rows[:, j])
-            columns.append(ca.vertcat(*self.equations.advance_valve(state, goal, self.equations.remains(j, step))))
+            command = history[j, whole] + (ticks - whole) * (history[j, whole + 1] - history[j, whole])
+            state, factors = ca.vertsplit(rows[:, j]), self.equations.lag_factors(j, step)
+            columns.append(ca.vertcat(*self.equations.advance_valve(state, command, factors)))
         return ca.Function("advance", [rows, history], [ca.horzcat(*columns)])
 
     def _displaced_function(self, step: float) -> ca.Function:
@@ -129,7 +107,7 @@ class HydraulicMachine:
         return ca.Function("displaced", [d, rows, p], [ca.vertcat(*after) if after else ca.SX(0, 1)])
 
     def _load_function(self) -> ca.Function:
-        """Inertia, and forces of gravity and of turning."""
+        """Return the function for the inertia matrix and the gravity and velocity-product forces."""
         s, v = ca.SX.sym("s", self.n), ca.SX.sym("v", self.n)
         strokes = ca.vertsplit(s)
         joints = [
@@ -141,18 +119,19 @@ class HydraulicMachine:
         return ca.Function("load", [s, v], [ca.vertcat(*rows), ca.vertcat(*forces)])
 
     def contents(self, y: Any) -> Any:
-        """Oil of all nodes, see `Equations.contents`, and the velocities themselves."""
+        """Return the oil contents of all nodes, see `Equations.contents`, followed by the velocities."""
         p = y[: self.nodes]
         return ca.vertcat(p - self.air / (p + at.ATMOSPHERE), y[self.nodes :])
 
     def pressures(self, content: Any) -> Any:
-        """Return the pressures at which the nodes hold the given oil, and the velocities: the inverse of `contents`.
+        """Return pressures and velocities from oil contents and velocities: the inverse of `contents`.
 
-        Above a vacuum, whatever is content; a stage is solved for what is content, since it is nearly linear in that.
+        Every content gives a pressure above vacuum. The unknowns of a stage are contents, because its residual is
+        nearly linear in them.
         """
         least = content[: self.nodes] + at.ATMOSPHERE
         root = ca.sqrt(least * least + 4.0 * self.air)
-        # Each half is free of cancellation on its side.
+        # Each formula avoids cancellation on its side of zero.
         absolute = ca.if_else(least > 0.0, 0.5 * (root + least), 2.0 * self.air / (root - ca.fmin(least, 0.0)))
         return ca.vertcat(absolute - at.ATMOSPHERE, content[self.nodes :])
 
@@ -166,10 +145,10 @@ class HydraulicMachine:
         inertia = [[mass[i + n * k] for k in range(n)] for i in range(n)]
         y, filled = ca.vertsplit(self.pressures(content)), ca.vertsplit(content[: self.nodes])
         residual = ca.vertcat(*self.equations.stage(y, stage, inertia, forces, filled))
-        root = ca.rootfinder("stage", "newton", {"x": content, "p": fixed, "g": residual}, ROOT)
-        left = ca.Function("left", [content, fixed], [ca.mmax(ca.fabs(residual))])
+        root = ca.rootfinder("stage", "newton", {"x": content, "p": fixed, "g": residual}, NEWTON)
+        residual_of = ca.Function("residual", [content, fixed], [ca.mmax(ca.fabs(residual))])
         slopes = ca.Function("slopes", [content, fixed], [residual, ca.jacobian(residual, content)])
-        return patient(root, left, slopes), left
+        return damped_root_finder(root, residual_of, slopes), residual_of
 
     def _bristle_function(self, step: float) -> ca.Function:
         v, before = ca.SX.sym("v", self.n), ca.SX.sym("before", self.n)
@@ -190,7 +169,7 @@ class HydraulicMachine:
         return ca.vertcat(*of_y), ca.vertcat(*of_s)
 
     def step(self, y: Any, s: Any, z: Any, d: Any, rows: Any, history: Any) -> tuple[Any, ...]:
-        """One implicit step: two stages of an L-stable SDIRK method of order two (Alexander 1977)."""
+        """Advance one implicit step: two stages of an L-stable SDIRK method of order two (Alexander 1977)."""
         length, before = self.tick_s / self.steps, y[self.nodes :]
         frozen = s + 0.5 * length * self.moved * before
         mass, force = self.load(frozen, before)
@@ -204,11 +183,11 @@ class HydraulicMachine:
             spools = rows[at.SPOOL, :].T
             fixed = ca.vertcat(base, base_z, spools, d, frozen, ca.vec(mass), force, s + half * before, half)
             solution = self.root(content, fixed)
-            content = ca.if_else(self.left(solution, fixed) < LEFT, solution, math.nan)
+            content = ca.if_else(self.residual(solution, fixed) < MAX_RESIDUAL, solution, math.nan)
             after = self.bristles(content[self.nodes :], base_z)
             if which == 0:
-                base = base + AHEAD * (content - base)
-                base_z = z + AHEAD * (after - z)
+                base = base + STAGE_RATIO * (content - base)
+                base_z = z + STAGE_RATIO * (after - z)
         y = self.pressures(content)
         return y, s + 0.5 * length * self.moved * (before + y[self.nodes :]), after, d, rows
 
@@ -221,7 +200,7 @@ class HydraulicMachine:
         d = m["displacements"] if self.pumps else ca.MX(0, 1)
         for _ in range(self.steps):
             y, s, z, d, rows = self.step(y, s, z, d, rows, history)
-        # What a twin promises: a stroke is the trapezoidal integral of the velocities that it answers, one a tick.
+        # The stroke of every twin is the trapezoidal integral of its velocity outputs, one step per sample.
         s = start[0] + 0.5 * self.tick_s * self.moved * (start[1] + y[self.nodes :])
         m["pressures_and_velocities"], m["strokes"], m["bristles"], m["valves"], m["history"] = y, s, z, rows, history
         m["displacements"] = d if self.pumps else m["displacements"]
@@ -233,32 +212,44 @@ class HydraulicMachine:
         return ca.vertcat(*answers)
 
 
-def patient(root: ca.Function, left: ca.Function, slopes: ca.Function) -> ca.Function:
-    """Return a root finder that repeats the search with damped steps if the first search fails.
+def damped_root_finder(root: ca.Function, residual_of: ca.Function, slopes: ca.Function) -> ca.Function:
+    """Return a root finder that continues with damped Newton steps if `root` fails.
 
-    Where a check or a relief toggles no step makes every residual less; steps that go to and fro are halved instead.
-    `left` is the largest residual at a root, `slopes` gives residuals and their Jacobian.
+    Newton's method can alternate between two points if a check valve or a relief valve toggles. The damping factor is
+    halved after each step that reverses the last one, and doubled otherwise.
+
+    Args:
+        root: Newton solver ``(guess, parameters) -> contents``.
+        residual_of: largest residual, from contents and parameters.
+        slopes: residuals and their Jacobian, from contents and parameters.
     """
     guess, fixed = (ca.MX.sym(name, root.size1_in(k)) for k, name in enumerate(("guess", "fixed")))
     content, before, share = ca.MX.sym("content", guess.numel()), ca.MX.sym("before", guess.numel()), ca.MX.sym("share")
     residual, jacobian = slopes(content, fixed)
     step = -ca.solve(jacobian, residual)
     back = ca.logic_and(ca.dot(step, before) < 0.0, ca.norm_2(step) > 0.5 * ca.norm_2(before))
-    shared = ca.if_else(back, ca.fmax(0.5 * share, LEAST_SHARE), ca.fmin(2.0 * share, 1.0))
+    shared = ca.if_else(back, ca.fmax(0.5 * share, MIN_DAMPING), ca.fmin(2.0 * share, 1.0))
     one = ca.Function("one", [content, before, share, fixed], [content + shared * step, step, shared])
     state = guess, ca.MX.zeros(guess.numel()), ca.MX(1.0)
-    whole = one.mapaccum("whole", DAMPED, 3, {"base": DAMPED})(*state, fixed)
+    whole = one.mapaccum("whole", DAMPED_STEPS, 3, {"base": DAMPED_STEPS})(*state, fixed)
     names = [ca.MX.sym("solution", guess.numel()), guess, fixed]
     keep = ca.Function("keep", names, [names[0]])
     again = ca.Function("again", names, [whole[0][:, -1]])
     solution = root(guess, fixed)
-    # One branch is computed, as a rule the short one; derivatives are those of the last root, whatever it began with.
-    chosen = ca.Function.if_else("chosen", keep, again)(left(solution, fixed) < LEFT, solution, guess, fixed)
-    return ca.Function("patient", [guess, fixed], [root(chosen, fixed)])
+    # CasADi evaluates one branch only. The final call of `root` gives the derivatives, independent of its guess.
+    chosen = ca.Function.if_else("chosen", keep, again)(
+        residual_of(solution, fixed) < MAX_RESIDUAL, solution, guess, fixed
+    )
+    return ca.Function("damped_root", [guess, fixed], [root(chosen, fixed)])
 
 
 def joint_angle(stroke: Any, knots: np.ndarray) -> Any:
-    """Angle of a joint at a stroke: quintic polynomials between knots (stroke, angle, slope, curvature), then lines."""
+    """Return the angle of a joint at a stroke.
+
+    Args:
+        stroke: m; beyond the first and last knot the angle continues as a polynomial, then as a line.
+        knots: stroke, angle, slope and curvature at the knots of quintic polynomials, shape (knot, 4).
+    """
     at, angle, slope, bend = knots.T
     width, rise = np.diff(at), np.diff(angle)
     d_0, d_1, b_0, b_1 = slope[:-1] * width, slope[1:] * width, bend[:-1] * width**2, bend[1:] * width**2
@@ -271,7 +262,7 @@ def joint_angle(stroke: Any, knots: np.ndarray) -> Any:
     past = [ca.SX(1.0), *(stroke >= inner for inner in at[1:-1]), ca.SX(0.0)]
     here = ca.vertcat(*(past[k] - past[k + 1] for k in range(len(width))))
     along = (stroke - ca.dot(here, at[:-1])) / ca.dot(here, width)
-    u = ca.fmin(ca.fmax(along, -BEYOND), 1.0 + BEYOND)
+    u = ca.fmin(ca.fmax(along, -EXTRAPOLATION), 1.0 + EXTRAPOLATION)
     c = ca.DM(powers) @ here
     value, first = c[5], ca.SX(0.0)
     for power in (c[4], c[3], c[2], c[1], c[0]):

@@ -48,8 +48,8 @@ GOLDEN = ("inputs", "stream", "tolerance")
 class CasadiTarget:
     """CasADi, float32 runs: ``edp_casadi.py``, ``NAME.json`` and ``NAME.npz``, and C with ``NAME_casadi.c`` (external).
 
-    ``edp_horizon.py`` runs a horizon of the compiled C. A grey box has ``edp_hydraulics.py``, ``edp_equations.py`` and
-    ``edp_parameter_index.py`` in place of all that is C: the C code of its equations has no tangents.
+    ``edp_horizon.py`` runs a horizon of the compiled C. An export of a grey box contains ``edp_hydraulics.py``,
+    ``edp_equations.py`` and ``edp_parameter_index.py`` instead of C, because the C code of a grey box has no tangents.
     """
 
     def write(self, bundle: Bundle, name: str, folder: Path) -> list[Path]:
@@ -78,7 +78,10 @@ class CasadiTarget:
 
 
 def equation_files() -> dict[str, bytes]:
-    """Return the modules of a grey box's equations, which import one another beside each other."""
+    """Return the Python modules of the grey-box equations by file name.
+
+    The exported modules import each other from their own folder, without the `edp` package.
+    """
     grey = resources.files("edp.networks.twin.grey")
     modules = {
         "edp_hydraulics.py": resources.files("edp.export.casadi").joinpath("hydraulics.py"),
@@ -107,7 +110,7 @@ def content(described: Description) -> dict[str, object]:
 
 
 def arrays(graph: Graph) -> dict[str, np.ndarray]:
-    """Constants by layer and name, and the state after a reset."""
+    """Return the constants by layer and name, and the state after a reset."""
     tensors = {f"{layer}/{name}": values for layer, name, values in graph.tensors()}
     return tensors | {"start": start(graph)}
 
@@ -122,7 +125,7 @@ def _layer(layer: Layer) -> dict[str, object]:
 
 
 def packed(data: dict[str, np.ndarray]) -> bytes:
-    """Arrays as a file of NumPy; it holds no objects."""
+    """Return arrays as a NumPy file without pickled objects."""
     buffer = io.BytesIO()
     # Objects in a NumPy file are pickles, which execute code when read.
     np.savez(buffer, allow_pickle=False, **data)

@@ -28,29 +28,28 @@ from edp.networks.twin.grey.equations import GreyForm
 from edp.networks.twin.grey.fit_spec import GreyFitSpec
 from edp.networks.twin.grey.initial_guess import load_start
 from edp.networks.twin.grey.known_linkage import KnownLinkage, check_linkage
-from edp.networks.twin.grey.linkage import joint_actuators
 from edp.networks.twin.grey.lowering import add_layer
 from edp.networks.twin.grey.parameters import LEFT_OUT, ParameterTable, finer_values, number_table
 from edp.networks.twin.grey.priors import STRETCHES, Travel
 from edp.networks.twin.grey.program import GreyProgram, program_of
-from edp.networks.twin.grey.rollouts import FitTarget, RunBatch, judge_run, run_batch
+from edp.networks.twin.grey.rollouts import FitTarget, RunBatch, evaluate_run, run_batch
 from edp.networks.twin.grey.runner import GreyRunner
-from edp.networks.twin.grey.tick import MachineArrays
+from edp.networks.twin.grey.tick import MachineArrays, machine_arrays
 from edp.networks.twin.grey.validation import check_elements
 from edp.networks.twin.scales import FASTEST, HIGHEST, Array, TwinScales
 from edp.settings.bounds import MOST_NAMES, check_bounds, check_count, integer
 
 Doubles = NDArray[np.float64]
 POLYNOMIALS = (2, 4)
-"""Degrees of those of inertia and gravity, where settings name none."""
+"""Default degrees of the polynomials of inertia and gravity."""
 LONGEST_DELAY_S = 0.3
-"""Of a command; a fit cannot find a longer one."""
+"""Maximum dead time of a command that a fit can find, s."""
 LONGEST_STEP_S = 0.0125
-"""Of an implicit step: swings of a load of several Hz keep their damping."""
+"""Maximum length of an implicit step, s. Longer steps would damp load oscillations of several Hz."""
 ROWS = 2048
-"""Errors whose slopes by all parameters a fit holds at once."""
+"""Maximum number of rows of the Jacobian in memory during a fit."""
 REST_MPA = 2.0
-"""Where a chamber that is not measured starts in the prefix."""
+"""Initial pressure of a chamber without a sensor, MPa."""
 
 
 @TWINS.register("greybox")
@@ -59,23 +58,24 @@ class GreyBox:
     """Elements of a hydraulic machine; by default they are derived from names and kinds of the channels.
 
     Attributes:
-        cylinders: with their channels.
-        motors: with their channels.
+        cylinders: cylinders and their channels.
+        motors: motors and their channels.
         valves: spools between pumps and cylinders or motors.
-        pumps: with their lines; none: valves are fed at constant pressure.
-        inertia_degree: of the polynomials of the strokes that stand for the root of the inertia.
-        potential_degree: of the polynomial that stands for gravity.
-        linkage: machine (a name, or a machine file) whose linkage the cylinders boom, arm and bucket move: bodies stand
-            for inertia and gravity then; empty: polynomials.
-        without: what its equations leave out: `power_limit` of the pumps, `cushions` at the end stops, `play` of the
+        pumps: pumps and their pressure channels. Without pumps, valves are supplied at constant pressure.
+        inertia_degree: degree of the stroke polynomials in the triangular factor of the inertia matrix.
+        potential_degree: degree of the polynomial of the strokes that is the potential energy.
+        linkage: machine name or machine file. Rigid bodies of this linkage, moved by the cylinders boom, arm and
+            bucket, replace the polynomials. Empty for polynomials.
+        without: parts of the equations to omit: `power_limit` of the pumps, `cushions` at the end stops, `play` of the
             spools.
-        stretches: of a spool's opening curve: 5, 10 or 20; 0: free runs of the validation part choose. A bundle that
-            names none has 5.
-        prefix_ticks: measured ticks before a free run.
-        fit: how its numbers are fitted.
+        stretches: number of segments of a spool's opening curve: 5, 10 or 20. 0 selects the number by free-run
+            simulation on the validation part. A bundle without this entry has 5.
+        prefix_ticks: number of measured samples before a free-run simulation.
+        fit: settings of the fit.
 
     Raises:
-        ConfigError: a value out of range, no such part of the equations, or polynomials beside a linkage.
+        ConfigError: a value is out of range, `without` has an unknown entry, or degrees are set together with a
+            linkage.
     """
 
     cylinders: tuple[CylinderElement, ...] = ()
@@ -118,7 +118,7 @@ class GreyBox:
         """Return the connected elements.
 
         Raises:
-            ConfigError: a port that is not connected, or pressures that no element has.
+            ConfigError: a port is not connected, or a pressure channel belongs to no element.
         """
         if self.cylinders or self.motors or self.valves or self.pumps:
             elements = Elements(self.pumps, self.cylinders, self.valves, self.motors)
@@ -130,7 +130,7 @@ class GreyBox:
         return elements
 
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> GreyTwin:
-        """Return a twin with typical parameters; if everything is measured, its load balances the measured forces."""
+        """Return a twin with typical parameters. Fit the load to the measured forces if all states are measured."""
         elements = self.elements(channels)
         front = KnownLinkage.read(self.linkage, elements, channels, scales) if self.linkage else None
         table = self.table(elements, channels, scales, front)
@@ -139,13 +139,13 @@ class GreyBox:
         arrays = {"numbers": table.nominal.astype(np.float32), "full": np.array(full, np.float32)}
         arrays |= {} if front is None else front.arrays()
         twin = self.build(channels, scales, arrays | self._network(channels, seed))
-        # Both sides of a motor are the same, so that there is nothing to learn of the second one.
+        # Both sides of a motor have the same displacement: only the first one is fitted.
         declared = [isinstance(one, MotorElement) or one.areas is not None for one in elements.actuators]
         values = load_start(table, train, twin.wiring.columns, twin.wiring.z_of, channels.rate_hz, declared)
         return twin.with_numbers(values)
 
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
-        """Return the shapes of all parameters, and of the full-scale command of each valve."""
+        """Return the shapes of the parameters and of the full-scale commands of the valves."""
         elements = self.elements(channels)
         travels = [Travel(0.0, 1.0, 1.0, (1.0, 1.0))] * len(elements.actuators)
         own = KnownLinkage.SHAPES if self.linkage else {}
@@ -155,7 +155,7 @@ class GreyBox:
         return {"numbers": (len(table.numbers),), "full": (len(elements.valves),), **own}
 
     def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> GreyTwin:
-        """Build the grey box with these parameters; the machine file of a linkage is not read again."""
+        """Build the grey box with the given parameters. Does not read the machine file of a linkage again."""
         elements = self.elements(channels)
         table = self.table(elements, channels, scales, KnownLinkage.of(arrays) if self.linkage else None)
         numbers = arrays["numbers"].astype(np.float64)
@@ -168,7 +168,7 @@ class GreyBox:
         return GreyTwin(channels, scales, self, (table, wiring), numbers, arrays["full"])
 
     def _network(self, channels: TwinChannels, seed: int) -> dict[str, Array]:
-        """Return the untrained arrays of an additional network; none here."""
+        """Return the untrained arrays of an additional network: an empty dictionary for a grey box without one."""
         return {}
 
     @property
@@ -178,13 +178,13 @@ class GreyBox:
 
     @property
     def curve(self) -> int:
-        """Stretches of an opening curve; before they are chosen, and in old bundles, the fewest."""
+        """Number of segments of an opening curve: the smallest one until a number is selected, and in old bundles."""
         return self.stretches or STRETCHES[0]
 
     def table(
         self, elements: Elements, channels: TwinChannels, scales: TwinScales, front: KnownLinkage | None
     ) -> ParameterTable:
-        """Return the parameter table, with initial values from the scales of the data."""
+        """Return the parameter table with initial values from the scales of the data."""
         names = [channel.name for channel in channels.answers]
         count = len(channels.velocities)
 
@@ -201,31 +201,27 @@ class GreyBox:
         return number_table(elements, travels, pumps, self.degrees, self.without, front, self.curve)
 
 
-def _rows(places: NDArray[np.int64]) -> tuple[tuple[int, ...], ...]:
-    return tuple(map(tuple, places.tolist()))
-
-
 def _sides(valve: ValveElement, channels: TwinChannels) -> list[int]:
     names = [channel.name for channel in channels.commands]
     return [names.index(name) for name in (valve.extend, valve.retract) if name]
 
 
 def _full(commands: Array) -> float:
-    """Return the largest command; 1 for a command that never moved."""
+    """Return the largest absolute command, or 1 if all commands are zero."""
     return float(np.abs(commands).max()) or 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class RunTarget:
-    """Reference of free-run errors, in units of the grey box.
+    """Measured outputs and the loss of free-run simulations, in units of the grey box.
 
     Attributes:
-        truth: row t is the machine after the command of sample t, shape (run, tick, output).
-        weight: of the errors, shape (output,).
-        delta: where the Huber loss turns to a line, in weighted errors.
-        prefix: samples at the start whose errors do not count.
-        followed: samples of the prefix that need no load, since all of it is measured.
-        stride: samples from one that counts to the next.
+        truth: measured outputs after the command of each sample, shape (run, tick, output).
+        weight: weight of the error of each output, shape (output,).
+        delta: weighted error above which the Huber loss is linear.
+        prefix: number of samples at the start whose errors are omitted.
+        followed: number of samples of the prefix in which all states are measured, so that the load is not evaluated.
+        stride: the loss uses every `stride`-th sample.
     """
 
     truth: Doubles
@@ -238,12 +234,12 @@ class RunTarget:
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """Sums over the errors of free runs.
+    """Normal equations of a Gauss-Newton step.
 
     Attributes:
-        matrix: Gauss-Newton matrix, shape (parameter, parameter); no rows where losses alone are wanted.
-        gradient: shape (parameter,).
-        losses: of the runs, shape (run,).
+        matrix: Gauss-Newton matrix, shape (parameter, parameter). Shape (0, 0) without derivatives.
+        gradient: gradient of the sum of the losses, shape (parameter,). Shape (0,) without derivatives.
+        losses: loss of each run, shape (run,).
     """
 
     matrix: Doubles
@@ -252,9 +248,10 @@ class NormalEquations:
 
 
 class GreyTwin(Twin):
-    """Twin of a grey box; its state is ``answer`` (outputs, SI units) and the states of its elements.
+    """Twin of a grey box.
 
-    These are in the units of `edp.networks.twin.grey.parameter_index`.
+    Its state has the outputs (``answer``, SI units) and the entries `STATES`, which have the units of
+    `edp.networks.twin.grey.parameter_index`.
     """
 
     def __init__(
@@ -271,12 +268,12 @@ class GreyTwin(Twin):
         self.numbers, self.full = numbers, full
 
     def with_numbers(self, numbers: Doubles) -> GreyTwin:
-        """Return the elements with other parameters, rounded to the stored precision."""
+        """Return a twin with the given parameters, rounded to single precision as in a bundle."""
         rounded = numbers.astype(np.float32).astype(np.float64)
         return GreyTwin(self.channels, self.scales, self.spec, (self.table, self.wiring), rounded, self.full)
 
     def with_stretches(self, stretches: int) -> GreyTwin:
-        """Return the machine with subdivided opening curves; its outputs do not change."""
+        """Return a twin with the same outputs whose opening curves have more segments."""
         spec = replace(self.spec, stretches=stretches)
         if spec.curve % self.table.stretches:
             raise ValueError(f"stretches = {stretches}; a multiple of {self.table.stretches} must hold")
@@ -289,62 +286,47 @@ class GreyTwin(Twin):
 
     @property
     def units(self) -> Doubles:
-        """SI value of the unit of each output: pressures are in MPa, so that all have similar magnitudes."""
+        """Unit of each output of the equations in SI units: 1e6 Pa for pressures, else 1."""
         return np.where(self.wiring.ports[:, 0] == 2, 1e6, 1.0)
 
     @property
     def program(self) -> GreyProgram:
-        """Machine code of the equations."""
+        """Compiled equations."""
         table, wiring = self.table, self.wiring
-        joints = () if table.front is None else tuple(int(k) for k in joint_actuators(table.linkage))
-        return program_of(GreyForm(
-            valve_at=_rows(table.valve_at),
-            valve_actuator=tuple(wiring.actuator.tolist()),
-            valve_pump=tuple(wiring.pump.tolist()),
-            actuator_at=tuple(table.actuator_at.tolist()),
-            pump_at=tuple(table.pump_at.tolist()),
-            circuit_at=int(table.circuit_at),
-            inertia_at=int(table.inertia_at),
-            inertia_terms=int(table.inertia_terms),
-            potential_at=int(table.potential_at),
-            exponents=_rows(table.exponents),
-            joint_actuators=joints,
-            knots=tuple(table.knots.tolist()),
-            parameters=len(table.numbers),
-        ))  # fmt: skip
+        arrays = vars(table) | {"valve_actuator": wiring.actuator, "valve_pump": wiring.pump, "knots": table.knots}
+        load = table.inertia_at, table.inertia_terms, table.potential_at
+        return program_of(GreyForm.from_arrays(arrays, table.linkage, table.circuit_at, load))
 
     def machine(self, numbers: Doubles) -> MachineArrays:
-        """Return parameters, in place of its own, with the constants of the machine."""
-        (middle, scale), linkage = self.wiring.z_of, self.table.linkage
-        bodies = linkage[: at.JOINTS] if len(linkage) else np.zeros(at.JOINTS)
-        constants = np.concatenate([middle, scale, bodies])
-        return MachineArrays(numbers, constants, scale, linkage, self.wiring.ports, *self.time)
+        """Return the arrays of the machine for the given parameters."""
+        middle, scale = self.wiring.z_of
+        return machine_arrays(numbers, (middle, scale), self.table.linkage, self.wiring.ports, self.time)
 
     @property
     def time(self) -> tuple[float, int]:
-        """Length of a tick in seconds, and implicit steps in it."""
+        """Length of a sample in seconds, and number of implicit steps per sample."""
         tick = 1.0 / self.channels.rate_hz
         return tick, max(1, int(np.ceil(tick / LONGEST_STEP_S - 1e-9)))
 
     @property
     def sizes(self) -> tuple[int, int, int, int]:
-        """Numbers of pressures and velocities, strokes, bristles and pumps: the state on which a tick acts."""
+        """Numbers of unknowns (pressures and velocities), strokes, bristles and pumps."""
         actuators = len(self.wiring.columns)
         return self.wiring.nodes + actuators, actuators, actuators, len(self.table.pump_at)
 
     def demands(self, commands: Array) -> Doubles:
-        """Return the signed valve commands as fractions of full scale ``(batch, tick, valve)``, extension positive."""
+        """Return the valve commands as fractions of full scale, shape (batch, tick, valve). Extension is positive."""
         extend, retract = self.wiring.sides.T
         signed = commands[..., extend].astype(np.float64)
         signed -= np.where(retract >= 0, commands[..., retract], 0.0)
         return np.ascontiguousarray(np.clip(signed / self.full, -1.0, 1.0))
 
     def rest(self, demands: Doubles, measured: Array) -> tuple[Doubles, ...]:
-        """Return steady states: y, strokes, bristles, displacements, valves and history.
+        """Return steady states in the order of `STATES`.
 
         Args:
-            demands: ``(batch, valve)``.
-            measured: ``(batch, answer)``, SI units.
+            demands: valve commands, shape (batch, valve).
+            measured: outputs in SI units, shape (batch, output).
         """
         wiring, batch, n = self.wiring, len(demands), len(self.wiring.columns)
         y, strokes = np.zeros((batch, wiring.nodes + n)), np.tile(wiring.z_of[0], (batch, 1))
@@ -382,7 +364,7 @@ class GreyTwin(Twin):
         cell: Cell | None = None,
         trace: RunTrace | None = None,
     ) -> tuple[Array, TwinState]:
-        """`rollout` of checked arrays, with a cell on top; see `edp.networks.twin.grey.rollouts.run_batch`."""
+        """Simulate as `rollout` does, without checks, and with a correction cell if one is passed."""
         now = [np.array(state[name], np.float64, order="C") for name in ("answer", *STATES)]
         now[0] /= self.units
         answers = np.empty(measured.shape)
@@ -393,21 +375,21 @@ class GreyTwin(Twin):
         rounded = answers.astype(np.float32)
         return rounded, {"answer": rounded[:, -1].copy()} | after
 
-    def judge(self, numbers: Doubles, batch: RunBatch, target: RunTarget, full: bool) -> NormalEquations:
-        """Return the losses of free runs with these parameters; if `full`, with gradient and Gauss-Newton matrix.
+    def evaluate_runs(self, numbers: Doubles, batch: RunBatch, target: RunTarget, full: bool) -> NormalEquations:
+        """Return the losses of free-run simulations, with gradient and Gauss-Newton matrix if `full`.
 
         Args:
             numbers: parameters, shape (parameter,).
-            batch: of runs; moved.
-            target: what their outputs should be.
-            full: whether gradient and matrix are wanted.
+            batch: runs at their start. The states are changed in place.
+            target: measured outputs and loss.
+            full: whether to compute gradient and matrix.
         """
         runs, ticks, _ = batch.demands.shape
         size = len(numbers) if full else 0
         rows = ((ticks - target.prefix) // target.stride + 2) * len(self.wiring.ports) if full else 0
         matrix, gradient, losses = np.zeros((size, size)), np.zeros(size), np.zeros(runs)
         program, machine = self.program, self.machine(numbers)
-        # Products of many rows at once take less time than one for each run.
+        # One product of many rows takes less time than one product per run.
         together = max(1, ROWS // max(rows, 1))
         for first in range(0, runs, together):
             last = min(first + together, runs)
@@ -418,7 +400,7 @@ class GreyTwin(Twin):
                     target.truth, target.weight, target.delta, target.prefix, target.followed, target.stride,
                     errors[own], slopes[own],
                 )  # fmt: skip
-                losses[run] = judge_run(program, machine, batch, run, part)
+                losses[run] = evaluate_run(program, machine, batch, run, part)
                 if not np.isfinite(losses[run]):
                     slopes[own], errors[own] = 0.0, 0.0
             if full:

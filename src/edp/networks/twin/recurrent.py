@@ -20,7 +20,7 @@ from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinRunner, TwinState, s
 from edp.networks.twin.recurrent_cell import Bounds, TwinNetwork, buffers
 from edp.networks.twin.scales import Array, TwinScales
 from edp.networks.twin.static_map import StaticMap, StaticTwin
-from edp.networks.twin.steps import run_branches, run_forward
+from edp.networks.twin.steps import BranchResults, run_branches, run_forward
 from edp.settings.bounds import MOST_UNITS, check_bounds, integer
 
 PIECE = 256
@@ -315,7 +315,9 @@ class RecurrentRunner(TwinRunner):
         start = (np.where(np.isfinite(read), read, state["answer"][0]), state["h"][0])
         answers, h = np.empty((rows.shape[1], len(rows), count), np.float32), np.empty(units, np.float32)
         bounds = twin.bounds
-        run_branches((rows, mapped), self._weights, bounds.arrays, bounds.velocities, start, first, (answers, h))
+        run_branches(
+            (rows, mapped), self._weights, bounds.arrays, bounds.velocities, start, first, BranchResults(answers, h)
+        )
         after = {"answer": twin.scaled(answers[0, -1])[None], "h": h[None]}
         return answers, after if twin.static is None else after | {"commands": memory}
 

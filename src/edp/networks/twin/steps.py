@@ -19,6 +19,7 @@ All compiled code of a twin is in this file, whose content is the fingerprint of
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,6 +146,18 @@ def run_forward(
         _answer(fed[t], change, bounds, velocities, answers[t], free[t])
 
 
+class BranchResults(NamedTuple):
+    """Results of branches of one run.
+
+    Attributes:
+        outputs: SI units, shape (batch, sample, output); before a run branches off, the outputs of the first run.
+        last_state: h of the first run after the last sample, shape (unit,).
+    """
+
+    outputs: Array
+    last_state: Array
+
+
 @compiler.compiled
 def run_branches(
     inputs: tuple[Array, Array],
@@ -153,7 +166,7 @@ def run_branches(
     velocities: int,
     start: tuple[Array, Array],
     first: NDArray[np.int64],
-    results: tuple[Array, Array],
+    results: BranchResults,
 ) -> None:
     """Simulate branches of one run in free run; the common part before each branch is computed once.
 
@@ -167,10 +180,9 @@ def run_branches(
         velocities: number of them.
         start: what the ports read at the first tick ``(answer,)``, and h ``(units,)``, of all lanes.
         first: tick at which each lane branches off lane 0 ``(lane,)``, ascending, that of lane 0 zero.
-        results: written: answers, SI units ``(lane, time, answer)``, before a lane branches off those of lane 0; and h
-            of lane 0 after the last tick ``(units,)``.
+        results: written.
     """
-    answers, last_h = results
+    answers = results.outputs
     commands, mapped = inputs
     input_weight, bias, h_weight, inner_bias, out_weight, out_bias, pull, offset, width = weights
     ticks, lanes, commanded = commands.shape
@@ -216,7 +228,7 @@ def run_branches(
         for row in range(running, lanes):
             for j in range(count):
                 answers[row, t, j] = answers[0, t, j]
-    last_h[:] = h[0]
+    results.last_state[:] = h[0]
 
 
 @compiler.compiled

@@ -1,4 +1,4 @@
-"""Faults of the machine and of its sensors, for scenarios and environments; each kind is a row of a table."""
+"""Machine faults and sensor faults for scenarios and environments; each kind is a row of a table."""
 
 from edp.sim.faults import machine_faults as machine_faults
 from edp.sim.faults import sensor_faults as sensor_faults

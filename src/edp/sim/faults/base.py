@@ -20,7 +20,7 @@ Units = Mapping[str, float]
 AXES = ("boom", "arm", "bucket")
 SPOOLS = (*AXES, *(f"{axis}_conflux" for axis in AXES))
 CHAMBERS = tuple(f"{axis}_{side}" for side in ("head", "rod") for axis in AXES)
-"""In the order of the state of the plant and of Table A.1: heads, then rods."""
+"""Chambers in the order of the plant state and of Table A.1: head chambers, then rod chambers."""
 
 # Factors to SI units; the first unit of each is that of bounds and ladders.
 FLOW: Units = {"L/min": 1.0 / 6e4, "m^3/s": 1.0}
@@ -33,29 +33,29 @@ VELOCITY: Units = {"mm/s": 1e-3, "cm/s": 1e-2, "m/s": 1.0}
 LENGTH: Units = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 TEMPERATURE: Units = {"K": 1.0}
 NO_UNIT: Units = {}
-"""Of kinds that are there or not."""
+"""Units of kinds without a size."""
 MOST_FAULTS = 8
-"""Of one recording: each has a channel of truth, whose names are fixed (`edp.signals.FAULT_CHANNELS`)."""
+"""Maximum number of faults per recording. Each fault has one of the channels `edp.signals.FAULT_CHANNELS`."""
 MOST_SECONDS = 1e7
-"""Of an onset, a ramp or a pause: more than any recording lasts."""
+"""Maximum onset, ramp and period, s. No recording is longer."""
 LEAST_SECONDS = 0.05
-"""Of the time on and off of an intermittent fault: loose contacts are faster, and are dropouts."""
+"""Minimum active and inactive time of an intermittent fault, s. The kind `dropout` describes faster loose contacts."""
 
 
 @dataclass(eq=False)
 class MachineNumbers:
-    """Numbers of a plant that a fault may change.
+    """Plant parameters that a fault may change.
 
     Attributes:
-        machine: the parameter set that they were packed from.
-        rate_hz: ticks per second.
+        machine: parameter set from which the arrays were packed.
+        rate_hz: sample rate.
         half_steps_s: half of a coarse and of a fine integration step, s.
-        axes: of the cylinders, shape (3, AXIS_VALUES).
-        plant: of the rest, shape (PLANT_VALUES,).
-        delays: dead time of each spool in ticks, shape (6,).
-        coarse: transitions of pilots and spools over half a coarse step, shape (6, 2, 4).
-        fine: the same over half a fine step.
-        soil: of bucket and soil; zeros in free air.
+        axes: parameters of the cylinders, shape (3, AXIS_VALUES).
+        plant: other parameters, shape (PLANT_VALUES,).
+        delays: dead time of each spool in samples, shape (6,).
+        coarse: transition matrices of pilots and spools over half a coarse step, shape (6, 2, 4).
+        fine: transition matrices of pilots and spools over half a fine step, shape (6, 2, 4).
+        soil: parameters of bucket and soil; zeros in free air.
     """
 
     machine: Machine
@@ -70,7 +70,7 @@ class MachineNumbers:
 
     @property
     def arrays(self) -> tuple[Array, ...]:
-        """Changeable arrays, in the order of `edp.sim.faults.course.BLOCKS`."""
+        """Arrays that faults change, in the order of `edp.sim.faults.course.BLOCKS`."""
         return self.axes, self.plant, self.delays, self.coarse, self.fine, self.soil
 
     def copy(self) -> MachineNumbers:
@@ -81,18 +81,19 @@ class MachineNumbers:
 
 @dataclass(frozen=True, kw_only=True)
 class FaultKind:
-    """One kind of fault; instances are entered in `FAULTS`.
+    """Kind of fault. Instances are registered in `FAULTS`.
 
     Attributes:
-        text: what is wrong, for tables and messages.
-        part: what a mechanic would look at; ``{site}``, ``{axis}``, ``{side}`` and ``{pair}`` are words of a site.
-        words: how a fault is reported, with these, ``{size}`` and, for either sign, ``{high}`` or ``{large}``.
+        text: description for tables and messages.
+        part: faulty component. ``{site}``, ``{axis}``, ``{side}`` and ``{pair}`` are replaced by words of the site.
+        words: text of a report, with the placeholders of `part`, ``{size}``, and ``{high}`` or ``{large}``, which
+            depend on the sign.
         grave: whether a load may fall or a movement may not stop.
-        sites: where it can sit; empty where a machine has one such part only.
-        units: units of the size with their factors to SI; empty where it is there or not.
+        sites: possible sites; empty if a machine has only one such component.
+        units: units of the size with their factors to SI units; empty for kinds without a size.
         ladder: sizes from hardly visible to gross, in the first unit.
-        bound: of the size, in the first unit.
-        neutral: the size that is no fault, in the first unit.
+        bound: range of the size, in the first unit.
+        neutral: size without effect, in the first unit.
     """
 
     text: str
@@ -125,9 +126,9 @@ class MachineFault(FaultKind):
     """Machine fault, which changes plant parameters.
 
     Attributes:
-        change: applies the fault to the parameters of a machine, in place. Its arguments are the parameters of a sound
-            machine, or of one with other faults; one of `sites`; and the size in SI units, `neutral` for no fault.
-        delays_commands: whether the size is a dead time that is added to the commands: room that a plant must have.
+        change: function that applies the fault to plant parameters in place. Its arguments are the parameters, which
+            may have other faults already, one of `sites`, and the size in SI units (`neutral` for no fault).
+        delays_commands: whether the size is an additional dead time of commands, for which the plant needs room.
     """
 
     change: Callable[[MachineNumbers, str, float], None]
@@ -136,12 +137,12 @@ class MachineFault(FaultKind):
 
 @dataclass(frozen=True, kw_only=True)
 class SensorFault(FaultKind):
-    """Sensor fault: one observed value per sample changes, or two are swapped.
+    """Sensor fault, which changes one observed value per sample or swaps two.
 
     Attributes:
-        operation: what happens, one of `edp.sim.sensors.alterations`.
-        channels: affected values by site, as indices of `edp.sim.sensors.chain.SENSED`; for noise, columns of its
-            draws. The site is empty for kinds without sites.
+        operation: operation on the value, one of `edp.sim.sensors.alterations`.
+        channels: affected channels by site, as indices of `edp.sim.sensors.chain.SENSED`; for noise, columns of the
+            random numbers. The site is empty for kinds without sites.
     """
 
     operation: int
@@ -157,16 +158,16 @@ class FaultSpec:
 
     Attributes:
         kind: name in `FAULTS`.
-        site: where it sits; empty for kinds without sites.
-        size: how large it is in `unit`; None for kinds that are there or not.
-        unit: of the size.
-        onset_s: when it begins, s from the start of the recording.
-        ramp_s: time in which it grows from nothing to its size, s.
-        on_s: an intermittent fault is there for so long, s; 0 for one that stays.
-        off_s: and then away for so long, s.
+        site: one of the kind's sites; empty for kinds without sites.
+        size: size in `unit`; None for kinds without a size.
+        unit: one of the kind's units.
+        onset_s: time from the start of the recording to the start of the fault, s.
+        ramp_s: time in which the fault grows to its size, s.
+        on_s: active time per period of an intermittent fault, s; 0 for a permanent fault.
+        off_s: inactive time per period of an intermittent fault, s.
 
     Raises:
-        ConfigError: an unknown kind, site or unit (the closest is offered), or a number out of its bounds.
+        ConfigError: the kind, site or unit is unknown, or a value is out of range.
     """
 
     kind: str
@@ -202,7 +203,7 @@ class FaultSpec:
 
     @property
     def full(self) -> float:
-        """The size in SI units; 1 for kinds that are there or not."""
+        """Size in SI units; 1 for kinds without a size."""
         kind = FAULTS[self.kind]
         return 1.0 if self.size is None else float(self.size) * kind.units[self.unit]
 
@@ -260,13 +261,13 @@ def _check_size(what: str, kind: FaultKind, size: float | None, unit: str) -> No
 def ladder(
     kinds: Iterable[str] | None = None, everywhere: bool = False, onset_s: float = 0.0, ramp_s: float = 0.0
 ) -> Iterator[FaultSpec]:
-    """Faults of every size of every kind, the smallest of each kind first.
+    """Return faults of every kind in every size of its ladder, in ascending order of size.
 
     Args:
         kinds: names in `FAULTS`; all by default.
-        everywhere: at each site of a kind; only at the first one by default.
-        onset_s: when all begin, s.
-        ramp_s: time in which they grow, s; kinds that are there or not do not grow.
+        everywhere: whether to use every site of a kind instead of the first one.
+        onset_s: start of all faults, s.
+        ramp_s: time in which faults grow, s. Kinds without a size have no ramp.
     """
     for name in FAULTS if kinds is None else kinds:
         kind = FAULTS[name]

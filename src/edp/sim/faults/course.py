@@ -1,4 +1,4 @@
-"""Time course of faults: the present fraction of each, and the effect on plant and observations."""
+"""Time course of faults: fraction of full size at each sample, and effect on plant and observations."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from edp.sim.sensors import alterations
 
 Array = NDArray[np.float64]
 STEPS = 1024
-"""A ramp rises in so many steps: a plant's numbers change at so many ticks of it, however long it is."""
+"""Maximum number of parameter changes during one ramp."""
 BLOCKS = ("axes", "plant", "delays", "coarse", "fine", "soil")
 """Arrays of `MachineNumbers` in order."""
 CHANGE = 4
-"""Numbers of a change: tick, which of `BLOCKS`, place in it, value."""
+"""Number of values per change: sample, index in `BLOCKS`, position in the block, new value."""
 
 
 def shares_at(faults: Sequence[FaultSpec], ticks: NDArray[np.int64], rate_hz: float) -> Array:
-    """How much of each fault is there, 0 to 1, shape (time, fault).
+    """Return the fraction of full size of each fault, 0 to 1, shape (time, fault).
 
-    A fault begins at the first tick that is not before its onset. An intermittent one goes on with its ramp while it is
-    away.
+    A fault begins at the first sample at or after its onset. The ramp of an intermittent fault continues during its
+    inactive time.
     """
     shares = np.zeros((len(ticks), len(faults)))
     for n, fault in enumerate(faults):
@@ -53,7 +53,7 @@ def of_machine(faults: Sequence[FaultSpec]) -> tuple[FaultSpec, ...]:
 
 
 def spare_s(faults: Sequence[FaultSpec]) -> float:
-    """Dead time that faults may add, s: room that a plant must have for past commands."""
+    """Return the additional dead time of commands with all faults, s."""
     pairs = [(fault, FAULTS[fault.kind]) for fault in faults]
     return sum(fault.full for fault, kind in pairs if isinstance(kind, MachineFault) and kind.delays_commands)
 
@@ -71,8 +71,8 @@ class MachineCourse:
     """Parameters of one plant under faults; a function of the sample index only.
 
     Args:
-        faults: those of the scenario; faults of sensors are left out.
-        sound: the numbers of the plant before its first tick; they are copied.
+        faults: faults of the scenario. Sensor faults are ignored.
+        sound: plant parameters without faults. They are copied.
     """
 
     def __init__(self, faults: Sequence[FaultSpec], sound: MachineNumbers) -> None:
@@ -102,7 +102,7 @@ class MachineCourse:
             yield first + start, first + end
 
     def changes(self, samples: int) -> Array:
-        """Every number that changes, when, and to what, in the order of ticks, shape (changes, CHANGE)."""
+        """Return all changes of parameters in the order of samples, shape (changes, CHANGE)."""
         rows: list[Array] = []
         before = [array.ravel()[touched] for array, touched in zip(self._sound.arrays, self._touched, strict=True)]
         shares = shares_at(self.faults, np.arange(samples), self._sound.rate_hz)
@@ -144,10 +144,10 @@ class SensorCourse:
     """Effect of sensor faults on the observations of one recording.
 
     Args:
-        faults: those of the scenario; faults of the machine are left out.
+        faults: faults of the scenario. Machine faults are ignored.
 
     Attributes:
-        table: a row a fault, see `edp.sim.sensors.alterations`.
+        table: one row per fault, see `edp.sim.sensors.alterations`.
     """
 
     def __init__(self, faults: Sequence[FaultSpec]) -> None:
@@ -161,9 +161,9 @@ class SensorCourse:
         """Return the random numbers of a recording with the faults' noise, then one column per row of the table.
 
         Args:
-            healthy: of `edp.sim.sensors.draws.draw`, shape (time, draws).
-            rate_hz: ticks per second.
-            chance: source of what is random in the faults.
+            healthy: random numbers of `edp.sim.sensors.draws.draw`, shape (time, draws).
+            rate_hz: sample rate.
+            chance: random generator of the faults.
         """
         if not self._every:
             return healthy

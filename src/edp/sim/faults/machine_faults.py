@@ -1,4 +1,4 @@
-"""Faults of the machine: each is a small function, and a row of `FAULTS`."""
+"""Machine faults: each is a function that changes plant parameters, and a row of `FAULTS`."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ FAULTS.register("internal_leak")(MachineFault(
 
 
 def _lower_main_relief(numbers: MachineNumbers, site: str, size: float) -> None:
-    """Lower the setting, though not below the pressure of the tank."""
+    """Lower the pressure setting, at least to the tank pressure."""
     plant = numbers.plant
     plant[at.PUMP_RELIEF] = max(plant[at.PUMP_RELIEF] - size, plant[at.TANK])
 
@@ -196,7 +196,7 @@ FAULTS.register("main_relief")(MachineFault(
 
 
 def _lower_port_relief(numbers: MachineNumbers, site: str, size: float) -> None:
-    """Lower the setting, though not below the pressure of the tank."""
+    """Lower the pressure setting, at least to the tank pressure."""
     axis, side = site.split("_")
     i, column = AXES.index(axis), at.RELIEF_HEAD if side == "head" else at.RELIEF_ROD
     numbers.axes[i, column] = max(numbers.axes[i, column] - size, numbers.plant[at.TANK])

@@ -13,7 +13,7 @@ from edp.sim.faults.base import FAULTS, MOST_FAULTS, FaultSpec, among
 from edp.storage.reading import Table
 
 MOST_CHARACTERS = 200
-"""Of one fault: kinds and sites are words, numbers have some digits."""
+"""Maximum length of the text of one fault."""
 GRAMMAR = "KIND[:SITE][:SIZE][@ONSET][,ramp=TIME][,on=TIME,off=TIME]"
 EXAMPLE = "internal_leak:boom:3L/min@120s,ramp=30s"
 SECONDS: Mapping[str, float] = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
@@ -24,7 +24,7 @@ def parse_fault(text: str) -> FaultSpec:
     """Parse a fault from text; the grammar is `GRAMMAR`, with a unit after each number.
 
     Raises:
-        ConfigError: what came, and the form, kinds, sites or units there are.
+        ConfigError: the text does not follow the grammar, or names an unknown kind, site or unit.
     """
     where = f"fault {shown(text)}"
     if not text or len(text) > MOST_CHARACTERS or not text.isprintable():
@@ -75,7 +75,8 @@ def faults_of(faults: Any, where: str) -> tuple[FaultSpec, ...]:
     """Convert user input (specs, texts and tables) to faults, limited to the number that a recording may have.
 
     Raises:
-        ConfigError: one cannot be, they are too many, or it is no list; `where` names what they are of.
+        ConfigError: a fault is invalid, there are too many, or `faults` is not a list. `where` is the subject of the
+            message.
     """
     if isinstance(faults, str) or not isinstance(faults, Iterable):
         raise ConfigError(f"{where}: faults = {shown(faults)} must be a list of faults, such as ['{EXAMPLE}']")

@@ -1,4 +1,4 @@
-"""Faults of the sensors: each is a row of `FAULTS`."""
+"""Sensor faults: each is a row of `FAULTS`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PAIRS = {"boom_arm": (0, 1), "boom_bucket": (0, 2), "arm_bucket": (1, 2)}
 
 
 def _each(sites: Sequence[str], *firsts: int) -> dict[str, tuple[int, ...]]:
-    """Return channels by site: one behind each of the first ones."""
+    """Return the channels of each site: consecutive channels from each of the first indices."""
     return {site: tuple(first + index for first in firsts) for index, site in enumerate(sites)}
 
 

@@ -1,4 +1,4 @@
-"""Names of the channels that a fault of a sensor falsifies."""
+"""Names of the channels that a sensor fault changes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def falsified_channels(kind: str, site: str) -> tuple[str, ...]:
         site: one of its sites.
 
     Raises:
-        ConfigError: no such kind.
+        ConfigError: the kind is unknown.
     """
     fault = FAULTS[kind]
     if not isinstance(fault, SensorFault):

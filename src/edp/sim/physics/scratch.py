@@ -1,4 +1,4 @@
-"""Arrays of one integrator step: what moves, commands, and positions of values in scratch arrays."""
+"""Arrays of one integrator step: states, commands, and positions of values in scratch arrays."""
 
 from __future__ import annotations
 

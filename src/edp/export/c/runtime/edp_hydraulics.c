@@ -34,7 +34,7 @@ enum { PILOT_1, PILOT_2, PLAYED, SPOOL_1, SPOOL, VALVE_STATES };
 #define TOLERANCE 1e-9       /* of a Newton step, MPa and m/s */
 #define LARGEST 4.0          /* MPa by which an iteration may move a pressure */
 #define GAMMA 0.29289321881345254 /* 1 - 1/sqrt(2): the method is L-stable */
-#define AHEAD 2.4142135623730949  /* (1 - gamma) / gamma */
+#define STAGE_RATIO 2.4142135623730949  /* (1 - gamma) / gamma */
 
 /* The caller's room, divided. */
 typedef struct {
@@ -650,10 +650,10 @@ static void step_of(const edp_hydraulics *h, const rooms *r, const float *histor
         if (which == 0u) {
             contents(h, r, r->reached);
             for (uint32_t k = 0; k < r->unknown; k++) {
-                r->base[k] += AHEAD * (r->reached[k] - r->base[k]);
+                r->base[k] += STAGE_RATIO * (r->reached[k] - r->base[k]);
             }
             for (uint32_t i = 0; i < r->n; i++) {
-                r->base_z[i] = r->zs[i] + AHEAD * (r->z[i] - r->zs[i]);
+                r->base_z[i] = r->zs[i] + STAGE_RATIO * (r->z[i] - r->zs[i]);
             }
         }
     }

@@ -577,15 +577,15 @@ static void solve_step(edp_near *n, const rooms *r, double step) {
         if (which == 0u) {
             contents(h, r, r->reached);
             for (uint32_t k = 0; k < r->unknown; k++) {
-                r->base[k] += AHEAD * (r->reached[k] - r->base[k]);
+                r->base[k] += STAGE_RATIO * (r->reached[k] - r->base[k]);
             }
             for (uint32_t i = 0; i < r->n; i++) {
-                r->base_z[i] = r->zs[i] + AHEAD * (r->z[i] - r->zs[i]);
+                r->base_z[i] = r->zs[i] + STAGE_RATIO * (r->z[i] - r->zs[i]);
             }
             contents_of_others(n, r, n->d_reached);
-            extend(n, r->unknown, n->d_base, n->d_reached, AHEAD);
+            extend(n, r->unknown, n->d_base, n->d_reached, STAGE_RATIO);
             /* The base of the bristles is where they began. */
-            extend(n, r->n, n->d_base_z, n->d_z, AHEAD);
+            extend(n, r->n, n->d_base_z, n->d_z, STAGE_RATIO);
         }
     }
     displaced_strokes(h, r, r->s, r->before, 0.5 * step);

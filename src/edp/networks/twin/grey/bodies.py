@@ -1,4 +1,4 @@
-"""Bodies of a known linkage: moments and inertias, and the forces of a motion, which are linear in these."""
+"""Rigid bodies of a linkage with data: their moments and inertias, and the forces of a motion (linear in both)."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ PARAMETERS = at.BODIES * at.BODY_VALUES
 
 @dataclass(frozen=True, eq=False)
 class BodyMoments:
-    """BodyMoments and inertias of all bodies about their joints: X, Y, H of the first body, of the second ...
+    """First moments X, Y and inertia H of each body about its joint, see `Equations.moments`.
 
     Attributes:
-        values: shape (BASE,).
-        slopes: by masses, centres and inertias, shape (BASE, parameter of a body).
+        values: X, Y, H of each body, shape (BASE,).
+        slopes: derivatives by the masses, centres of mass and inertias, shape (BASE, body parameter).
     """
 
     values: Array
@@ -51,45 +51,38 @@ def _functions(joints: tuple[int, ...]) -> Loaded:
         Equations(form, parameters, constants, algebra),
         CodeModule(graph, (parameters, constants, inputs)),
     )
-    moments_by_parameters = equations.moments()
-    module.add(
-        "moments",
-        [
-            *moments_by_parameters,
-            *(slope for row in algebra.derivatives(moments_by_parameters, parameters) for slope in row),
-        ],
-    )
+    values = equations.moments()
+    slopes = algebra.derivatives(values, parameters)
+    module.add("moments", [*values, *(slope for row in slopes for slope in row)])
     forces = equations.balance(moments, strokes, speeds, accelerations, angles[::ANGLES])
     module.add("balance", [slope for row in algebra.derivatives(forces, moments) for slope in row])
     return loaded_module(module, ("bodies", joints))
 
 
 def moments_of(values: Array, inertia_at: int, linkage: Array) -> BodyMoments:
-    """Return the moments and inertias of bodies.
+    """Return the moments and inertias of the bodies.
 
     Args:
         values: parameters of the grey box, shape (parameter,).
-        inertia_at: place of the first body's.
-        linkage: of `edp.networks.twin.grey.parameter_index`.
+        inertia_at: index of the first body parameter.
+        linkage: geometry of the linkage, see `edp.networks.twin.grey.parameter_index`.
     """
     joints = tuple(joint_actuators(linkage).tolist())
-    own, results = (
-        np.ascontiguousarray(values[inertia_at : inertia_at + PARAMETERS]),
-        np.empty(at.BASE * (1 + PARAMETERS)),
-    )
+    bodies = np.ascontiguousarray(values[inertia_at : inertia_at + PARAMETERS])
+    results = np.empty(at.BASE * (1 + PARAMETERS))
     constants = np.concatenate([np.zeros(2 * len(joints)), linkage[: at.JOINTS]])
-    _call(_functions(joints).addresses["moments"], own, constants, np.zeros(1), results)
+    _call(_functions(joints).addresses["moments"], bodies, constants, np.zeros(1), results)
     return BodyMoments(results[: at.BASE], results[at.BASE :].reshape(at.BASE, PARAMETERS))
 
 
 def forces_by_moments(strokes: Array, speeds: Array, accelerations: Array, linkage: Array) -> Array:
-    """Return the forces on the actuators by each moment and inertia, shape (row, actuator, BASE).
+    """Return the derivatives of the actuator forces by each moment and inertia, shape (row, actuator, BASE).
 
     Args:
         strokes: m, shape (row, actuator).
         speeds: m/s, shape (row, actuator).
         accelerations: m/s^2, shape (row, actuator).
-        linkage: of `edp.networks.twin.grey.parameter_index`.
+        linkage: geometry of the linkage, see `edp.networks.twin.grey.parameter_index`.
     """
     joints = joint_actuators(linkage)
     motion = np.ascontiguousarray(np.concatenate([strokes, speeds, accelerations], axis=1))

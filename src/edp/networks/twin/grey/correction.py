@@ -1,9 +1,9 @@
-"""A recurrent cell on top of a grey box: it reads ports and the grey box's own change, and corrects that change.
+"""Recurrent cell that corrects the change of a grey box in each sample, and the adjoint of a corrected run.
 
     r, k = sigmoid(a + W x + U h),  n = tanh(a + W x + r (U h + b)),  h' = n + k (h - n),  change += c (V h' + d)
 
-x are the ports as they were fed, then what the grey box changes velocities and pressures by in this tick; a is the
-commands' part. Bounds, and strokes as integrals, come behind the correction.
+The input x consists of the port readings and of the change of velocities and pressures in the grey box; a is the
+contribution of the commands. Bounds and the integration of strokes follow the correction.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Singles = NDArray[np.float32]
 LARGEST = 1e3
-"""Gradient by a state beyond which a lane's earlier ticks are left out: of a mean loss it only grows so in runs that
-part from each other at the least change (a check that chatters, an end stop), where it says nothing."""
+"""Maximum gradient by a state; beyond it the earlier samples of that run are left out of the gradient. A gradient of a
+mean loss grows this much only in chaotic runs (a chattering check valve, an end stop), where it has no meaning."""
 
 
 class OutputBounds(NamedTuple):
-    """Least and largest outputs in units of the grey box, and these units in SI units, shape (output,)."""
+    """Bounds of the outputs in units of the grey box, and those units in SI units, shape (output,)."""
 
     low: Array
     high: Array
@@ -34,20 +34,20 @@ class OutputBounds(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """A network's part in the outputs; without units there is none.
+    """Weights and state of the recurrent cell; a twin without a correction has a cell of zero units.
 
     Attributes:
-        projected: part of the commands in its gates, shape (tick, run, 3 * unit).
-        state: h, moved, shape (run, unit).
-        read_weight: of what it reads, shape (read, 3 * unit).
-        state_weight: of h, shape (unit, 3 * unit).
-        inner_bias: of n's inner sum, shape (unit,).
-        out_weight: of its outputs, shape (unit, solved).
-        out_bias: of its outputs, shape (solved,).
-        offset: of what it reads, in units of the grey box, shape (output,).
-        per_width: inverse width of what it reads, shape (output,).
-        change: width of changes, in units of the grey box, shape (solved,).
-        solved: outputs that it corrects, shape (solved,).
+        projected: contribution of the commands to the gates, shape (sample, run, 3 * unit).
+        state: hidden state h, updated in place, shape (run, unit).
+        read_weight: input weights W, shape (input, 3 * unit).
+        state_weight: recurrent weights U, shape (unit, 3 * unit).
+        inner_bias: bias b, shape (unit,).
+        out_weight: output weights V, shape (unit, corrected output).
+        out_bias: output bias d, shape (corrected output,).
+        offset: offset of the port readings, in units of the grey box, shape (output,).
+        per_width: inverse scale of the port readings, shape (output,).
+        change: scale c of the changes, in units of the grey box, shape (corrected output,).
+        solved: indices of the corrected outputs, shape (corrected output,).
     """
 
     projected: Singles
@@ -64,16 +64,16 @@ class Cell(NamedTuple):
 
 
 class RunTrace(NamedTuple):
-    """What a run leaves for its adjoint, tick first; without rows there is none.
+    """Intermediate values of a run that its adjoint needs; arrays of length zero disable the recording.
 
     Attributes:
-        read: what the cell read, shape (tick, run, read).
-        free: 1 where no bound acted, shape (tick, run, output).
-        gates: shape (tick, run, 3 * unit).
-        inner_sum: shape (tick, run, unit).
-        state: h, shape (tick + 1, run, unit).
-        slopes: Jacobians of the grey box's ticks, shape (tick, run, state, state).
-        counts: 1 where these count, shape (tick, run).
+        read: inputs of the cell, shape (sample, run, input).
+        free: 1 where no bound was active, shape (sample, run, output).
+        gates: gates of the cell, shape (sample, run, 3 * unit).
+        inner_sum: inner sum of n, shape (sample, run, unit).
+        state: hidden state h, shape (sample + 1, run, unit).
+        slopes: Jacobians of the samples of the grey box, shape (sample, run, state, state).
+        counts: 1 where the Jacobian was recorded, shape (sample, run).
     """
 
     read: Singles
@@ -93,7 +93,7 @@ def index_of(port: IntArray, n: int, nodes: int) -> Any:
 
 @inner
 def fed_ports(ports: IntArray, y: Array, s: Array, fed: Array) -> None:
-    """Write the port readings, in units of the grey box, to `fed` ``(answer,)``."""
+    """Write the port readings to `fed`, in units of the grey box, shape (output,)."""
     n, nodes = len(s), len(y) - len(s)
     for c in range(len(ports)):
         index = index_of(ports[c], n, nodes)
@@ -108,12 +108,12 @@ def correct(
 
     Args:
         now: sample and run.
-        y: pressures and velocities as the grey box has them after the sample; moved.
+        y: pressures and velocities of the grey box after the sample; corrected in place.
         s: strokes.
-        fed: what the ports read before it.
-        ports: kind and number of the state behind each output.
-        cell: moved.
-        trace: written, unless None.
+        fed: port readings before the sample.
+        ports: kind and index of the state behind each output.
+        cell: recurrent cell; its state is updated in place.
+        trace: record of the run, updated in place, or None.
     """
     t, row = now
     units, answers, n, nodes = cell.state.shape[1], len(ports), len(s), len(y) - len(s)
@@ -143,7 +143,7 @@ def correct(
 def note_bounds(
     now: tuple[int, int], y: Array, s: Array, ports: IntArray, bounds: OutputBounds, proposed: Array, trace: RunTrace
 ) -> None:
-    """Record in the trace where no bound was active on an output, from the ports before bounding."""
+    """Record in the trace which outputs were not bounded."""
     n, nodes = len(s), len(y) - len(s)
     for c in range(len(ports)):
         index = index_of(ports[c], n, nodes)
@@ -156,8 +156,9 @@ def note_bounds(
 
 @inner
 def state_rows(program: GreyProgram) -> IntArray:
-    """Return the places of the state on which a sample acts: unknowns, strokes, bristles and displacements."""
-    (n, _, pumps, nodes, _), frame = program.sizes, program.frame
+    """Return the indices of the state variables of a sample: unknowns, strokes, bristles and displacements."""
+    sizes = program.sizes
+    n, pumps, nodes, frame = sizes.actuators, sizes.pumps, sizes.nodes, program.frame
     rows, k = np.empty(nodes + 3 * n + pumps, np.int64), 0
     for first, count in ((0, nodes + n), (frame.strokes, n), (frame.bristles, n), (frame.displacements, pumps)):
         for row in range(first, first + count):
@@ -168,7 +169,7 @@ def state_rows(program: GreyProgram) -> IntArray:
 
 @inner
 def seed(rows: IntArray, tangents: Array) -> None:
-    """Set the tangents of the state by itself: one."""
+    """Initialise the tangents with the derivatives of the state by itself: the identity matrix."""
     for row in range(tangents.shape[0]):
         for k in range(tangents.shape[1]):
             tangents[row, k] = 0.0
@@ -178,7 +179,7 @@ def seed(rows: IntArray, tangents: Array) -> None:
 
 @inner
 def note_slopes(now: tuple[int, int], rows: IntArray, tangents: Array, trace: RunTrace) -> None:
-    """Write the Jacobian of a sample by the state before it to the trace."""
+    """Record the Jacobian of a sample by the state before the sample."""
     for row in range(len(rows)):
         for k in range(tangents.shape[1]):
             trace.slopes[now[0], now[1], row, k] = tangents[rows[row], k]
@@ -198,14 +199,15 @@ def run_back(
     """Compute the adjoint of a free run of grey box and cell, from the last sample to the first.
 
     Args:
-        grad_answers: gradient by the answers, each in its deviations ``(tick, lane, answer)``.
-        port: 1 where a port read a measured value; the shape of `grad_answers`.
-        cell: as in the forward run; `ports` and `trace` likewise.
-        ports: of the grey box.
-        sizes: actuators, nodes, and half a tick (s).
-        trace: what the forward run wrote.
-        grads: written: by the gates' pre-activations ``(tick, lane, 3 units)``, by n's inner sum ``(tick, lane,
-            units)``, and by the cell's answers ``(tick, lane, solved)``.
+        grad_answers: gradient by the scaled outputs, shape (sample, run, output).
+        port: 1 where a port read a measured value, shape (sample, run, output).
+        cell: cell of the forward run.
+        ports: kind and index of the state behind each output.
+        sizes: numbers of actuators and of nodes, and half a sample time (s).
+        trace: record of the forward run.
+        grads: gradients, written in place: by the pre-activations of the gates, shape (sample, run, 3 * unit), by the
+            inner sum of n, shape (sample, run, unit), and by the outputs of the cell, shape (sample, run, corrected
+            output).
     """
     h, per_width, change, solved = cell.state, cell.per_width, cell.change, cell.solved
     by_gates, by_inner, by_out = grads
@@ -226,7 +228,7 @@ def run_back(
             by_tick[row] = by_state[row]
             for c in range(answers):
                 if ports[c, 0] == 1:
-                    # A stroke is fed stroke plus trapezoid: the grey box's own is not read.
+                    # A stroke is the fed stroke plus the trapezoidal integral; the result of the grey box is not used.
                     speed = nodes + ports[c, 1]
                     along = by_state[row, where[c]] * trace.free[t, row, c]
                     by_tick[row, where[c]] = 0.0
@@ -266,7 +268,7 @@ def _before(
     (t, row) = now
     by_state[:] = 0.0
     if trace.counts[t, row] == 0.0:
-        # All that was fed so far was measured: no weight has a part in it.
+        # All port readings so far were measured, so they do not depend on the weights.
         return
     jacobian = trace.slopes[t, row]
     for k in range(len(by_state)):

@@ -1,35 +1,40 @@
-"""The equations of a grey box, each written once.
+"""Equations of a grey box: command path, pumps, hydraulic network, load and friction.
 
-They are written for any algebra: expressions that are differentiated and compiled
-(`edp.networks.twin.symbolic`), or CasADi's. Units are m, s, MPa, MN and Gg, pressures are gauge.
+The equations use an `Algebra`. The same code therefore evaluates numbers, expressions that are differentiated and
+compiled (`edp.networks.twin.symbolic`), and symbols of CasADi. Units are m, s, MPa, MN and Gg. Pressures are gauge
+pressures.
 
-Nodes of the hydraulic network are the head chambers of all actuators, their rod chambers and the pump lines, then tank
-and supply, whose pressures are constant. Unknowns y of an implicit step are the pressures of all nodes but the last
-two, then the velocities of the actuators.
+The nodes of the hydraulic network are the head chambers of all actuators, their rod chambers, the pump lines, the tank
+and the supply. The pressures of tank and supply are constant. The unknowns y of an implicit step are the other
+pressures, followed by the velocities of the actuators.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
+
+from numpy.typing import NDArray
 
 from edp.networks.twin.grey import parameter_index as at
 
 SMOOTH2 = 0.1**2
-"""Square of the pressure difference (MPa) below which an orifice turns laminar."""
+"""Square of the pressure difference below which orifice flow becomes laminar, MPa^2."""
 CHECK = 1e-3
-"""Fraction of its flow that a load check passes backwards: not zero, so that a closed check has a slope."""
+"""Backward flow of a load check as a fraction of its forward flow; above zero, so that a closed check has a slope."""
 IDLE = 1e-9
-"""MW below which pumps take no power: no division by zero."""
+"""Minimum pump power in a division, MW."""
+MISSING = 65535
+"""Missing entry in arrays of unsigned integers."""
 GAMMA = 1.0 - 1.0 / math.sqrt(2.0)
-"""Of the SDIRK method: the value at which it is L-stable with the smaller error constant."""
+"""Coefficient of the SDIRK method for L-stability with the smaller error constant."""
 Values = Sequence[Any]
 
 
 class Algebra(Protocol):
-    """Operations on the values of equations, beside ``+ - * /``."""
+    """Operations that the equations use in addition to ``+ - * /``."""
 
     def sqrt(self, a: Any) -> Any:
         """Return the square root."""
@@ -62,21 +67,22 @@ class Algebra(Protocol):
 
 @dataclass(frozen=True)
 class GreyForm:
-    """What a machine consists of: which equations there are, apart from all parameters.
+    """Structure of a machine: its elements, their connections, and the positions of their parameters.
 
     Attributes:
-        valve_at: places of the parameters of each valve, see `edp.networks.twin.grey.parameter_index`; -1: it has none.
+        valve_at: positions of the parameters of each valve, see `edp.networks.twin.grey.parameter_index`; -1 if a valve
+            does not have the parameter.
         valve_actuator: actuator of each valve.
-        valve_pump: pump of each valve; -1: supply.
-        actuator_at: place of the first parameter of each actuator.
-        pump_at: place of the first parameter of each pump.
-        circuit_at: place of the first parameter of the circuit.
-        inertia_at: place of the first parameter of the load.
-        inertia_terms: coefficients of each entry of the root of the inertia; 0 for a known linkage.
-        potential_at: place of the first coefficient of the potential.
-        exponents: of the monomials of the load.
-        joint_actuators: actuator of each joint of a known linkage; empty without one.
-        knots: of the opening curves.
+        valve_pump: pump of each valve; -1 for the supply.
+        actuator_at: position of the first parameter of each actuator.
+        pump_at: position of the first parameter of each pump.
+        circuit_at: position of the first parameter of the circuit.
+        inertia_at: position of the first parameter of the load.
+        inertia_terms: number of coefficients per entry of the inertia's root; 0 for a known linkage.
+        potential_at: position of the first coefficient of the potential.
+        exponents: exponents of the monomials of the load.
+        joint_actuators: actuator of each joint of a known linkage; empty for a polynomial load.
+        knots: knots of the opening curves.
         parameters: number of parameters.
     """
 
@@ -93,6 +99,40 @@ class GreyForm:
     joint_actuators: tuple[int, ...]
     knots: tuple[float, ...]
     parameters: int
+
+    @staticmethod
+    def from_arrays(
+        arrays: Mapping[str, NDArray[Any]], linkage: Any, circuit_at: int, load: tuple[int, int, int]
+    ) -> GreyForm:
+        """Build the form from arrays of integers, in which a missing entry is negative or `MISSING`.
+
+        Args:
+            arrays: ``valve_at``, ``valve_actuator``, ``valve_pump``, ``actuator_at``, ``pump_at``, ``exponents``,
+                ``knots`` and ``numbers``, by name.
+            linkage: see `edp.networks.twin.grey.parameter_index`; at most one entry for a polynomial load.
+            circuit_at: position of the first parameter of the circuit.
+            load: ``inertia_at``, ``inertia_terms`` and ``potential_at``.
+        """
+
+        def row(values: Any) -> tuple[int, ...]:
+            return tuple(-1 if value < 0 or value == MISSING else int(value) for value in values)
+
+        inertia_at, inertia_terms, potential_at = load
+        return GreyForm(
+            valve_at=tuple(map(row, arrays["valve_at"])),
+            valve_actuator=row(arrays["valve_actuator"]),
+            valve_pump=row(arrays["valve_pump"]),
+            actuator_at=row(arrays["actuator_at"]),
+            pump_at=tuple(first for first in row(arrays["pump_at"]) if first >= 0),
+            circuit_at=int(circuit_at),
+            inertia_at=int(inertia_at),
+            inertia_terms=int(inertia_terms),
+            potential_at=int(potential_at),
+            exponents=tuple(map(row, arrays["exponents"])),
+            joint_actuators=row(linkage[at.JOINTS + at.ACTUATOR :: at.JOINT_VALUES]),
+            knots=tuple(map(float, arrays["knots"])),
+            parameters=len(arrays["numbers"]),
+        )
 
     @property
     def actuators(self) -> int:
@@ -129,10 +169,10 @@ class Equations:
     """Equations of one machine.
 
     Args:
-        form: what it consists of.
-        parameters: values or symbols, in the order of `edp.networks.twin.grey.parameter_index`.
+        form: structure of the machine.
+        parameters: parameters as numbers or symbols, in the order of `edp.networks.twin.grey.parameter_index`.
         constants: middle and scale of the strokes, gravity (m/s^2), lengths of the first two bodies (m).
-        algebra: operations on them.
+        algebra: operations on numbers or symbols.
     """
 
     def __init__(self, form: GreyForm, parameters: Values, constants: Values, algebra: Algebra) -> None:
@@ -158,33 +198,33 @@ class Equations:
 
     # --- Command path ---
 
-    def remains(self, j: int, step: Any) -> list[Any]:
-        """Return the fractions of their distances that the lags of pilot and spool leave after `step` seconds."""
+    def lag_factors(self, j: int, step: Any) -> list[Any]:
+        """Return the decay factors of the pilot lag and the spool lag of a valve over `step` seconds."""
         return [self.algebra.exp(-step / self._valve(j, which)) for which in (at.PILOT_LAG, at.SPOOL_LAG)]
 
-    def advance_valve(self, state: Values, goal: Any, remains: Values) -> list[Any]:
+    def advance_valve(self, state: Values, command: Any, lag_factors: Values) -> list[Any]:
         """Return the state of a valve after a time: two pilot lags, play, two spool lags.
 
         Args:
-            state: pilot, delayed pilot, play, spool, delayed spool, as fractions of full travel.
-            goal: command, one dead time ago.
-            remains: of this time.
+            state: first and second pilot lag, play, first and second spool lag, as fractions of full travel.
+            command: command one dead time ago, as a fraction of full travel.
+            lag_factors: decay factors of the time step.
         """
-        play, (pilot_part, spool_part) = self.circuit[at.PLAY], remains
-        first = goal + (state[at.PILOT_1] - goal) * pilot_part
+        play, (pilot_part, spool_part) = self.circuit[at.PLAY], lag_factors
+        first = command + (state[at.PILOT_1] - command) * pilot_part
         pilot = first + (state[at.PILOT_2] - first) * pilot_part
         played = self._clip(state[at.PLAYED], pilot - play, pilot + play)
         behind = played + (state[at.SPOOL_1] - played) * spool_part
         return [first, pilot, played, behind, behind + (state[at.SPOOL] - behind) * spool_part]
 
     def displacements(self, before: Values, pilots: Values, pressures: Values, step: Any) -> list[Any]:
-        """Return the displacements of the pumps after `step` seconds, under their common power limit.
+        """Return the pump displacements after `step` seconds under the common power limit.
 
         Args:
-            before: fractions of full displacement.
-            pilots: of all valves.
-            pressures: of the pump lines.
-            step: s.
+            before: displacements as fractions of full displacement.
+            pilots: pilot positions of all valves.
+            pressures: pressures of the pump lines, MPa.
+            step: time step, s.
         """
         start, span = self.circuit[at.DEMAND_START], self.circuit[at.DEMAND_SPAN]
         demands, power = [], 0.0
@@ -209,14 +249,14 @@ class Equations:
     # --- Load ---
 
     def load(self, strokes: Values, velocities: Values, joints: Values) -> tuple[list[list[Any]], list[Any]]:
-        """Return inertia and the forces of gravity and turning, by Lagrange's equations.
+        """Return the inertia matrix and the forces of gravity and motion by Lagrange's equations.
 
             M(s) v' + c(s, v) + grad U(s) = forces
 
         Args:
-            strokes: of the actuators, m.
-            velocities: m/s.
-            joints: angles of the joints of a known linkage, rad; functions of the strokes.
+            strokes: strokes of the actuators, m.
+            velocities: velocities of the actuators, m/s.
+            joints: joint angles of a known linkage as functions of the strokes, rad.
         """
         if self.form.joint_actuators:
             mass, potential = self._bodies(self.moments(), joints, strokes)
@@ -227,7 +267,7 @@ class Equations:
     def balance(
         self, moments: Values, strokes: Values, velocities: Values, accelerations: Values, joints: Values
     ) -> list[Any]:
-        """Return the forces on the actuators that a motion takes, M v' + c + grad U, from `moments`."""
+        """Return the forces of a motion on the actuators, M v' + c + grad U, for given `moments`."""
         mass, potential = self._bodies(moments, joints, strokes)
         forces, n = self._forces(mass, potential, strokes, velocities), self.form.actuators
         return [forces[i] + sum((mass[i][k] * accelerations[k] for k in range(n)), 0.0) for i in range(n)]
@@ -266,11 +306,13 @@ class Equations:
         return mass, sum((q * term for q, term in zip(coefficients, terms[1:], strict=True)), 0.0)
 
     def moments(self) -> list[Any]:
-        """Return moments X, Y and inertia H of each body about its joint, in which inertia and potential are linear.
+        """Return the moments X, Y and the inertia H of each body about its joint.
+
+        Inertia and potential are linear in these.
 
             X_a = m_a x_a + L_a m,   Y_a = m_a y_a,   H_a = I_a + m_a (x_a^2 + y_a^2) + L_a^2 m
 
-        m is the mass of all bodies behind.
+        m is the mass of all bodies further from the base.
         """
         body = [self.q[self.form.inertia_at + at.BODY_VALUES * b :][: at.BODY_VALUES] for b in range(at.BODIES)]
         moments: list[Any] = []
@@ -282,7 +324,7 @@ class Equations:
         return moments
 
     def _bodies(self, moments: Values, joints: Values, strokes: Values) -> tuple[list[list[Any]], Any]:
-        """Return inertia and potential of planar bodies, each turned by one actuator against the last."""
+        """Return inertia and potential of planar bodies in a row, with one actuator per joint."""
         count, n = at.BODIES, self.form.actuators
         angles: list[Any] = []
         for joint in joints:
@@ -305,22 +347,23 @@ class Equations:
     # --- Hydraulic network and motion ---
 
     def contents(self, pressures: Values) -> list[Any]:
-        """Return the oil of each node, as the pressure that would press it in without free air: p - B a p_0 / p_abs.
+        """Return the oil content of each node as a pressure: p - B a p_0 / p_abs.
 
-        Its slope by p is B over the effective bulk modulus of oil with free air, isothermal. It rises with p
-        everywhere, so that Newton's method finds the pressure of a chamber that is near to boiling, too.
+        The content is the pressure of the same amount of oil without free air. Its derivative by p is the ratio of the
+        bulk modulus B and the effective bulk modulus of oil with isothermal free air. The content increases with p
+        everywhere, so that Newton's method also converges near cavitation.
         """
         air = self.circuit[at.BULK] * self.circuit[at.AIR] * at.ATMOSPHERE
         contents = []
         for p in pressures:
             absolute = p + at.ATMOSPHERE
-            # Below the least pressure the curve goes on as its tangent: a pole there would end the iteration.
+            # Continue along the tangent below the minimum pressure: a pole there would stop the iteration.
             inverse = 1.0 / self._largest(absolute, at.LEAST_ABSOLUTE)
             contents.append(p - air * (inverse * (2.0 - absolute * inverse)))
         return contents
 
     def net_flows(self, pressures: Values, spools: Values, displacements: Values, strokes: Values) -> list[Any]:
-        """Return the net flow into each node without tank and supply; Q = a dp / (dp^2 + delta^2)^(1/4)."""
+        """Return the net flow into each node except tank and supply; Q = a dp / (dp^2 + delta^2)^(1/4)."""
         p = [*pressures, self.circuit[at.TANK], self.circuit[at.SUPPLY]]
         net: list[Any] = [0.0] * len(p)
 
@@ -340,7 +383,7 @@ class Equations:
             for side in range(2):
                 k = i + side * n
                 lost = self.actuator[i][at.SPOOL_LEAK] * (p[k] - p[tank])
-                # A slope instead of a hard limit: real reliefs let pressure rise while they open.
+                # Let the pressure rise while a relief valve opens, as real valves do.
                 over = self._largest(p[k] - self.actuator[i][at.HEAD_RELIEF + side], 0.0)
                 lost = lost + self.circuit[at.PORT_SLOPE] * over
                 fed = self.circuit[at.MAKE_UP] * self._turbulent(self._largest(p[tank] - p[k], 0.0))
@@ -356,7 +399,7 @@ class Equations:
         return dp / self.algebra.sqrt(self.algebra.sqrt(dp * dp + SMOOTH2))
 
     def _open_centre(self, m: int, spools: Values) -> Any:
-        """Return the open-centre area of a pump, which closes as any of its spools moves."""
+        """Return the open-centre area of a pump; each moving spool closes it further."""
         area = self.pump[m][at.BYPASS]
         for j in range(self.form.valves):
             if self.form.valve_pump[j] == m:
@@ -366,7 +409,7 @@ class Equations:
         return area
 
     def _spool(self, j: int, side: int, x: Any, strokes: Values, edge: Any) -> None:
-        """Add the edges of one spool in one direction; they are closed while the spool moves the other way."""
+        """Add the openings of one spool in one direction."""
         form, n = self.form, self.form.actuators
         i, pump, places = form.valve_actuator[j], form.valve_pump[j], form.valve_at[j]
         band, tank = self._valve(j, at.BAND + side), form.nodes
@@ -375,7 +418,7 @@ class Equations:
         edge(2 * n + pump if pump >= 0 else tank + 1, fed, self._opening(r, places[at.INTO + side]), True)
         if places[at.OUT_OF + side] < 0:
             return
-        # Cushions throttle what leaves, on the side that the piston runs into.
+        # Throttle the outflow by the cushion on the side that the piston approaches.
         actuator = self.actuator[i]
         left = actuator[at.STOP_HIGH] - strokes[i] if side == 0 else strokes[i] - actuator[at.STOP_LOW]
         near, least = self._clip(left / actuator[at.CUSHION_LENGTH], 0.0, 1.0), actuator[at.CUSHION_LEAST]
@@ -386,7 +429,7 @@ class Equations:
             edge(other, fed, area * self._valve(j, at.REGENERATION + side), True)
 
     def _opening(self, r: Any, first: int) -> Any:
-        """Return the area of a monotone curve at r in [0, 1]: increments between fixed knots, summed up."""
+        """Return the area of a monotone opening curve at r in [0, 1], as a sum of increments between knots."""
         knots, area = self.form.knots, 0.0
         for k in range(len(knots) - 1):
             share = self._clip((r - knots[k]) / (knots[k + 1] - knots[k]), 0.0, 1.0)
@@ -394,13 +437,13 @@ class Equations:
         return area
 
     def friction(self, i: int, v: Any, before: Any, step: Any) -> tuple[Any, Any]:
-        """Return deflection and force of LuGre friction after an implicit step of its bristle.
+        """Return bristle deflection and force of LuGre friction after an implicit step.
 
         Args:
-            i: number of the actuator.
+            i: index of the actuator.
             v: velocity at the end of the step, m/s.
-            before: deflection before it, m.
-            step: s.
+            before: deflection at the start of the step, m.
+            step: time step, s.
         """
         a = self.actuator[i]
         ratio = v / a[at.STRIBECK]
@@ -411,7 +454,7 @@ class Equations:
         z = (before + step * v) / (1.0 + a[at.BRISTLE] * step * speed / level)
         damping = a[at.BRISTLE_DAMPING] * fade / step
         force = a[at.BRISTLE] * z + damping * (z - before) + a[at.VISCOUS] * v
-        # A lean of the force by the sign of v, smooth over the Stribeck velocity.
+        # Add a force that acts in one direction of motion only, smooth over the Stribeck velocity.
         tilt = self.algebra.tanh(ratio)
         return z, force + a[at.ASYMMETRY] * (tilt * tilt)
 
@@ -424,10 +467,10 @@ class Equations:
 
         Args:
             y: unknowns.
-            stage: what is known.
-            mass: inertia.
-            forces: of gravity and turning, against the actuators.
-            contents: of the nodes at these unknowns, where they are known.
+            stage: inputs of the stage.
+            mass: inertia matrix.
+            forces: forces of gravity and motion against the actuators.
+            contents: contents of the nodes at these unknowns; None to compute them.
         """
         n, nodes, step = self.form.actuators, self.form.nodes, stage.step
         p, v = y[:nodes], y[nodes:]
@@ -440,7 +483,7 @@ class Equations:
                 i, side = k % n, k // n
                 actuator, way = self.actuator[i], (1.0, -1.0)[side]
                 area = actuator[at.HEAD_AREA + side]
-                # Beyond a stop the oil of the dead volume is left.
+                # Use the dead volume alone beyond an end stop.
                 room = self._largest(way * (stage.strokes[i] - actuator[at.STOP_LOW + side]), 0.0)
                 volume, into = actuator[at.HEAD_DEAD + side] + area * room, into - way * area * v[i]
             else:
@@ -461,16 +504,16 @@ class Equations:
 
 @dataclass(frozen=True)
 class Stage:
-    """What is known of an implicit stage.
+    """Inputs of an implicit stage.
 
     Attributes:
-        base: contents and velocities from which it starts.
-        bristles: deflections from which it starts, m.
-        spools: positions, fractions of full travel.
-        displacements: of the pumps.
-        strokes: frozen, m.
-        reached: strokes without the motion of this stage, m.
-        half: half of the time from the start of the step, s.
+        base: contents and velocities at the start of the stage.
+        bristles: bristle deflections at the start of the stage, m.
+        spools: spool positions as fractions of full travel.
+        displacements: pump displacements as fractions of full displacement.
+        strokes: strokes in the middle of the step, m.
+        reached: strokes at the end of the stage, without the contribution of the unknown velocities, m.
+        half: half of the time from the start of the step to the end of the stage, s.
         step: length of the stage, s.
     """
 

@@ -13,13 +13,11 @@ from edp.ir.base import INPUT
 from edp.ir.builder import indices
 from edp.ir.hydraulics import NONE, HydraulicTick
 from edp.ir.reference import STEPS
-from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.correction import OutputBounds
 from edp.networks.twin.grey.equations import GreyForm
-from edp.networks.twin.grey.linkage import joint_actuators
 from edp.networks.twin.grey.program import program_of
 from edp.networks.twin.grey.rollouts import RunBatch, run_batch
-from edp.networks.twin.grey.tick import MachineArrays
+from edp.networks.twin.grey.tick import machine_arrays
 
 if TYPE_CHECKING:
     from edp.networks.twin.greybox import GreyTwin
@@ -102,13 +100,13 @@ def _tick(
     state[3] = np.ascontiguousarray(state[3][:, :pumps])
     answers, unbounded = np.empty((1, 1, len(ports))), np.full(len(ports), np.inf)
     linkage = values["linkage"] if layer.linked else np.zeros(0)
-    bodies = linkage[: at.JOINTS] if layer.linked else np.zeros(at.JOINTS)
-    constants = np.concatenate([values["middle"], values["scale"], bodies])
+    strokes, time = (values["middle"], values["scale"]), (layer.tick_s, layer.steps)
+    batch = RunBatch(np.array(demand, np.float64)[None, None], measured[None, None], np.zeros((1, len(ports))), *state)
     run_batch(
-        program_of(_form(layer, values)),
-        MachineArrays(values["numbers"], constants, values["scale"], linkage, ports, layer.tick_s, layer.steps),
+        program_of(GreyForm.from_arrays(vars(layer), linkage, layer.circuit, layer.load)),
+        machine_arrays(values["numbers"], strokes, linkage, ports, time),
         OutputBounds(-unbounded, unbounded, np.ones(len(ports))),
-        RunBatch(np.array(demand, np.float64)[None, None], measured[None, None], np.zeros((1, len(ports))), *state),
+        batch,
         answers,
         None,
         None,
@@ -117,26 +115,6 @@ def _tick(
         memory[slot.name] = _padded(value[0], slot.size) if slot.shape != value[0].shape else value[0]
     scaled = (answers[0, 0] - values["offset"]) / values["answer_width"]
     return np.asarray(scaled[ports[:, 0] != 1], commands.dtype)
-
-
-def _form(layer: HydraulicTick, values: Mapping[str, NDArray[np.float64]]) -> GreyForm:
-    inertia_at, inertia_terms, potential_at = layer.load
-    joints = tuple(joint_actuators(values["linkage"]).tolist()) if layer.linked else ()
-    return GreyForm(
-        valve_at=tuple(map(tuple, _signed(layer.valve_at).tolist())),
-        valve_actuator=tuple(_signed(layer.valve_actuator).tolist()),
-        valve_pump=tuple(_signed(layer.valve_pump).tolist()),
-        actuator_at=tuple(_signed(layer.actuator_at).tolist()),
-        pump_at=tuple(_signed(layer.pump_at[: layer.sizes[2]]).tolist()),
-        circuit_at=layer.circuit,
-        inertia_at=inertia_at,
-        inertia_terms=inertia_terms,
-        potential_at=potential_at,
-        exponents=tuple(map(tuple, _signed(layer.exponents).tolist())),
-        joint_actuators=joints,
-        knots=tuple(values["knots"].tolist()),
-        parameters=len(values["numbers"]),
-    )
 
 
 STEPS[HydraulicTick] = _tick

@@ -1,9 +1,10 @@
-"""Linearised rollouts: one machine, and runs whose commands differ a little from its own, for the plan at each sample.
+"""Linearised rollouts: a free run of a grey box, and runs whose commands differ slightly, for predictive control.
 
-The first run is the grey box itself. The others start each implicit stage from its solution and take one step of
-Newton's method with its matrix. So they follow their own commands, with dead bands and play, and differ from exact runs
-by the square of their distance. What changes of the strokes do to volumes, cushions, inertia and gravity is left out:
-within a plan they are a few per cent of what drives the machine.
+The first run solves the equations of the grey box. In each implicit stage, every other run takes one step of Newton's
+method from the solution of the first run, with the matrix of the first run and the residual of its own commands. Dead
+bands and play therefore act exactly, and the error grows with the square of the distance from the first run. Volumes,
+cushions, inertia and gravity use the strokes of the first run. Within the horizon of a plan, this changes the driving
+forces by a few per cent.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from edp.networks.twin.grey.jit import compiled, inlined, inner
 from edp.networks.twin.grey.program import GreyProgram
 from edp.networks.twin.grey.rollouts import clamp_outputs, feed
 from edp.networks.twin.grey.tick import (
-    AHEAD,
+    STAGE_RATIO,
     MachineArrays,
     RunValues,
     copy,
@@ -37,21 +38,21 @@ from edp.networks.twin.symbolic.machine_code import call
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 TOLERANCE = 1e-5
-"""Of the last change of Newton's method, in MPa and m/s: what is left then is about its square."""
+"""Maximum Newton step of a solved stage, MPa and m/s; the remaining error is about its square."""
 BETWEEN = GAMMA / (1.0 - GAMMA)
-"""Where the first stage of a step over two samples lies between the two stages of the first of them."""
+"""Relative position of the first stage of a double step between the two stages of its first sample."""
 
 
 class NearPlan(NamedTuple):
-    """Commands of runs that branch off a first one.
+    """Commands of a first run and of runs that branch off from it.
 
     Attributes:
-        demands: of the valves, shape (run, tick, valve).
-        measured: what the ports read at the first sample, in units of the grey box, NaN where one is free, shape
-            (output,).
-        first: sample at which each run branches off the first one, shape (run,).
-        single: number of samples that have steps of their own; behind them a step may go over two, and what is answered
-            between these lies on their velocities' line.
+        demands: valve commands, shape (run, sample, valve).
+        measured: measured values of the ports at the first sample, in units of the grey box, NaN if a port is free,
+            shape (output,).
+        first: sample at which each run branches off from the first run, shape (run,).
+        single: number of samples with separate steps. Later steps may cover two samples; the outputs between them are
+            interpolated linearly in velocity.
     """
 
     demands: Array
@@ -61,19 +62,19 @@ class NearPlan(NamedTuple):
 
 
 class NearRuns(NamedTuple):
-    """Runs near a first one; arrays whose first dimension is the run hold it, too.
+    """States and buffers of all runs; index 0 is the first run.
 
     Attributes:
         frames: inputs of all functions, shape (run, value).
-        unknowns: shape (run, unknown).
-        branched: whether a run differs from the first one, shape (run,).
-        begins: first sample whose outputs are its own, shape (run,).
-        spools: at both stages of each step, shape (run, tick, 2 * step, valve).
-        pilots: in the middle of each step, shape (run, tick, step, valve).
-        steps: of Newton's method, shape (unknown, run - 1).
-        out: results of functions.
-        slopes: of the contents of the first run by its pressures, shape (node,).
-        matrix: factorised, shape (unknown, unknown).
+        unknowns: pressures and velocities, shape (run, unknown).
+        branched: whether a run has branched off, shape (run,).
+        begins: first sample with separate outputs, shape (run,).
+        spools: spool positions at both stages of each step, shape (run, sample, 2 * step, valve).
+        pilots: pilot positions in the middle of each step, shape (run, sample, step, valve).
+        steps: Newton steps of the other runs, shape (unknown, run - 1).
+        out: results of the last function.
+        slopes: derivatives of the contents of the first run by its pressures, shape (node,).
+        matrix: factorised matrix of the first run, shape (unknown, unknown).
     """
 
     frames: Array
@@ -90,7 +91,7 @@ class NearRuns(NamedTuple):
 
 @inlined
 def _demand(demands: Array, history: Array, t: int, j: int, ticks: float) -> float:
-    """Return the command of valve `j` some ticks before tick t, interpolated; from `history` before the run."""
+    """Return the command of valve `j`, interpolated `ticks` samples before sample `t`."""
     whole = min(int(ticks), len(history) - 2)
     newer = demands[t - whole, j] if whole <= t else history[whole - t - 1, j]
     older = demands[t - whole - 1, j] if whole < t else history[whole - t, j]
@@ -98,47 +99,50 @@ def _demand(demands: Array, history: Array, t: int, j: int, ticks: float) -> flo
 
 
 @inner
-def follow_commands(
+def simulate_valves(
     program: GreyProgram, machine: MachineArrays, runs: NearRuns, demands: Array, history: Array, first: IntArray
 ) -> None:
-    """Compute spools and pilots of all runs.
+    """Compute the spool and pilot positions of all runs.
 
     Args:
-        program: of the form.
-        machine: its parameters.
-        runs: whose frames hold the states of the valves; moved.
-        demands: shape (run, tick, valve).
-        history: commands before, newest first, shape (tick, valve).
-        first: tick at which each run branches off, shape (run,).
+        program: compiled equations.
+        machine: parameters and constants.
+        runs: runs, whose frames contain the valve states; updated in place.
+        demands: valve commands, shape (run, sample, valve).
+        history: earlier valve commands, newest first, shape (sample, valve).
+        first: sample at which each run branches off, shape (run,).
     """
-    frame, count, ticks = program.frame, program.sizes[1], demands.shape[1]
+    frame, count, ticks = program.frame, program.sizes.valves, demands.shape[1]
     length, states = machine.tick_s / machine.steps, count * at.VALVE_STATES
-    before, remains = np.empty((ticks, states)), np.empty((2, 2 * count))
+    before, lag_factors = np.empty((ticks, states)), np.empty((2, 2 * count))
     for stage in range(2):
         runs.frames[0, frame.length] = GAMMA * length if stage == 0 else length - GAMMA * length
-        call(program.addresses[code.REMAINS], machine.parameters, machine.constants, runs.frames[0], runs.out)
-        copy(remains[stage], runs.out)
+        call(program.addresses[code.LAG_FACTORS], machine.parameters, machine.constants, runs.frames[0], runs.out)
+        copy(lag_factors[stage], runs.out)
     for run in range(len(demands)):
         values = runs.frames[run]
         begin = first[run] if run > 0 else 0
         if begin >= ticks:
             continue
         if run > 0:
-            # A step over two samples may begin at the one before.
+            # Copy the sample before, in case a double step starts there.
             if begin > 0:
-                _copy_ways(runs, run, begin - 1, 0)
-            copy(values[frame.valves : frame.goals], before[begin])
+                for stage in range(2 * machine.steps):
+                    copy(runs.spools[run, begin - 1, stage], runs.spools[0, begin - 1, stage])
+                for step in range(machine.steps):
+                    copy(runs.pilots[run, begin - 1, step], runs.pilots[0, begin - 1, step])
+            copy(values[frame.valves : frame.delayed_commands], before[begin])
         for t in range(begin, ticks):
             if run == 0:
-                copy(before[t], values[frame.valves : frame.goals])
+                copy(before[t], values[frame.valves : frame.delayed_commands])
             for j in range(count):
                 delay = machine.parameters[program.own[j, at.BY_DELAY]] / machine.tick_s
                 delay = min(max(delay, 0.0), len(history) - 2.0)
-                values[frame.goals + j] = _demand(demands[run], history, t, j, delay)
+                values[frame.delayed_commands + j] = _demand(demands[run], history, t, j, delay)
             for stage in range(2 * machine.steps):
-                copy(values[frame.remains : frame.mass], remains[stage % 2])
-                call(program.addresses[code.FOLLOW], machine.parameters, machine.constants, values, runs.out)
-                copy(values[frame.valves : frame.goals], runs.out)
+                copy(values[frame.lag_factors : frame.mass], lag_factors[stage % 2])
+                call(program.addresses[code.FAST_VALVES], machine.parameters, machine.constants, values, runs.out)
+                copy(values[frame.valves : frame.delayed_commands], runs.out)
                 for j in range(count):
                     state = at.VALVE_STATES * j
                     runs.spools[run, t, stage, j] = runs.out[state + at.SPOOL]
@@ -146,24 +150,11 @@ def follow_commands(
                         runs.pilots[run, t, stage // 2, j] = runs.out[state + at.PILOT_2]
 
 
-@inlined
-def _copy_ways(runs: NearRuns, run: int, t: int, source: int) -> None:
-    for stage in range(runs.spools.shape[2]):
-        copy(runs.spools[run, t, stage], runs.spools[source, t, stage])
-    for step in range(runs.pilots.shape[2]):
-        copy(runs.pilots[run, t, step], runs.pilots[source, t, step])
-
-
-@inlined
-def _set_valves(program: GreyProgram, values: Array, state: int, positions: Array) -> None:
-    for j in range(len(positions)):
-        values[program.frame.valves + at.VALVE_STATES * j + state] = positions[j]
-
-
 @inner
 def _begin_step(program: GreyProgram, machine: MachineArrays, runs: NearRuns, work: RunValues, length: float) -> None:
-    """Prepare a step of all runs: frozen load, contents, deflections and displacements."""
-    (n, _, pumps, nodes, _), frame = program.sizes, program.frame
+    """Initialise a step of all runs: load, contents, bristle deflections and pump displacements."""
+    sizes = program.sizes
+    n, pumps, nodes, frame = sizes.actuators, sizes.pumps, sizes.nodes, program.frame
     fill_contents(program, machine, work, work.frame[frame.base : frame.bristle_base], work.tangents, at.NONE)
     copy(runs.slopes, work.out[nodes : 2 * nodes])
     for run in range(len(runs.frames)):
@@ -185,7 +176,7 @@ def _begin_step(program: GreyProgram, machine: MachineArrays, runs: NearRuns, wo
 
 @inlined
 def _add_contents(runs: NearRuns, run: int, first: Array, contents: Array, keep: float) -> None:
-    """Set contents to a part of their own and the rest of those of the first run, to first order."""
+    """Blend contents with the linearised contents of the first run: ``keep * contents + (1 - keep) * linearised``."""
     size, nodes = runs.unknowns.shape[1], len(runs.slopes)
     for k in range(size):
         apart = runs.unknowns[run, k] - runs.unknowns[0, k]
@@ -195,7 +186,7 @@ def _add_contents(runs: NearRuns, run: int, first: Array, contents: Array, keep:
 
 @inner
 def _stage(program: GreyProgram, machine: MachineArrays, runs: NearRuns, work: RunValues) -> None:
-    """Solve a stage of the first run, and take one step of Newton's method for each other one."""
+    """Solve a stage of the first run; take one step of Newton's method in every other run."""
     size, steps = len(runs.matrix), runs.steps
     values = runs.frames[0]
     newton(program, machine, work, TOLERANCE)
@@ -224,8 +215,9 @@ def _stage(program: GreyProgram, machine: MachineArrays, runs: NearRuns, work: R
 
 @inner
 def _end_stage(program: GreyProgram, machine: MachineArrays, runs: NearRuns, work: RunValues, first: bool) -> None:
-    """Move deflections, and after the first stage the bases of the second; those of other runs to first order."""
-    (n, _, _, nodes, _), frame, own = program.sizes, program.frame, work.frame
+    """Update the bristle deflections; after the first stage, also the bases of the second stage."""
+    sizes = program.sizes
+    n, nodes, frame, own = sizes.actuators, sizes.nodes, program.frame, work.frame
     call(program.addresses[code.BRISTLES], machine.parameters, machine.constants, own, runs.out)
     for run in range(1, len(runs.frames)):
         if not runs.branched[run]:
@@ -244,27 +236,27 @@ def _end_stage(program: GreyProgram, machine: MachineArrays, runs: NearRuns, wor
         if not runs.branched[run]:
             continue
         values = runs.frames[run]
-        _add_contents(runs, run, work.contents, values[frame.base :], 1.0 - AHEAD)
+        _add_contents(runs, run, work.contents, values[frame.base :], 1.0 - STAGE_RATIO)
         for i in range(n):
             before = values[frame.bristle_base + i]
-            values[frame.bristle_base + i] = before + AHEAD * (values[frame.bristles + i] - before)
+            values[frame.bristle_base + i] = before + STAGE_RATIO * (values[frame.bristles + i] - before)
 
 
 @inner
 def step_all(
     program: GreyProgram, machine: MachineArrays, runs: NearRuns, work: RunValues, length: float, at_stages: Array
 ) -> None:
-    """Advance all runs by one implicit step of `length` seconds, whose pilots are in their frames.
+    """Advance all runs by one implicit step.
 
     Args:
-        program: of the form.
-        machine: its parameters.
-        runs: moved.
-        work: of the first run.
-        length: s.
-        at_stages: spools at both stages, shape (run, stage, valve).
+        program: compiled equations.
+        machine: parameters and constants.
+        runs: runs, whose frames contain the pilot positions; updated in place.
+        work: buffers of the first run.
+        length: length of the step, s.
+        at_stages: spool positions at both stages, shape (run, stage, valve).
     """
-    n, frame = program.sizes[0], program.frame
+    n, frame = program.sizes.actuators, program.frame
     _begin_step(program, machine, runs, work, length)
     for which in range(2):
         half = 0.5 * (GAMMA * length if which == 0 else length)
@@ -273,7 +265,8 @@ def step_all(
             if not runs.branched[run]:
                 continue
             values[frame.half] = half
-            _set_valves(program, values, at.SPOOL, at_stages[run, which])
+            for j in range(at_stages.shape[2]):
+                values[frame.valves + at.VALVE_STATES * j + at.SPOOL] = at_stages[run, which, j]
             for i in range(n):
                 values[frame.reached + i] = values[frame.strokes + i] + half * values[frame.speeds + i]
         _stage(program, machine, runs, work)
@@ -289,8 +282,8 @@ def step_all(
 def _move_strokes(
     program: GreyProgram, machine: MachineArrays, runs: NearRuns, run: int, half: float, strokes: Array, speeds: Array
 ) -> None:
-    """Integrate the strokes of a run by the trapezoidal rule, from strokes and velocities before."""
-    n, nodes = program.sizes[0], program.sizes[3]
+    """Integrate the strokes of a run by the trapezoidal rule from earlier strokes and velocities."""
+    n, nodes = program.sizes.actuators, program.sizes.nodes
     for i in range(n):
         weight = half if machine.scale[i] > 0.0 else 0.0
         moved = weight * (speeds[i] + runs.unknowns[run, nodes + i])
@@ -314,14 +307,14 @@ def _write(t: int, ports: IntArray, units: Array, runs: NearRuns, strokes: int, 
 
 @inner
 def _write_between(t: int, ports: IntArray, half: float, runs: NearRuns, answers: Array) -> None:
-    """Interpolate outputs of all branched runs at sample t between the solved samples before and after it.
+    """Interpolate the outputs of all branched runs at sample t between the samples t - 1 and t + 1.
 
     Args:
-        t: the sample, of which there is one before.
-        ports: kind and number of the state behind each output, shape (output, 2).
-        half: half a tick, s.
-        runs: that are simulated.
-        answers: read and written, shape (run, tick, output).
+        t: index of the sample, at least 1.
+        ports: kind and index of the state behind each output, shape (output, 2).
+        half: half of the sample time, s.
+        runs: simulated runs.
+        answers: outputs, shape (run, sample, output); updated in place.
     """
     for run in range(len(answers)):
         if not runs.branched[run]:
@@ -342,7 +335,7 @@ def _write_between(t: int, ports: IntArray, half: float, runs: NearRuns, answers
 
 @inner
 def _clamp_others(ports: IntArray, bounds: OutputBounds, runs: NearRuns, strokes: int, nodes: int) -> None:
-    """Hold the other runs at a bound where the first run is at this bound."""
+    """Set states of the other runs to the bound at which the first run is."""
     for c in range(len(ports)):
         kind, which = ports[c, 0], ports[c, 1]
         index = which + (0 if kind == 2 else nodes)
@@ -357,7 +350,7 @@ def _clamp_others(ports: IntArray, bounds: OutputBounds, runs: NearRuns, strokes
 
 @inner
 def _near_runs(program: GreyProgram, count: int, ticks: int, steps: int) -> NearRuns:
-    valves, size = program.sizes[1], program.sizes[3] + program.sizes[0]
+    valves, size = program.sizes.valves, program.sizes.nodes + program.sizes.actuators
     return NearRuns(
         np.zeros((count, program.frame.size)),
         np.zeros((count, size)),
@@ -367,7 +360,7 @@ def _near_runs(program: GreyProgram, count: int, ticks: int, steps: int) -> Near
         np.empty((count, ticks, steps, valves)),
         np.zeros((size, count - 1)),
         np.zeros(program.results),
-        np.zeros(program.sizes[3]),
+        np.zeros(program.sizes.nodes),
         np.zeros((size, size)),
     )
 
@@ -382,20 +375,22 @@ def run_near(
     resistance: Array,
     answers: Array,
 ) -> None:
-    """Simulate one machine in free run from the measured state, and neighbouring runs to first order.
+    """Simulate a free run and linearised neighbouring runs from the measured state.
 
     Args:
-        program: of the form.
-        machine: its parameters.
-        bounds: of the outputs.
-        plan: what is simulated.
-        state: of the machine: unknowns, strokes, bristles, displacements, valves and history; moved by the first run.
-        resistance: forces against each actuator that the load does not know of, MN, shape (actuator,).
-        answers: written, SI units, shape (run, tick, output).
+        program: compiled equations.
+        machine: parameters and constants.
+        bounds: bounds of the outputs.
+        plan: commands of all runs.
+        state: unknowns, strokes, bristles, displacements, valves and history; updated to the end of the first run.
+        resistance: external forces against the actuators, MN, shape (actuator,).
+        answers: buffer for the outputs, SI units, shape (run, sample, output).
     """
     demands, first = plan.demands, plan.first
     y, s, z, d, valves, history = state
-    (n, count, pumps, nodes, _), frame, ports = program.sizes, program.frame, machine.ports
+    sizes = program.sizes
+    n, count, pumps, nodes = sizes.actuators, sizes.valves, sizes.pumps, sizes.nodes
+    frame, ports = program.frame, machine.ports
     runs, ticks = _near_runs(program, len(demands), demands.shape[1], machine.steps), demands.shape[1]
     work = work_arrays(program, 0)
     shared = RunValues(
@@ -405,9 +400,9 @@ def run_near(
     for j in range(count):
         first_state = frame.valves + at.VALVE_STATES * j
         copy(runs.frames[0, first_state : first_state + at.VALVE_STATES], valves[j])
-    follow_commands(program, machine, runs, demands, history, first)
+    simulate_valves(program, machine, runs, demands, history, first)
     for j in range(count):
-        copy(valves[j], runs.frames[0, frame.valves + at.VALVE_STATES * j : frame.goals])
+        copy(valves[j], runs.frames[0, frame.valves + at.VALVE_STATES * j : frame.delayed_commands])
     feed(ports, plan.measured, y, s)
     own = runs.frames[0]
     copy(runs.unknowns[0], y)
@@ -427,7 +422,7 @@ def run_near(
         for step in range(1 if double else machine.steps):
             for run in range(len(demands)):
                 if runs.branched[run]:
-                    _pose_valves(program, runs, run, t, step, double, at_stages[run])
+                    _set_stage_valves(program, runs, run, t, step, double, at_stages[run])
             length = 2.0 * machine.tick_s if double else machine.tick_s / machine.steps
             copy(own[:nodes], runs.unknowns[0])
             copy(own[nodes : nodes + n], runs.unknowns[0, nodes:])
@@ -436,7 +431,7 @@ def run_near(
                 own[frame.forces + i] += resistance[i]
             step_all(program, machine, runs, shared, length, at_stages)
         whole = 2.0 * machine.tick_s if double else machine.tick_s
-        # What a twin promises: a stroke is the trapezoidal integral of the velocities that it answers, one a sample.
+        # A twin guarantees that strokes are the trapezoidal integral of its velocity outputs.
         for run in range(len(demands)):
             if runs.branched[run]:
                 _move_strokes(program, machine, runs, run, 0.5 * whole, before[run, :n], before[run, n:])
@@ -460,7 +455,7 @@ def run_near(
 
 @inner
 def _branch(program: GreyProgram, runs: NearRuns, first: IntArray, t: int, end: int) -> None:
-    """Let the runs begin at sample `t` that branch off before `end`, from the state of the first run."""
+    """Start all runs that branch off before sample `end`, at sample `t` from the state of the first run."""
     frame = program.frame
     for run in range(1, len(first)):
         if runs.branched[run] or first[run] >= end:
@@ -473,10 +468,10 @@ def _branch(program: GreyProgram, runs: NearRuns, first: IntArray, t: int, end: 
 
 
 @inlined
-def _pose_valves(
+def _set_stage_valves(
     program: GreyProgram, runs: NearRuns, run: int, t: int, step: int, double: bool, at_stages: Array
 ) -> None:
-    """Set the pilots of a step, and the spools at its stages; a double step has those of two samples."""
+    """Set the pilot positions of a step and the spool positions of its stages."""
     spools, pilots = runs.spools[run, t], runs.pilots[run, t]
     for j in range(spools.shape[1]):
         pilot = program.frame.valves + at.VALVE_STATES * j + at.PILOT_2

@@ -56,7 +56,7 @@ OWN = 4
 
 # tangents that a tick carries along: none, by all numbers, or by the state before:
 # pressures and velocities, strokes, bristles, displacements; valves depend on the commands alone
-NONE, BY_NUMBERS, BY_STATE = range(3)
+NONE, BY_PARAMETERS, BY_STATE = range(3)
 
 ATMOSPHERE = 0.1013
 """MPa; pressures are gauge."""

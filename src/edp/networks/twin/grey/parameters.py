@@ -33,6 +33,8 @@ from edp.networks.twin.grey.priors import (
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+MAX_ACTUATORS, MAX_VALVES = 12, 48
+"""Maximum numbers of elements: their equations are compiled, which takes seconds and a gigabyte at these sizes."""
 MOST_OF_LOAD = 5_000
 """Numbers of a load: a fit holds their matrix, 200 MB of it."""
 LEFT_OUT = {
@@ -157,7 +159,7 @@ def number_table(
         ConfigError: the load would have more numbers than can be fitted.
     """
     degrees = degrees if front is None else (0, 0)
-    _check_load(elements, degrees)
+    _check_size(elements, degrees)
     numbers: list[GreyParameter] = []
     actuator_at, areas = [], []
     for actuator, travel in zip(elements.actuators, travels, strict=True):
@@ -216,9 +218,14 @@ def coarse_by_fine(coarse: ParameterTable, fine: ParameterTable) -> Array:
     return slopes
 
 
-def _check_load(elements: Elements, degrees: tuple[int, int]) -> None:
-    """Raise ConfigError if the polynomial load model would have too many parameters."""
+def _check_size(elements: Elements, degrees: tuple[int, int]) -> None:
+    """Raise ConfigError if the elements or the parameters of the polynomial load model are too many."""
     actuators, variables = len(elements.actuators), len(elements.load_variables)
+    if actuators > MAX_ACTUATORS or len(elements.valves) > MAX_VALVES:
+        raise ConfigError(
+            f"grey box: got {actuators:,} cylinders and motors and {len(elements.valves):,} valves, expected at most "
+            f"{MAX_ACTUATORS} and {MAX_VALVES}; leave channels out of [channels], or choose another twin.kind"
+        )
     entries = actuators * (actuators + 1) // 2
     count = entries * comb(variables + degrees[0], variables) + comb(variables + max(degrees), variables)
     if count > MOST_OF_LOAD:

@@ -1,4 +1,4 @@
-"""Machine code of the equations of a grey box, with the tables that loops over its samples need."""
+"""Compiled equations of one form of grey box, and the positions of their inputs and derivatives."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.equations import Equations, GreyForm, Stage
 from edp.networks.twin.grey.jit import compiler
 from edp.networks.twin.symbolic.expression import Expression, ExpressionGraph
-from edp.networks.twin.symbolic.machine_code import CodeModule, Loaded, digest_of, load, read_or_make
+from edp.networks.twin.symbolic.machine_code import CodeModule, Loaded, digest_of, load, read_or_compile
 
 IntArray = NDArray[np.int64]
 ANGLES = 4
-"""Values of each joint: its angle and three derivatives by the stroke."""
+"""Number of values per joint: the angle and its first three derivatives with respect to the stroke."""
 
 
 class FramePlaces(NamedTuple):
-    """Places of the first value of each kind among the inputs of all functions.
+    """Position of the first value of each kind in the input array of the compiled functions.
 
     Attributes:
         unknowns: pressures and velocities.
-        base: contents and velocities from which a stage starts.
-        bristle_base: deflections from which it starts.
-        displacements: of the pumps.
-        frozen: strokes in the middle of the step.
-        speeds: velocities at the start of the step.
-        reached: strokes without the motion of the stage.
-        strokes: at the start of the step.
-        bristles: deflections.
-        tangents: number of the values above, each of which has a row of tangents.
-        valves: states of the valves.
-        goals: their commands one dead time ago.
-        remains: parts that the lags of pilot and spool of each valve leave, see `Equations.remains`.
-        mass: inertia.
-        forces: of the load against the actuators.
-        joints: angles of the joints and their derivatives.
-        half: half of the time from the start of the step to the end of the stage.
-        step: length of the stage.
-        length: by which valves or displacements move on.
+        base: contents and velocities at the start of a stage.
+        bristle_base: bristle deflections at the start of a stage.
+        displacements: pump displacements.
+        frozen: strokes in the middle of a step.
+        speeds: velocities at the start of a step.
+        reached: strokes at the end of a stage, without the contribution of the unknown velocities.
+        strokes: strokes at the start of a step.
+        bristles: bristle deflections.
+        tangents: number of values listed so far. Each of these values has a row of tangents.
+        valves: valve states.
+        delayed_commands: valve commands one dead time ago.
+        lag_factors: decay factors of the pilot lag and the spool lag of each valve, see `Equations.lag_factors`.
+        mass: inertia matrix.
+        forces: forces of the load on the actuators.
+        joints: joint angles and their derivatives.
+        half: half of the time from the start of the step to the end of the stage, s.
+        step: length of the stage, s.
+        length: time step of valves and pumps, s.
         size: number of all values.
     """
 
@@ -57,8 +57,8 @@ class FramePlaces(NamedTuple):
     bristles: int
     tangents: int
     valves: int
-    goals: int
-    remains: int
+    delayed_commands: int
+    lag_factors: int
     mass: int
     forces: int
     joints: int
@@ -68,42 +68,53 @@ class FramePlaces(NamedTuple):
     size: int
 
 
-# Functions of a form, by their place among its addresses, with what they write:
+# Index of each function in `GreyProgram.addresses`, and its results:
 NEWTON = 0  # a step of Newton's method towards the root of a stage, to be subtracted
 RESIDUAL = 1  # residual of a stage
 MATRIX = 2  # derivatives of the residual by the unknowns
 LOAD = 3  # inertia and forces of the load
-SLOPES = 4  # as MATRIX, then BY_FRAME, BY_SPOOL and BY_NUMBER
-CONTENTS = 5  # of the nodes, their derivatives by the pressures, CONTENT_NUMBERS
-BRISTLES = 6  # deflections, their derivatives by velocity and by deflection before, BRISTLE_NUMBERS
+SLOPES = 4  # as MATRIX, then BY_FRAME, BY_SPOOL and BY_PARAMETER
+CONTENTS = 5  # of the nodes, their derivatives by the pressures, CONTENT_PARAMETERS
+BRISTLES = 6  # deflections, their derivatives by velocity and by deflection before, BRISTLE_PARAMETERS
 VALVES = 7  # states of the valves, VALVE_STATES, VALVE_OWN
-PUMPS = 8  # displacements, PUMP_FRAME, PUMP_PILOTS, PUMP_NUMBERS
-REMAINS = 9  # fractions that the lags of the valves leave
-FOLLOW = 10  # states of the valves from these fractions
+PUMPS = 8  # displacements, PUMP_FRAME, PUMP_PILOTS, PUMP_PARAMETERS
+LAG_FACTORS = 9  # decay factors of the valve lags
+FAST_VALVES = 10  # states of the valves, for known decay factors
 FUNCTIONS = (
-    "newton", "residual", "matrix", "load", "slopes", "contents", "bristles", "valves", "pumps", "remains", "follow",
+    "newton", "residual", "matrix", "load", "slopes", "contents", "bristles", "valves", "pumps", "lag_factors",
+    "fast_valves",
 )  # fmt: skip
 
-# Derivatives that are not zero everywhere, by their place in `GreyProgram.groups`.
+# Index of each group of derivatives in `GreyProgram.groups`.
 (
-    BY_FRAME, BY_SPOOL, BY_NUMBER, CONTENT_NUMBERS, BRISTLE_NUMBERS, VALVE_STATES, VALVE_OWN, PUMP_FRAME, PUMP_PILOTS,
-    PUMP_NUMBERS,
+    BY_FRAME, BY_SPOOL, BY_PARAMETER, CONTENT_PARAMETERS, BRISTLE_PARAMETERS, VALVE_STATES, VALVE_OWN, PUMP_FRAME,
+    PUMP_PILOTS, PUMP_PARAMETERS,
 ) = range(10)  # fmt: skip
 GROUPS = 10
 
 
+class FormSizes(NamedTuple):
+    """Numbers of actuators, valves, pumps, unknown pressures and parameters."""
+
+    actuators: int
+    valves: int
+    pumps: int
+    nodes: int
+    parameters: int
+
+
 class GreyProgram(NamedTuple):
-    """Functions of one form by their addresses, and the places of their derivatives.
+    """Compiled functions of one form, and the positions of their derivatives.
 
     Attributes:
-        addresses: of the functions, shape (function,).
-        groups: of derivatives: place of the first one among the results, first row of `entries`, and the row behind
-            the last one, shape (group, 3).
+        addresses: address of each function, shape (function,).
+        groups: for each group of derivatives: position of its first value in the results, its first row in `entries`,
+            and the row after its last one, shape (group, 3).
         entries: result and variable of each derivative, shape (derivative, 2).
-        own: parameters of each valve: dead time, pilot lag, spool lag, play, shape (valve, OWN).
-        frame: places of the inputs.
-        sizes: numbers of actuators, valves, pumps, nodes and parameters.
-        results: largest number of results of a function.
+        own: positions of the dead time, pilot lag, spool lag and play of each valve, shape (valve, OWN).
+        frame: positions of the inputs.
+        sizes: sizes of the form.
+        results: maximum number of results of a function.
     """
 
     addresses: IntArray
@@ -111,12 +122,12 @@ class GreyProgram(NamedTuple):
     entries: IntArray
     own: IntArray
     frame: FramePlaces
-    sizes: tuple[int, int, int, int, int]
+    sizes: FormSizes
     results: int
 
 
 class ExpressionAlgebra:
-    """Algebra of expressions, see `edp.networks.twin.grey.equations.Algebra`."""
+    """Algebra of `Equations` on expressions."""
 
     def __init__(self, graph: ExpressionGraph) -> None:
         self.graph, self.less = graph, graph.less
@@ -125,14 +136,14 @@ class ExpressionAlgebra:
         return lambda a: self.graph.function(name, a)
 
     def derivatives(self, results: Sequence[Any], variables: Sequence[Expression]) -> list[list[Expression]]:
-        """Return the derivatives of results by variables, a row for each result."""
+        """Return the Jacobian as nested lists, one row per result."""
         slopes = self.graph.jacobian([self.graph.of(result) for result in results], variables)
         zero = self.graph.of(0.0)
         return [[slopes.get((i, k), zero) for k in range(len(variables))] for i in range(len(results))]
 
 
 def frame_of(form: GreyForm) -> FramePlaces:
-    """Return the places of all inputs of a form."""
+    """Return the positions of the inputs of a form."""
     n, pumps, valves, unknowns = form.actuators, form.pumps, form.valves, form.unknowns
     counts = [unknowns, unknowns, n, pumps, n, n, n, n, n]
     tangents = sum(counts)
@@ -144,25 +155,25 @@ def frame_of(form: GreyForm) -> FramePlaces:
 
 @cache
 def program_of(form: GreyForm) -> GreyProgram:
-    """Return the program of a form; the first one on a computer takes a second, which is kept on disk."""
+    """Return the compiled functions of a form, from the cache on disk if it has them."""
     functions = _Functions(form)
     return functions.program(loaded_module(functions.module, form))
 
 
 def loaded_module(module: CodeModule, identity: object) -> Loaded:
-    """Return the functions of a module, whose machine code is kept on disk under what it is made of."""
+    """Load the functions of a module, from the cache on disk if it has them under this identity."""
     file = None if compiler.folder is None else compiler.folder / f"{digest_of(identity)}.o"
-    loaded = load(read_or_make(file, module.object_code), module.names)
+    loaded = load(read_or_compile(file, module.object_code), module.names)
     _LOADED.append(loaded)
     return loaded
 
 
 _LOADED: list[Loaded] = []
-"""Machine code must outlive the addresses that point into it."""
+"""Loaded code of this process: freed code would leave the addresses dangling."""
 
 
 def _solution(matrix: Sequence[Sequence[Expression]], right: Sequence[Expression]) -> list[Expression]:
-    """Return the solution of linear equations, without pivots: pressures come first, and the diagonal dominates."""
+    """Solve linear equations by elimination without pivoting; pressures come first, where the diagonal dominates."""
     rows, values = [list(row) for row in matrix], list(right)
     size = len(values)
     inverses = []
@@ -181,7 +192,7 @@ def _solution(matrix: Sequence[Sequence[Expression]], right: Sequence[Expression
 
 
 class _Functions:
-    """All functions of a form, as expressions."""
+    """Functions of a form as expressions."""
 
     def __init__(self, form: GreyForm) -> None:
         self.form, self.frame, self.graph = form, frame_of(form), ExpressionGraph()
@@ -208,7 +219,7 @@ class _Functions:
     def _slopes(
         self, group: int, first: int, results: Sequence[Any], variables: dict[int, Expression]
     ) -> list[Expression]:
-        """Return derivatives by variables, given by their columns, and note where they will be written."""
+        """Return the derivatives by `variables` (by column) and record their positions in the results."""
         columns = list(variables)
         slopes = self.graph.jacobian([self.graph.of(result) for result in results], list(variables.values()))
         self._note(group, first, [(row, columns[k]) for row, k in slopes])
@@ -219,7 +230,7 @@ class _Functions:
         self.entries = np.concatenate([self.entries, np.array(places, np.int64).reshape(-1, 2)])
         self.groups[group] = first, begin, len(self.entries)
 
-    def _numbers(self) -> dict[int, Expression]:
+    def _by_parameter(self) -> dict[int, Expression]:
         return dict(enumerate(self.parameters))
 
     def _stage(self) -> None:
@@ -250,14 +261,14 @@ class _Functions:
         self._add("matrix", [slope for row in matrix for slope in row])
         mass, load_forces = self.equations.load(strokes, self._part(frame.speeds, n), joints)
         self._add("load", [*(value for row in mass for value in row), *load_forces])
-        # With the load inside: forces depend on strokes, velocities and parameters, too.
+        # Include the load: its forces depend on strokes, velocities and parameters.
         whole = self.equations.stage(unknowns, stage, mass, load_forces)
         written: list[Expression] = [slope for row in self._jacobian(whole, unknowns) for slope in row]
         moving = {k: self.inputs[k] for k in range(frame.base, frame.strokes)}
         for group, variables in (
             (BY_FRAME, moving),
             (BY_SPOOL, dict(enumerate(spools))),
-            (BY_NUMBER, self._numbers()),
+            (BY_PARAMETER, self._by_parameter()),
         ):
             written += self._slopes(group, len(written), whole, variables)
         self._add("slopes", written)
@@ -270,7 +281,7 @@ class _Functions:
         contents = self.equations.contents(pressures)
         own = [self._jacobian([content], [p])[0][0] for content, p in zip(contents, pressures, strict=True)]
         written = [*contents, *own]
-        written += self._slopes(CONTENT_NUMBERS, len(written), contents, self._numbers())
+        written += self._slopes(CONTENT_PARAMETERS, len(written), contents, self._by_parameter())
         self._add("contents", written)
 
     def _bristles(self) -> None:
@@ -281,29 +292,29 @@ class _Functions:
         by_speed = [self._jacobian([after[i]], [speeds[i]])[0][0] for i in range(n)]
         by_before = [self._jacobian([after[i]], [before[i]])[0][0] for i in range(n)]
         written = [*after, *by_speed, *by_before]
-        written += self._slopes(BRISTLE_NUMBERS, len(written), after, self._numbers())
+        written += self._slopes(BRISTLE_PARAMETERS, len(written), after, self._by_parameter())
         self._add("bristles", written)
 
     def _valves(self) -> None:
         form, frame = self.form, self.frame
         states = self._part(frame.valves, form.valves * at.VALVE_STATES)
-        goals, length = self._part(frame.goals, form.valves), self.inputs[frame.length]
-        remains = [self.equations.remains(j, length) for j in range(form.valves)]
-        computed = self._part(frame.remains, 2 * form.valves)
+        commands, length = self._part(frame.delayed_commands, form.valves), self.inputs[frame.length]
+        lag_factors = [self.equations.lag_factors(j, length) for j in range(form.valves)]
+        computed = self._part(frame.lag_factors, 2 * form.valves)
         after: list[Expression] = []
         followed: list[Expression] = []
         for j in range(form.valves):
             own = states[at.VALVE_STATES * j : at.VALVE_STATES * (j + 1)]
-            after += self.equations.advance_valve(own, goals[j], remains[j])
-            followed += self.equations.advance_valve(own, goals[j], computed[2 * j : 2 * j + 2])
-        self._add("remains", [part for parts in remains for part in parts])
-        self._add("follow", followed)
+            after += self.equations.advance_valve(own, commands[j], lag_factors[j])
+            followed += self.equations.advance_valve(own, commands[j], computed[2 * j : 2 * j + 2])
+        self._add("lag_factors", [part for parts in lag_factors for part in parts])
+        self._add("fast_valves", followed)
         written = [*after]
-        written += self._slopes(VALVE_STATES, len(written), after, dict(enumerate([*states, *goals])))
+        written += self._slopes(VALVE_STATES, len(written), after, dict(enumerate([*states, *commands])))
         places, slopes = [], []
-        for j, numbers in enumerate(self.own):
+        for j, positions in enumerate(self.own):
             mine = after[at.VALVE_STATES * j : at.VALVE_STATES * (j + 1)]
-            for (row, column), slope in self.graph.jacobian(mine, [self.parameters[k] for k in numbers]).items():
+            for (row, column), slope in self.graph.jacobian(mine, [self.parameters[k] for k in positions]).items():
                 places.append((at.VALVE_STATES * j + row, column))
                 slopes.append(slope)
         self._note(VALVE_OWN, len(written), places)
@@ -311,7 +322,7 @@ class _Functions:
 
     @property
     def own(self) -> list[list[int]]:
-        """Parameters of the command path of each valve."""
+        """Positions of the parameters of each valve's command path."""
         play = self.form.circuit_at + at.PLAY
         return [[row[at.DELAY], row[at.PILOT_LAG], row[at.SPOOL_LAG], play] for row in self.form.valve_at]
 
@@ -326,15 +337,15 @@ class _Functions:
         for group, variables in (
             (PUMP_FRAME, {k: self.inputs[k] for k in places}),
             (PUMP_PILOTS, dict(enumerate(pilots))),
-            (PUMP_NUMBERS, self._numbers()),
+            (PUMP_PARAMETERS, self._by_parameter()),
         ):
             written += self._slopes(group, len(written), after, variables)
         self._add("pumps", written)
 
     def program(self, loaded: Loaded) -> GreyProgram:
-        """Return the program with the addresses of machine code."""
+        """Return the program for loaded machine code."""
         form = self.form
-        sizes = form.actuators, form.valves, form.pumps, form.nodes, form.parameters
+        sizes = FormSizes(form.actuators, form.valves, form.pumps, form.nodes, form.parameters)
         own, addresses = np.array(self.own, np.int64), [loaded.addresses[name] for name in FUNCTIONS]
         results = np.array(addresses, np.int64), self.groups, self.entries, own
         return GreyProgram(*results, frame=self.frame, sizes=sizes, results=self.results)

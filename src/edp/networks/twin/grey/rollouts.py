@@ -1,4 +1,4 @@
-"""Batched simulation of grey boxes: free runs with measured ports, and the normal equations of a fit."""
+"""Batched simulation of grey boxes, and the errors of a fit with their derivatives."""
 
 from __future__ import annotations
 
@@ -41,18 +41,18 @@ IntArray = NDArray[np.int64]
 
 
 class RunBatch(NamedTuple):
-    """Runs side by side, in units of the grey box.
+    """Batch of runs in units of the grey box. A simulation updates all arrays from `answers` on in place.
 
     Attributes:
-        demands: commands of the valves, shape (run, tick, valve).
-        measured: readings of the ports, NaN where a port is free, shape (run, tick, output).
-        answers: last outputs, shape (run, output); moved, as all that follow.
+        demands: valve commands, shape (run, sample, valve).
+        measured: measured values of the ports, NaN if a port is free, shape (run, sample, output).
+        answers: last outputs, shape (run, output).
         unknowns: pressures and velocities, shape (run, unknown).
-        strokes: shape (run, actuator).
-        bristles: deflections, shape (run, actuator).
-        displacements: of the pumps, shape (run, pump).
-        valves: shape (run, valve, state).
-        history: commands before, newest first, shape (run, tick, valve).
+        strokes: strokes, shape (run, actuator).
+        bristles: bristle deflections, shape (run, actuator).
+        displacements: pump displacements, shape (run, pump).
+        valves: valve states, shape (run, valve, state).
+        history: earlier valve commands, newest first, shape (run, sample, valve).
     """
 
     demands: Array
@@ -67,17 +67,17 @@ class RunBatch(NamedTuple):
 
 
 class FitTarget(NamedTuple):
-    """What outputs of a fit should be, and the errors of one run.
+    """Measured outputs of a fit, and buffers for the errors of one run.
 
     Attributes:
-        truth: shape (run, tick, output).
-        weight: of the errors, shape (output,).
-        delta: where the Huber loss turns to a line, in weighted errors.
-        prefix: samples at the start whose errors do not count.
-        followed: samples of the prefix that need no load, since all of it is measured.
-        stride: samples from one that counts to the next.
-        errors: weighted, written, shape (row,); empty: the loss alone is wanted.
-        slopes: of the errors by the parameters, written, shape (row, parameter).
+        truth: measured outputs, shape (run, sample, output).
+        weight: weight of the errors, shape (output,).
+        delta: weighted error at which the Huber loss becomes linear.
+        prefix: number of samples at the start that are not evaluated.
+        followed: number of samples at the start in which the load is fully measured and not simulated.
+        stride: number of samples from one evaluated sample to the next.
+        errors: buffer for weighted errors, shape (row,); empty if only the loss is required.
+        slopes: buffer for the derivatives of the errors by the parameters, shape (row, parameter).
     """
 
     truth: Array
@@ -92,7 +92,7 @@ class FitTarget(NamedTuple):
 
 @inner
 def _set_port(kind: int, which: int, value: float, y: Array, s: Array, nodes: int) -> None:
-    """Write a measured velocity (0), stroke (1) or pressure (2) in place of the state."""
+    """Replace the state of a port: velocity (kind 0), stroke (kind 1) or pressure (kind 2)."""
     if kind == 1:
         s[which] = value
     elif kind == 0:
@@ -103,7 +103,7 @@ def _set_port(kind: int, which: int, value: float, y: Array, s: Array, nodes: in
 
 @inner
 def feed(ports: IntArray, measured: Array, y: Array, s: Array) -> None:
-    """Fill the ports with measurements; those that are free stay as they are."""
+    """Replace the states of all measured ports."""
     nodes = len(y) - len(s)
     for c in range(len(ports)):
         if np.isfinite(measured[c]):
@@ -112,7 +112,7 @@ def feed(ports: IntArray, measured: Array, y: Array, s: Array) -> None:
 
 @inner
 def feed_back(ports: IntArray, measured: Array, answers: Array, y: Array, s: Array) -> None:
-    """Fill the ports with measurements, or with the last outputs: the state was rounded to them."""
+    """Replace the states of measured ports by the measurement, and of free ports by the rounded last output."""
     nodes = len(y) - len(s)
     for c in range(len(ports)):
         value = measured[c] if np.isfinite(measured[c]) else answers[c]
@@ -121,7 +121,7 @@ def feed_back(ports: IntArray, measured: Array, answers: Array, y: Array, s: Arr
 
 @inner
 def clear_tangents(ports: IntArray, measured: Array, t_y: Array, t_s: Array) -> None:
-    """Remove the tangents of measured ports."""
+    """Set the tangents of measured ports to zero."""
     nodes = len(t_y) - len(t_s)
     for c in range(len(ports)):
         kind, which = ports[c, 0], ports[c, 1]
@@ -134,15 +134,15 @@ def clear_tangents(ports: IntArray, measured: Array, t_y: Array, t_s: Array) -> 
 
 @inner
 def clamp_outputs(ports: IntArray, bounds: OutputBounds, before: Array, y: Array, s: Array, time: float) -> None:
-    """Limit outputs to their bounds: first velocities, then strokes; no velocity into an end stop.
+    """Limit velocities and pressures, then strokes, to their bounds; set velocities into an end stop to zero.
 
     Args:
-        ports: kind and number of the state behind each output.
-        bounds: of the outputs.
-        before: strokes and velocities, `time` seconds ago.
-        y: unknowns; moved.
-        s: strokes; moved.
-        time: s.
+        ports: kind and index of the state behind each output.
+        bounds: bounds of the outputs.
+        before: strokes and velocities `time` seconds earlier.
+        y: unknowns; updated in place.
+        s: strokes; updated in place.
+        time: time step, s.
     """
     n, nodes = len(s), len(y) - len(s)
     for turn in range(2):
@@ -163,8 +163,9 @@ def clamp_outputs(ports: IntArray, bounds: OutputBounds, before: Array, y: Array
 
 @inner
 def _begin(program: GreyProgram, work: RunValues, batch: RunBatch, run: int) -> None:
-    """Copy the state of a run to its inputs; all tangents are zero."""
-    (n, _, pumps, nodes, _), frame = program.sizes, program.frame
+    """Load the state of a run and set all tangents to zero."""
+    sizes = program.sizes
+    n, pumps, nodes, frame = sizes.actuators, sizes.pumps, sizes.nodes, program.frame
     copy(work.frame[: nodes + n], batch.unknowns[run])
     copy(work.frame[frame.strokes : frame.strokes + n], batch.strokes[run])
     copy(work.frame[frame.bristles : frame.bristles + n], batch.bristles[run])
@@ -178,8 +179,9 @@ def _begin(program: GreyProgram, work: RunValues, batch: RunBatch, run: int) -> 
 
 @inner
 def _end(program: GreyProgram, work: RunValues, batch: RunBatch, run: int) -> None:
-    """Copy the state of a run back."""
-    (n, _, pumps, nodes, _), frame = program.sizes, program.frame
+    """Store the state of a run."""
+    sizes = program.sizes
+    n, pumps, nodes, frame = sizes.actuators, sizes.pumps, sizes.nodes, program.frame
     copy(batch.unknowns[run], work.frame[: nodes + n])
     copy(batch.strokes[run], work.frame[frame.strokes : frame.strokes + n])
     copy(batch.bristles[run], work.frame[frame.bristles : frame.bristles + n])
@@ -190,45 +192,46 @@ def _end(program: GreyProgram, work: RunValues, batch: RunBatch, run: int) -> No
 
 
 @inner
-def _remember(history: Array, demands: Array) -> None:
-    """Put the commands of a sample before those of earlier ones."""
+def _push_commands(history: Array, demands: Array) -> None:
+    """Insert the commands of a sample at the start of the history."""
     for k in range(len(history) - 1, 0, -1):
         copy(history[k], history[k - 1])
     copy(history[0], demands)
 
 
 @inner
-def _follow(program: GreyProgram, machine: MachineArrays, work: RunValues, history: Array, columns_by: int) -> None:
-    """Advance a sample with fully measured load: only valves, displacements and bristles move."""
-    n, frame, by_numbers = program.sizes[0], program.frame, columns_by == at.BY_NUMBERS
-    advance_valves(program, machine, work, history, GAMMA * machine.tick_s, by_numbers)
-    move_pumps(program, machine, work, machine.tick_s, columns_by)
-    advance_valves(program, machine, work, history, (1.0 - GAMMA) * machine.tick_s, by_numbers)
+def _follow(program: GreyProgram, machine: MachineArrays, work: RunValues, history: Array, tangents_by: int) -> None:
+    """Advance valves, pumps and bristles by one sample while the load is fully measured."""
+    n, frame, by_parameters = program.sizes.actuators, program.frame, tangents_by == at.BY_PARAMETERS
+    advance_valves(program, machine, work, history, GAMMA * machine.tick_s, by_parameters)
+    move_pumps(program, machine, work, machine.tick_s, tangents_by)
+    advance_valves(program, machine, work, history, (1.0 - GAMMA) * machine.tick_s, by_parameters)
     work.frame[frame.step] = machine.tick_s
     copy(work.frame[frame.bristle_base : frame.bristle_base + n], work.frame[frame.bristles : frame.bristles + n])
-    if columns_by:
+    if tangents_by:
         copy_rows(
             work.tangents[frame.bristle_base : frame.bristle_base + n],
             work.tangents[frame.bristles : frame.bristles + n],
         )
-    move_bristles(program, machine, work, columns_by)
+    move_bristles(program, machine, work, tangents_by)
 
 
 @compiled
-def judge_run(program: GreyProgram, machine: MachineArrays, batch: RunBatch, run: int, target: FitTarget) -> float:
-    """Simulate one run of a batch, which moves, and return its Huber loss.
+def evaluate_run(program: GreyProgram, machine: MachineArrays, batch: RunBatch, run: int, target: FitTarget) -> float:
+    """Simulate one run of a batch, write its errors and return its Huber loss.
 
     Args:
-        program: of the form.
-        machine: its parameters.
-        batch: of runs.
-        run: number of the run.
-        target: what the outputs should be.
+        program: compiled equations.
+        machine: parameters and constants.
+        batch: batch of runs; updated in place.
+        run: index of the run.
+        target: measured outputs and buffers.
     """
-    (n, _, _, nodes, parameters), ports, history = program.sizes, machine.ports, batch.history[run]
+    sizes, ports, history = program.sizes, machine.ports, batch.history[run]
+    n, nodes = sizes.actuators, sizes.nodes
     full = len(target.errors) > 0
-    columns_by = at.BY_NUMBERS if full else at.NONE
-    work = work_arrays(program, parameters if full else 0)
+    tangents_by = at.BY_PARAMETERS if full else at.NONE
+    work = work_arrays(program, sizes.parameters if full else 0)
     first = program.frame.strokes
     y, s = work.frame[: nodes + n], work.frame[first : first + n]
     t_y, t_s = work.tangents[: nodes + n], work.tangents[first : first + n]
@@ -238,11 +241,11 @@ def judge_run(program: GreyProgram, machine: MachineArrays, batch: RunBatch, run
         feed(ports, batch.measured[run, t], y, s)
         if full:
             clear_tangents(ports, batch.measured[run, t], t_y, t_s)
-        _remember(history, batch.demands[run, t])
+        _push_commands(history, batch.demands[run, t])
         if t < target.followed:
-            _follow(program, machine, work, history, columns_by)
+            _follow(program, machine, work, history, tangents_by)
             continue
-        tick(program, machine, work, history, columns_by)
+        tick(program, machine, work, history, tangents_by)
         done = t + 1 - target.prefix
         if done > 0 and (done % target.stride == 0 or t + 1 == ticks):
             loss += _sum_errors(program, machine, target, target.truth[run, t], work, used)
@@ -255,8 +258,8 @@ def judge_run(program: GreyProgram, machine: MachineArrays, batch: RunBatch, run
 def _sum_errors(
     program: GreyProgram, machine: MachineArrays, target: FitTarget, truth: Array, work: RunValues, used: int
 ) -> float:
-    """Return the Huber loss of one sample; write its weighted errors and their slopes behind those that are used."""
-    loss, nodes = 0.0, program.sizes[3]
+    """Return the Huber loss of one sample; write its errors and their derivatives from row `used` on."""
+    loss, nodes = 0.0, program.sizes.nodes
     for c in range(len(machine.ports)):
         kind = machine.ports[c, 0]
         first = nodes if kind == 0 else (program.frame.strokes if kind == 1 else 0)
@@ -265,7 +268,7 @@ def _sum_errors(
         size = abs(error)
         loss += 0.5 * error * error if size <= target.delta else target.delta * (size - 0.5 * target.delta)
         if len(target.errors) > 0:
-            # Rows beyond delta count as much as their gradient says (iteratively reweighted least squares).
+            # Weight errors above delta by their gradient (iteratively reweighted least squares).
             share = 1.0 if size <= target.delta else math.sqrt(target.delta / size)
             target.errors[used + c] = share * error
             for k in range(work.tangents.shape[1]):
@@ -283,18 +286,19 @@ def run_batch(
     cell: Cell | None,
     trace: RunTrace | None,
 ) -> None:
-    """Simulate runs side by side, each port measured or fed back; outputs are bounded and rounded.
+    """Simulate a batch of runs and write bounded outputs, rounded to single precision.
 
     Args:
-        program: of the form.
-        machine: its parameters.
-        bounds: of the outputs.
-        batch: of runs; moved.
-        answers: outputs, written, shape (run, tick, output), SI units.
-        cell: a network's part in the outputs; None without one.
-        trace: written for `edp.networks.twin.grey.correction.run_back`; None: nothing is.
+        program: compiled equations.
+        machine: parameters and constants.
+        bounds: bounds of the outputs.
+        batch: batch of runs; updated in place.
+        answers: buffer for the outputs, SI units, shape (run, sample, output).
+        cell: network that corrects the outputs; None for a grey box alone.
+        trace: buffers for `edp.networks.twin.grey.correction.run_back`; None if no gradient is required.
     """
-    (n, _, _, nodes, _), frame, ports = program.sizes, program.frame, machine.ports
+    sizes = program.sizes
+    n, nodes, frame, ports = sizes.actuators, sizes.nodes, program.frame, machine.ports
     columns = 0
     if trace is not None:
         columns = trace.slopes.shape[2]
@@ -309,17 +313,17 @@ def run_batch(
         for t in range(batch.demands.shape[1]):
             measured = batch.measured[run, t]
             feed_back(ports, measured, batch.answers[run], y, s)
-            _remember(history, batch.demands[run, t])
+            _push_commands(history, batch.demands[run, t])
             copy(before[:n], s)
             copy(before[n:], y[nodes:])
-            columns_by = at.NONE
+            tangents_by = at.NONE
             if cell is not None:
                 fed_ports(ports, y, s, fed)
             if trace is not None:
                 by_weights = by_weights or not _are_finite(measured)
-                columns_by = at.BY_STATE if by_weights else at.NONE
+                tangents_by = at.BY_STATE if by_weights else at.NONE
                 seed(rows, tangents)
-            tick(program, machine, work, history, columns_by)
+            tick(program, machine, work, history, tangents_by)
             if trace is not None and by_weights:
                 note_slopes((t, run), rows, tangents, trace)
             if cell is not None:
@@ -328,8 +332,8 @@ def run_batch(
             clamp_outputs(ports, bounds, before, y, s, machine.tick_s)
             if trace is not None:
                 note_bounds((t, run), y, s, ports, bounds, proposed, trace)
-            # A state as single precision keeps it, so that a chunk and its samples give the same bits.
-            _round(values[: frame.goals])
+            # Round the state to single precision, so that one call and many short calls give the same bits.
+            _round(values[: frame.delayed_commands])
             for row in history:
                 _round(row)
             _write_answers(ports, bounds, y, s, answers[run, t], batch.answers[run])
@@ -352,7 +356,7 @@ def _round(values: Array) -> None:
 
 @inner
 def _write_answers(ports: IntArray, bounds: OutputBounds, y: Array, s: Array, answers: Array, last: Array) -> None:
-    """Write outputs in SI units, and in units of the grey box, rounded to single precision."""
+    """Write the outputs in SI units and in units of the grey box, rounded to single precision."""
     nodes = len(y) - len(s)
     for c in range(len(ports)):
         kind, which = ports[c, 0], ports[c, 1]

@@ -1,1 +1,1 @@
-"""Equations as expressions: written once with operators, differentiated automatically, compiled to machine code."""
+"""Symbolic expressions: written with Python operators, differentiated automatically, compiled to machine code."""

@@ -1,7 +1,7 @@
 """Scalar expressions and their derivatives.
 
-Equal expressions are one object, so that what several results share is computed once. Derivatives are found by
-automatic differentiation in reverse (Griewank and Walther, Evaluating Derivatives, 2008).
+Equal expressions are one object, so that common subexpressions are computed once. Derivatives come from reverse-mode
+automatic differentiation (Griewank and Walther, Evaluating Derivatives, 2008).
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ class Expression:
     """One operation on other expressions.
 
     Attributes:
-        graph: to which it belongs.
-        index: in the order of creation; arguments come before what is made of them.
-        operation: ``constant``, ``input``, ``+``, ``-``, ``*``, ``/``, ``less`` (of four: if a < b then c, else d), or
-            one of `FUNCTIONS`.
-        arguments: of the operation.
-        value: of a constant.
+        graph: graph that owns the expression.
+        index: position in the order of creation; the arguments of an expression have smaller indices.
+        operation: ``constant``, ``input``, ``+``, ``-``, ``*``, ``/``, ``less`` (four arguments: c if a < b, else d),
+            or a name in `FUNCTIONS`.
+        arguments: arguments of the operation.
+        value: value of a constant.
     """
 
     graph: ExpressionGraph
@@ -64,10 +64,10 @@ class Expression:
 
 @dataclass(eq=False)
 class ExpressionGraph:
-    """All expressions of one set of equations.
+    """Expressions of one set of equations.
 
     Attributes:
-        nodes: every expression, arguments first.
+        nodes: all expressions; arguments come before the expressions that use them.
     """
 
     nodes: list[Expression] = field(default_factory=list)
@@ -83,15 +83,18 @@ class ExpressionGraph:
         return self._known[identity]
 
     def of(self, value: Expression | float) -> Expression:
-        """Return an expression, or the constant of a number."""
+        """Return `value` itself if it is an expression, else a constant expression."""
         return value if isinstance(value, Expression) else self._node("constant", value=float(value))
 
     def inputs(self, name: str, count: int) -> list[Expression]:
-        """Return new inputs."""
+        """Return `count` input expressions."""
         return [self._node("input", key=(name, index)) for index in range(count)]
 
     def link(self, values: Sequence[Expression], argument: Expression) -> None:
-        """State that inputs are a function of an expression and its derivatives: each the derivative of the last."""
+        """Declare inputs as a function of `argument` and the successive derivatives of this function.
+
+        The caller computes the inputs, for example by interpolation; `gradient` then applies the chain rule.
+        """
         for value, slope in pairwise(values):
             self._slopes[value.index] = (argument, slope)
 
@@ -129,16 +132,16 @@ class ExpressionGraph:
         return self.multiply(a, self._node("/", self.of(1.0), b))
 
     def less(self, a: Any, b: Any, then: Any, otherwise: Any) -> Expression:
-        """Return `then` where a < b, `otherwise` elsewhere, also where one of them is not a number."""
+        """Return `then` if a < b, else `otherwise`; NaN compares as false."""
         chosen = self.of(then), self.of(otherwise)
         return chosen[0] if chosen[0] is chosen[1] else self._node("less", self.of(a), self.of(b), *chosen)
 
     def least(self, a: Any, b: Any) -> Expression:
-        """Return the smaller of two."""
+        """Return the smaller of two expressions."""
         return self.less(a, b, a, b)
 
     def largest(self, a: Any, b: Any) -> Expression:
-        """Return the larger of two."""
+        """Return the larger of two expressions."""
         return self.less(a, b, b, a)
 
     def absolute(self, a: Any) -> Expression:
@@ -146,14 +149,14 @@ class ExpressionGraph:
         return self.less(a, 0.0, -a, a)
 
     def function(self, name: str, a: Any) -> Expression:
-        """Return one of `FUNCTIONS` of an expression."""
+        """Return the function `name`, one of `FUNCTIONS`, of an expression."""
         argument = self.of(a)
         if argument.operation == "constant":
             return self.of(getattr(math, name)(argument.value))
         return self._node(name, argument)
 
     def gradient(self, result: Expression) -> dict[int, Expression]:
-        """Return the derivatives of an expression by all that it is made of, by their index; zeros are left out."""
+        """Return the derivatives of an expression by its subexpressions, by their index; zeros are omitted."""
         adjoint: dict[int, Expression] = {result.index: self.of(1.0)}
         for node in self._below([result]):
             weight = adjoint.get(node.index)
@@ -168,7 +171,7 @@ class ExpressionGraph:
     def jacobian(
         self, results: Sequence[Expression], variables: Sequence[Expression]
     ) -> dict[tuple[int, int], Expression]:
-        """Return the derivatives that are not zero everywhere, by the places of result and variable."""
+        """Return the derivatives that are not identically zero, by the positions of result and variable."""
         entries = {}
         for row, result in enumerate(results):
             slopes = self.gradient(result)
@@ -178,7 +181,7 @@ class ExpressionGraph:
         return entries
 
     def needed(self, results: Iterable[Expression]) -> list[Expression]:
-        """Return all that results are made of, arguments first."""
+        """Return the subexpressions of `results`; arguments come before the expressions that use them."""
         return self._below(results)[::-1]
 
     def _below(self, results: Iterable[Expression]) -> list[Expression]:
@@ -196,7 +199,7 @@ class ExpressionGraph:
         return node.arguments if linked is None else (linked[0],)
 
     def _shares(self, node: Expression, weight: Expression) -> list[tuple[Expression, Expression]]:
-        """Return arguments, each with `weight` times the derivative of an expression by it."""
+        """Return the arguments of a node, each with `weight` times the derivative of the node by that argument."""
         if node.index in self._slopes:
             argument, slope = self._slopes[node.index]
             return [(argument, weight * slope)]

@@ -1,7 +1,7 @@
-"""Machine code of expressions, made by LLVM without a C compiler, and its cache on disk.
+"""Compiler of expressions to machine code with LLVM, without a C compiler, and the cache of this code on disk.
 
-Operations run in double precision and in the order written; none are fused. Every function has four arguments, arrays
-of double precision: parameters, constants and inputs, which it reads, and results, which it writes.
+Operations run in double precision, in the order written, without fusion. Every function takes four arrays in double
+precision: it reads parameters, constants and inputs, and writes results.
 """
 
 from __future__ import annotations
@@ -22,8 +22,10 @@ from edp.networks.twin.symbolic.expression import Expression, ExpressionGraph
 from edp.storage import write_bytes
 
 DOUBLE, INDEX, VOID = ir.DoubleType(), ir.IntType(64), ir.VoidType()
+MAX_OPTIMISED = 40_000
+"""Maximum number of operations of a module whose code generation is optimised."""
 CHECK = 16
-"""Bytes of the checksum before machine code in a file: LLVM trusts what it loads."""
+"""Bytes of the checksum before machine code in a file; LLVM does not verify the code that it loads."""
 OPERATORS = {"+": "fadd", "-": "fsub", "*": "fmul", "/": "fdiv"}
 
 
@@ -32,8 +34,8 @@ class Loaded:
     """Machine code in memory.
 
     Attributes:
-        addresses: of the functions by name.
-        engine: owner of the code, which frees it.
+        addresses: addresses of the functions by name.
+        engine: owner of the code; the code is freed with the engine.
     """
 
     addresses: Mapping[str, int]
@@ -41,20 +43,21 @@ class Loaded:
 
 
 class CodeModule:
-    """Functions of one graph, in the order in which they are added.
+    """Functions compiled from one graph.
 
     Args:
-        graph: of the expressions.
-        groups: parameters, constants and inputs.
+        graph: graph of the expressions.
+        groups: parameters, constants and inputs: the input expressions of the three arrays that a function reads.
     """
 
     def __init__(self, graph: ExpressionGraph, groups: Sequence[Sequence[Expression]]) -> None:
         self._graph, self._code = graph, ir.Module("equations")
         self._places = {node.index: (at, k) for at, group in enumerate(groups) for k, node in enumerate(group)}
         self.names: list[str] = []
+        self.operations = 0
 
     def add(self, name: str, results: Sequence[Expression]) -> None:
-        """Add a function that writes `results` in their order."""
+        """Add a function that computes `results`."""
         self.names.append(name)
         pointer = DOUBLE.as_pointer()
         function = ir.Function(self._code, ir.FunctionType(VOID, [pointer] * 4), name)
@@ -62,7 +65,9 @@ class CodeModule:
             argument.add_attribute("noalias")
         build = ir.IRBuilder(function.append_basic_block())
         values: dict[int, ir.Value] = {}
-        for node in self._graph.needed(results):
+        nodes = self._graph.needed(results)
+        self.operations += len(nodes)
+        for node in nodes:
             values[node.index] = self._value(build, function, node, values)
         for k, node in enumerate(results):
             build.store(values[node.index], build.gep(function.args[-1], [INDEX(k)]))
@@ -90,7 +95,8 @@ class CodeModule:
 
     def object_code(self) -> bytes:
         """Return the machine code for this processor."""
-        machine = _target_machine()
+        # The time of optimised code generation grows with a power of the length of a function.
+        machine = _target_machine(optimised=self.operations <= MAX_OPTIMISED)
         parsed = binding.parse_assembly(str(self._code))
         options = binding.create_pipeline_tuning_options(speed_level=2)
         passes = binding.create_pass_builder(machine, options)
@@ -99,7 +105,7 @@ class CodeModule:
 
 
 def digest_of(*parts: object) -> str:
-    """Return the name of machine code in a cache: what it is made of, processor and version of LLVM."""
+    """Return a digest of `parts`, the processor and the version of LLVM: the key of machine code in the cache."""
     state = hashlib.blake2b(digest_size=16)
     for part in (*parts, binding.get_host_cpu_name(), _features(), binding.llvm_version_info):
         state.update(repr(part).encode() + b"\0")
@@ -107,7 +113,12 @@ def digest_of(*parts: object) -> str:
 
 
 def load(code: bytes, names: Sequence[str]) -> Loaded:
-    """Return functions that can be called."""
+    """Load machine code into memory.
+
+    Args:
+        code: result of `CodeModule.object_code`.
+        names: names of its functions.
+    """
     _target_machine()
     engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _target_machine())
     engine.add_object_file(binding.ObjectFileRef.from_data(code))
@@ -115,14 +126,19 @@ def load(code: bytes, names: Sequence[str]) -> Loaded:
     return Loaded({name: engine.get_function_address(name) for name in names}, engine)
 
 
-def read_or_make(file: Path | None, make: Callable[[], bytes]) -> bytes:
-    """Return machine code from a file; where there is none, or a damaged one, make it and keep it there if possible."""
+def read_or_compile(file: Path | None, compile_code: Callable[[], bytes]) -> bytes:
+    """Return machine code from a cache file; if the file is absent or damaged, compile the code and write the file.
+
+    Args:
+        file: cache file, or None to compile without a cache. A file that cannot be written is not an error.
+        compile_code: returns the machine code.
+    """
     if file is not None:
         with contextlib.suppress(OSError):
             content = file.read_bytes()
             if content[:CHECK] == _check(content[CHECK:]):
                 return content[CHECK:]
-    code = make()
+    code = compile_code()
     if file is not None:
         with contextlib.suppress(OSError, StorageError):
             write_bytes(file, _check(code) + code)
@@ -133,11 +149,16 @@ def _check(code: bytes) -> bytes:
     return hashlib.blake2b(code, digest_size=CHECK).digest()
 
 
-def _target_machine() -> Any:
+def _target_machine(optimised: bool = True) -> Any:
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
     return binding.Target.from_default_triple().create_target_machine(
-        opt=2, cpu=binding.get_host_cpu_name(), features=_features(), reloc="pic", codemodel="jitdefault", jit=True
+        opt=2 if optimised else 0,
+        cpu=binding.get_host_cpu_name(),
+        features=_features(),
+        reloc="pic",
+        codemodel="jitdefault",
+        jit=True,
     )
 
 
@@ -149,7 +170,7 @@ def _features() -> str:
 
 
 def _call(typing: Any, address: Any, parameters: Any, constants: Any, inputs: Any, results: Any) -> Any:
-    """Call a function of `Loaded` at an address, from code that Numba compiles."""
+    """Emit the call of a `Loaded` function at an address, for code compiled by Numba."""
     signature = types.void(address, parameters, constants, inputs, results)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -163,4 +184,4 @@ def _call(typing: Any, address: Any, parameters: Any, constants: Any, inputs: An
 
 
 call: Any = intrinsic(_call)
-"""``call(address, parameters, constants, inputs, results)``, in code that Numba compiles."""
+"""``call(address, parameters, constants, inputs, results)`` for code compiled by Numba."""
