@@ -34,6 +34,7 @@ $(READY): pyproject.toml constraints.txt requirements.lock
 		set -x; $(BIN)/python -m $(INSTALL) --require-hashes -r requirements.lock; \
 	fi
 	$(BIN)/python -m $(INSTALL) --no-build-isolation -e .
+	@$(BIN)/edp doctor --compile > /dev/null || echo "compiling ahead failed: code is compiled at its first use"
 	@touch $@
 
 lock: ## write requirements.lock from pyproject.toml and constraints.txt; give the result to a review

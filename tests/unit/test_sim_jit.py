@@ -139,3 +139,29 @@ def test_not_a_number_stays_visible():
         return np.isnan(x)
 
     assert echo(float("nan"))
+
+
+AHEAD = "from edp.workflows.compile_ahead import compile_ahead; compile_ahead()"
+FIRST_USE = """
+from numba.core import event
+compiled = []
+class Compilations(event.Listener):
+    def on_start(self, event):
+        compiled.append(event.data["dispatcher"].py_func.__qualname__)
+    def on_end(self, event):
+        pass
+with event.install_listener("numba:compile", Compilations()):
+    from edp.workflows.compile_ahead import compile_ahead
+    compile_ahead()
+print(compiled)
+"""
+
+
+@pytest.mark.slow
+def test_code_compiled_ahead_is_not_compiled_again(tmp_path):
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    subprocess.run([sys.executable, "-c", AHEAD], env=environment, check=True)
+    second = subprocess.run(
+        [sys.executable, "-c", FIRST_USE], env=environment, check=True, capture_output=True, text=True
+    )
+    assert second.stdout.strip() == "[]"

@@ -19,6 +19,7 @@ import typer
 
 from edp import __version__
 from edp.cli.console import JsonFlag, emit, listing, out
+from edp.cli.progress import shown_progress
 from edp.errors import EdpError, count_of
 from edp.storage.paths import is_folder_at
 from edp.wording import figure, number
@@ -77,6 +78,10 @@ class InstallationCheck:
 
 def doctor(
     folder: Annotated[Path, typer.Argument(help="Where runs are to be written; its disk is looked at.")] = Path(),
+    ahead: Annotated[
+        bool,
+        typer.Option("--compile", help="First compile simulator, twins and controllers, so that no first call has to."),
+    ] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Check versions, optional parts, the sandbox, compilers, disk, memory and threads; print missing parts.
@@ -85,6 +90,11 @@ def doctor(
 
     Example: `edp doctor`
     """
+    if ahead:
+        from edp.workflows.compile_ahead import compile_ahead
+
+        with shown_progress("doctor", as_json) as progress:
+            compile_ahead(progress)
     checks = [*packages(), *machine(folder), reading(), *sandbox_layers(), *extras(), *programs()]
     broken = [check for check in checks if check.state == "broken"]
 

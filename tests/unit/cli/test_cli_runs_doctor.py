@@ -138,6 +138,15 @@ def test_doctor_says_what_is_there_and_what_for(edp, tmp_path):
     assert re.search(r"optional parts? missing", shown)
 
 
+def test_doctor_compiles_only_on_request(edp, tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr("edp.workflows.compile_ahead.compile_ahead", lambda progress: calls.append(progress))
+    assert edp("doctor", tmp_path).code == 0
+    assert not calls
+    assert edp("doctor", tmp_path, "--compile").code == 0
+    assert len(calls) == 1
+
+
 def test_doctor_names_what_is_missing_and_ends_with_3_where_edp_needs_it(edp, tmp_path, monkeypatch):
     monkeypatch.setattr(doctor_command.shutil, "which", lambda name: None)
     monkeypatch.setattr(doctor_command.importlib.util, "find_spec", lambda name: None)
