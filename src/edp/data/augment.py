@@ -20,7 +20,7 @@ class AugmentationSpec(Protocol):
         """Return an augmented segment of the same length.
 
         Args:
-            part: from a reset to the next one, with what its last targets need.
+            part: segment from one reset to the next, including the rows that its last targets need.
             deviation: ``(input,)``, standard deviation of each input in the training data, SI units.
             rng: the only source of chance.
         """

@@ -47,9 +47,9 @@ class Spectrum:
         names: commands; two one-sided ones as their difference.
         frequency_hz: shape ``(frequency,)``.
         density: power spectral density, shape ``(frequency, command)``.
-        flat_to_hz: how far each stays within 10 dB of its maximum.
-        drop_db: how far each lies below its maximum at `used_hz`.
-        used_hz: up to here they should be flat.
+        flat_to_hz: frequency up to which each spectrum stays within 10 dB of its maximum.
+        drop_db: attenuation of each spectrum at `used_hz` below its maximum.
+        used_hz: frequency up to which spectra should be flat.
     """
 
     names: tuple[str, ...]
@@ -116,7 +116,7 @@ class Coverage:
         inputs: channels that command.
         singular: smallest singular value of the input Hankel matrix by lags; inputs of deviation 1.
         constant: inputs that never change, left out of `singular`.
-        absent: what could not be looked at, and why.
+        absent: figures that could not be computed, each with the reason.
         contradictions: strokes that are no integrals of their velocities, and what to do.
     """
 
@@ -151,7 +151,7 @@ def cover(
     """Compute the coverage of a data set.
 
     Args:
-        recordings: at one rate, with equal channels.
+        recordings: recordings with one sample rate and equal channels.
         inputs: channels that command, where neither name nor kind tells.
         split: also say how far its tests lie from its training.
         dead_band: share of the largest command that moves nothing.

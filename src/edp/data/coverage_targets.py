@@ -19,11 +19,11 @@ class CoverageTarget:
     """One coverage figure and its target.
 
     Attributes:
-        name: what.
+        name: name of the figure.
         value: the figure.
         bound: least or most that is wanted.
         at_least: whether the bound is the least; else the most.
-        unit: of both; shares are in %.
+        unit: unit of value and target; fractions are in %.
     """
 
     name: str

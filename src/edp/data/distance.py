@@ -26,9 +26,9 @@ class Distance:
     """Distance to the nearest training sample, in deviations of a signal (root mean square over the signals).
 
     Attributes:
-        signals: how many numbers make a state.
+        signals: number of signals in a state.
         test: median and 95 % quantile over test samples.
-        train: the same from one half of the training stretches to the other, with as many references: the yardstick.
+        train: reference distances from one half of the training segments to the other half, with equally many samples.
         beyond: share of test samples farther away than 95 % of the training samples; 5 % where both are alike.
     """
 

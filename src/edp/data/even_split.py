@@ -33,7 +33,7 @@ def moving_ticks(recordings: Sequence[Recording], channels: Sequence[str], span:
 
     Args:
         recordings: the data set.
-        channels: by name; a recording that lacks one is asked for the others.
+        channels: channel names. If a recording lacks one, the others are used.
         span: ticks over which a change is looked at, forward.
     """
     changes = []
@@ -58,10 +58,10 @@ def is_even(
     """Return whether each part has at least `LEAST_OF_SHARE` of the weight expected from its fraction of the data.
 
     Args:
-        split: how to divide.
+        split: division of the recordings.
         recordings: the data set.
         gap: ticks between neighbouring stretches of different parts.
-        weights: which ticks of each recording count.
+        weights: samples of each recording that count.
     """
     try:
         parts = split.split(recordings, gap)
@@ -88,10 +88,10 @@ def most_unlike(
     """Compare root-mean-square changes of each channel in the test part with the rest; return the largest difference.
 
     Args:
-        split: how to divide.
+        split: division of the recordings.
         recordings: the data set.
         gap: ticks between neighbouring stretches of different parts.
-        channels: by name; a recording that lacks one is asked for the others.
+        channels: channel names. If a recording lacks one, the others are used.
         spans: ticks over which changes are looked at.
 
     Returns:
@@ -144,9 +144,9 @@ def blocks_where_time_is_uneven(
 
     Args:
         recordings: the data set.
-        channels: what is predicted, by name.
-        horizons: in ticks.
-        by_time: how they would be divided.
+        channels: names of the predicted channels.
+        horizons: horizons in samples.
+        by_time: intended division by time.
     """
     blocks, even_in_blocks, even_in_time = _evenness(recordings, channels, horizons, by_time)
     if not even_in_blocks:
@@ -175,9 +175,9 @@ def rests_where_it_tests(
 
     Args:
         recordings: the data set.
-        channels: what is predicted, by name.
-        horizons: in ticks.
-        by_time: how they would be divided.
+        channels: names of the predicted channels.
+        horizons: horizons in samples.
+        by_time: intended division by time.
     """
     _, *even = _evenness(recordings, channels, horizons, by_time)
     return not any(even)

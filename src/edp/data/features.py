@@ -37,7 +37,8 @@ class Derivation:
     Attributes:
         of_changes: whether s is the change ``x[t] - x[t - 1]``, and not x itself.
         gain: see `Gain`.
-        least_ticks: of a span that is given in seconds; 0 where the derivation takes none, and n is 1.
+        least_ticks: minimum length of a span that is stated in seconds, in samples; 0 if the derivation has no span (n
+            = 1).
     """
 
     of_changes: bool
@@ -64,7 +65,7 @@ class Derived:
         name: its own.
         source: the logged channel that it comes from.
         how: a registered derivation.
-        kind: what it measures.
+        kind: physical quantity.
         seconds: span that it looks back, for derivations that take one; rounded to ticks of the task's rate.
     """
 
@@ -120,13 +121,13 @@ class FeatureSet:
     """The columns of a network: logged channels, then derived ones.
 
     Attributes:
-        name: how reports call it.
+        name: name in reports.
         channels: logged channels, in order; these are the inputs of a bundle, in SI units.
         derived: channels computed inside the predictor, appended in order.
         hidden: logged channels that only serve as sources of derived ones; inputs, but not features.
         starting: logged channels that are read in the first ticks after a reset only, so that a free run starts from
             a measured state; with them comes the feature `STARTING`, 1 while they are read and 0 from then on.
-        starting_ticks: how many ticks they are read.
+        starting_ticks: number of samples for which the start-up channels are read.
     """
 
     name: str

@@ -23,7 +23,7 @@ class FoldRidge:
     """Linear maps of each fold and of all rows.
 
     Attributes:
-        weights: of each fold, ``(fold, column, output)``.
+        weights: weights of each fold, ``(fold, column, output)``.
         intercepts: ``(fold, output)``.
         left_out: predictions of each row by the fold that left it out, ``(row, output)``.
     """
@@ -81,10 +81,10 @@ class TableMoments:
     """Means and covariances of a table and its targets.
 
     Attributes:
-        covariance: of the columns, ``(column, column)``.
-        cross: of columns and targets, ``(column, output)``.
-        mean: of the columns; `level` of the targets.
-        variance: of the targets.
+        covariance: covariance of the columns, ``(column, column)``.
+        cross: covariance of columns and targets, ``(column, output)``.
+        mean: mean of the columns; `level` is the mean of the targets.
+        variance: variance of the targets.
     """
 
     covariance: DoubleArray
@@ -110,7 +110,7 @@ class _Spectrum:
     """Ridge regressions of one set of rows, for any penalty.
 
     Attributes:
-        moments: of the rows.
+        moments: means and covariances of the rows.
         values: eigenvalues of their covariance.
         vectors: its eigenvectors, ``(column, direction)``.
         turned: covariances of directions and targets, ``(direction, output)``.
@@ -139,10 +139,10 @@ class _Sums:
     """Sums of products over rows, centred on common values.
 
     Attributes:
-        rows: how many.
-        squares: of columns, ``(column, column)``.
-        cross: of columns and targets, ``(column, target)``.
-        first: of the columns themselves; `level` of the targets, and `power` of their squares.
+        rows: number of rows.
+        squares: products of columns, ``(column, column)``.
+        cross: products of columns and targets, ``(column, target)``.
+        first: sums of the columns; `level` are sums of the targets, `power` sums of their squares.
     """
 
     rows: int

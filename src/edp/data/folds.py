@@ -51,7 +51,7 @@ def blocked_folds(lengths: Sequence[int], folds: int, gap: int, pieces: int = 1)
         lengths: rows of each stretch, in order.
         folds: number of folds, 2 or more.
         gap: rows beside a piece, in the same stretch, that share history or future with it and do not train.
-        pieces: of each fold; the folds take the pieces in turn.
+        pieces: number of contiguous parts per fold. Consecutive parts belong to different folds.
 
     Raises:
         DataError: too few rows for so many folds, or a fold would have nothing to train on.
@@ -95,7 +95,7 @@ def recording_folds(lengths: Sequence[int], recordings: Sequence[str], folds: in
 
     Args:
         lengths: rows of each stretch, laid end to end.
-        recordings: of which recording each stretch is.
+        recordings: index of the recording of each segment.
         folds: number of folds at most.
 
     Returns:

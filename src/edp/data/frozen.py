@@ -28,8 +28,8 @@ class Session:
     """A session by its content.
 
     Attributes:
-        name: that it had; for messages only.
-        digest: of its content (`edp.recording.Recording.digest`).
+        name: name at the time of the division, for messages.
+        digest: hash of its content (`edp.recording.Recording.digest`).
     """
 
     name: str
@@ -50,11 +50,12 @@ class ByFrozen:
         validation: development sessions that validate.
         train: development sessions that train.
         study: folder of the search, whose ledger records each look at the second sealed test set.
-        missing: what happens where a frozen session is not among the recordings: ``refuse``, or ``draw`` for other
-            data: a share of what is left tests, and validates where no session of `validation` is there.
+        missing: action if a frozen session is not among the recordings: ``refuse``, or ``draw`` for other data.
+            ``draw`` tests on a fraction of the remaining recordings, and also validates on them if no session of
+            `validation` is present.
         validation_share: share that is drawn to validate.
         test_share: share that is drawn to test.
-        seed: of the draw.
+        seed: random seed of the draw.
 
     Raises:
         ConfigError: a session in two parts, or an unknown `missing`.
@@ -171,9 +172,9 @@ def refuse_frozen(recordings: Sequence[Recording], frozen: Mapping[str, str], wh
     """See that no recording is a frozen session.
 
     Args:
-        recordings: that are to train, calibrate or choose.
+        recordings: recordings for training, calibration or selection.
         frozen: names of frozen sessions by digest.
-        what: what they are to do, for the message.
+        what: purpose of the recordings, for the message.
 
     Raises:
         DataError: one is; the message names it.

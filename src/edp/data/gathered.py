@@ -49,7 +49,8 @@ class _Gathered(_OnDemand):
     Args:
         values: all samples of the recording, ``(time, channel)``.
         places: column of each.
-        gains: where not 0, the column is ``(x[t] - x[t - 1]) gain``, with 0 at the first tick of the recording.
+        gains: gain of each column. For a gain other than 0 the column is ``(x[t] - x[t - 1]) gain``, with 0 at the
+            first sample of the recording.
         rows: first row, and the one after the last.
     """
 
@@ -123,7 +124,7 @@ def made_when_read(shape: tuple[int, int], make: Make, slot: LastMade) -> FloatA
     """Return an array ``(time, column)`` that is computed on access, for data that are read recording by recording.
 
     Args:
-        shape: of what `make` gives.
+        shape: shape of the result of `make`.
         make: gives the whole array, the same each time.
         slot: shared by arrays of which one at a time is to be in memory.
     """

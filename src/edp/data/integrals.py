@@ -28,7 +28,7 @@ class IntegralFit:
     Attributes:
         ratio: root-mean-square change of the stroke over that of the integral; negative where they go against each
             other, 0 where one of them rests.
-        correlation: of the two changes, about zero.
+        correlation: correlation of the two changes about zero.
     """
 
     ratio: float
@@ -45,7 +45,7 @@ def integral_fit(pairs: Sequence[tuple[Rows, Rows]], rate_hz: float) -> Integral
 
     Args:
         pairs: velocity and stroke of each stretch ``(tick,)``, in units that belong together.
-        rate_hz: of the samples.
+        rate_hz: sample rate.
     """
     ticks = max(LEAST_TICKS, round(WINDOW_S * rate_hz))
     of_stroke, of_velocity, both = 0.0, 0.0, 0.0

@@ -20,7 +20,7 @@ class RandomOrder:
 
     Args:
         rng: the source of chance.
-        count: how many things.
+        count: length of the permutation.
     """
 
     def __init__(self, rng: np.random.Generator, count: int) -> None:

@@ -20,7 +20,7 @@ class Prepared:
     """Series of each part of the split, with the kinds of their channels.
 
     Attributes:
-        task: what is read and predicted.
+        task: channels to read and to predict.
         train: training stretches; `validation` and `test` likewise.
         inputs: the logged input channels.
         feature_kinds: kind of each feature, in order.
@@ -49,8 +49,8 @@ def prepare(recordings: Sequence[Recording], task: Task, split: SplitSpec, windo
 
     Args:
         recordings: the data set, all at the rate of the task.
-        task: what is read and predicted.
-        split: how to divide.
+        task: channels to read and to predict.
+        split: division of the recordings.
         window: W; the gap between neighbouring stretches is ``W + k``.
 
     Raises:

@@ -74,8 +74,8 @@ def ridge_solution(
     to persistence. Memory is a few Gram matrices of ``(history * input)`` squared, whatever the length of the series.
 
     Args:
-        train: at least one series with a full history and the longest horizon.
-        task: what to predict from what.
+        train: training series; at least one has a full history and the longest horizon.
+        task: channels to read and to predict.
         validation: chooses penalty and history by squared error; when it has no usable tick, the smallest penalty and
             longest history are taken.
         penalties: penalties per row on standardised features, each above 0.
@@ -116,9 +116,9 @@ def crossed_solution(
 
     Args:
         parts: all stretches that may be learned from.
-        task: what to predict from what.
+        task: channels to read and to predict.
         folds: pieces of nearly equal duration; neighbouring ones share the history and future of their ticks.
-        penalties: as for `ridge_solution`.
+        penalties: penalties to try, see `ridge_solution`.
         histories: histories to choose from, in samples; cut to the task's.
 
     Raises:

@@ -27,7 +27,7 @@ class Axis:
     """One axis of motion and its channels; a missing channel is an empty name.
 
     Attributes:
-        name: for readers.
+        name: name for reports.
         command: channels that command it: extend and retract, one signed channel, or none.
         velocity: its velocity, extension positive; where kinds tell none, another signal that answers.
         pressures: head and rod pressure, or as many as there are.
@@ -65,7 +65,7 @@ def roles_of(recording: Recording, inputs: Sequence[str] = ()) -> Roles:
     """Return the axes of Table A.1 if a recording has its names, otherwise one axis per velocity channel.
 
     Args:
-        recording: whose channels are looked at.
+        recording: recording whose channels are searched.
         inputs: names of the channels that command, where neither name nor kind tells.
 
     Raises:

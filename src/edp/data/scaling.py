@@ -73,9 +73,9 @@ def feature_columns(task: Task, series: Series, places: Sequence[int], slot: Las
     Channels are a view; derived features are computed on access.
 
     Args:
-        task: what is read.
+        task: channels to read.
         series: the stretch.
-        places: of the features, in the order wanted.
+        places: indices of the features, in the required order.
         slot: shared by stretches that are gone through one after the other.
     """
     if max(places, default=0) < len(task.features.channels):
@@ -90,7 +90,7 @@ def fit_scaler(task: Task, train: Sequence[Series], kinds: Sequence[Kind]) -> Sc
     Bounded kinds (position, angle, ratio) use min-max scaling to [-1, 1], other kinds the z-score.
 
     Args:
-        task: what is read and predicted.
+        task: channels to read and to predict.
         train: the training stretches, nothing else.
         kinds: kind of each feature, in order.
     """

@@ -17,7 +17,7 @@ class Series:
         targets: float32 ``(time, target)``; row t is the target channel *at* t (a horizon k asks for row t + k).
         strategy_columns: float32 ``(time, column)``, what a training strategy reads of tick t beside the targets:
             teacher predictions, the number of a domain or machine; None where it reads nothing more.
-        machine: which machine it was recorded on; empty where that is not known.
+        machine: machine of the recording; empty if unknown.
         recording: the recording that it is cut from; empty where that is not known.
     """
 

@@ -68,7 +68,7 @@ class ByRecording:
     Attributes:
         validation_share: share of the recordings that validate (when not named).
         test_share: share that tests.
-        seed: of the draw.
+        seed: random seed of the draw.
         validation: names of recordings that validate; `test` likewise. A recording named in neither trains.
         tail_share: share of every training recording, at its end, that validates where no recording does.
     """
@@ -257,7 +257,7 @@ class ByMachine:
     Attributes:
         validation_share: share of the machines that validate (when not named).
         test_share: share that tests (when neither named nor chosen by mass).
-        seed: of the draw.
+        seed: random seed of the draw.
         validation: names of machines that validate; `test` likewise.
         test_masses: machines from the first to the second mass, in t, test too; their size is never trained on.
     """

@@ -15,7 +15,7 @@ def spread_series(series: Sequence[Series], length: int, most: int, on_disk: boo
 
     Args:
         series: the series.
-        length: of a stretch.
+        length: length of a segment.
         most: ticks in all.
         on_disk: rows that are read from disk when they are asked for stay there, in place of coming into memory.
     """

@@ -18,7 +18,7 @@ class StretchFold:
 
     Attributes:
         train: stretches to learn from.
-        validation: those that are left out.
+        validation: segments that are left out.
     """
 
     train: list[Series]
@@ -29,12 +29,12 @@ def stretch_folds(series: Sequence[Series], count: int, gap: int, shortest: int,
     """Divide segments `count` times; each sample is left out in at most one fold (see `blocked_folds`).
 
     Args:
-        series: at least one stretch. They are laid end to end in an order drawn by the seed, since files often lie in
-            the order of what was driven.
+        series: at least one segment. They are concatenated in random order, because files are often in the order of the
+            driving tasks.
         count: folds, at least 2.
         gap: ticks beside a fold that it does not learn from.
         shortest: ticks of a stretch that says something; what is cut shorter is in neither part.
-        seed: of the order.
+        seed: random seed of the order.
 
     Raises:
         DataError: too few ticks.

@@ -27,10 +27,10 @@ class TwinChannelSettings:
     """Names of channels by their part; a part that is left empty follows from names and kinds of the recordings.
 
     Attributes:
-        commands: what an operator or controller commands; by default pilot pressures, else currents, voltages, ratios.
+        commands: commands of operator or controller; by default pilot pressures, else currents, voltages, ratios.
         velocities: one for each actuator; by default every velocity.
         strokes: the position of each of them, in the same order; by default where positions fit the velocities.
-        pressures: of chambers and pumps; by default every pressure that commands nothing.
+        pressures: pressures of chambers and pumps; by default every pressure that is not a command.
 
     Raises:
         ConfigError: a name twice, or too many.
@@ -56,9 +56,9 @@ class TwinChannels:
 
     Attributes:
         commands: read at each tick.
-        velocities: of the actuators.
+        velocities: velocities of the actuators.
         strokes: position of each, in the order of the velocities, or none at all.
-        pressures: of chambers and pumps.
+        pressures: pressures of chambers and pumps.
         rate_hz: samples per second.
 
     Raises:
@@ -117,7 +117,7 @@ def twin_channels(recording: Recording, settings: TwinChannelSettings | None = N
     """Return the channels of a recording by role.
 
     Args:
-        recording: whose names and kinds are looked at.
+        recording: recording whose channel names and kinds are searched.
         settings: names where these do not tell.
 
     Raises:

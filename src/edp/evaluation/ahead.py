@@ -25,9 +25,9 @@ class Ahead:
     """k-step-ahead outputs of a twin and the corresponding measurements.
 
     Attributes:
-        channels: of the twin.
-        ticks: how far ahead.
-        moments: of each stretch ``(moment,)``: the last tick that was measured.
+        channels: channels of the twin.
+        ticks: prediction horizon in samples.
+        moments: index of the last measured sample of each prediction, by segment ``(moment,)``.
         answers: ``(moment, answer)``, SI units, stretch after stretch.
         truth: measured, of the same shape.
     """
@@ -45,7 +45,7 @@ def look_ahead(twin: Twin, series: Sequence[Series], ticks: int, first: int = 0)
     Args:
         twin: any formulation.
         series: inputs are commands, targets are what it answers.
-        ticks: how far ahead, at least one.
+        ticks: prediction horizon in samples, at least one.
         first: earliest moment in a stretch; never before the prefix.
 
     Raises:
@@ -97,8 +97,8 @@ def predictor_scores(ahead: Ahead, predicted: Mapping[str, Array]) -> dict[str, 
     """Mean absolute errors of a look-ahead predictor at the same moments, by kind of channel.
 
     Args:
-        ahead: of the twin.
-        predicted: of each channel that both answer, ``(moment,)``, SI units.
+        ahead: k-step-ahead outputs of the twin.
+        predicted: predictions of each common output, ``(moment,)``, SI units.
     """
     pairs = {}
     for part, columns in ahead.channels.parts.items():

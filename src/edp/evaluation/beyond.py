@@ -24,9 +24,9 @@ def command_ranges(channels: TwinChannels, series: Sequence[Series], before: Any
     """Least and largest value of each command, SI units, by name.
 
     Args:
-        channels: of the twin.
-        series: that taught it.
-        before: those of the twin that it began as, where it went on with these series.
+        channels: channels of the twin.
+        series: training series.
+        before: ranges of the initial twin, if the training continued one.
     """
     low = np.min([part.inputs.min(axis=0) for part in series], axis=0)
     high = np.max([part.inputs.max(axis=0) for part in series], axis=0)
@@ -41,8 +41,8 @@ def commands_beyond(ranges: Any, channels: TwinChannels, inputs: Sequence[NDArra
     """Return the commands that leave their ranges, by name.
 
     Args:
-        ranges: of `command_ranges`, from a file that may hold anything; a command without two numbers is left out.
-        channels: of the twin.
+        ranges: content of a file written by `command_ranges`. Commands without two numbers are ignored.
+        channels: channels of the twin.
         inputs: commands ``(tick, command)``, SI units.
     """
     beyond: dict[str, CommandExcess] = {}

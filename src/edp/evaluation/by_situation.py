@@ -58,7 +58,7 @@ class Situations:
     the kind of its integral. Sizes are those of the series that are judged, ranges those of all series.
 
     Args:
-        data: whose series are judged; its inputs show strokes and commands.
+        data: evaluated series; their inputs contain strokes and commands.
     """
 
     def __init__(self, data: Prepared) -> None:
@@ -70,7 +70,7 @@ class Situations:
         Args:
             series: measured inputs and targets.
             horizon: samples ahead.
-            ticks: how many, from the first on; the last of them must have a truth.
+            ticks: number of samples from the first one; the last one must have a measured target.
         """
         return [(axis.target, _ticks_of(axis, series, horizon, ticks)) for axis in self.axes]
 
@@ -159,7 +159,7 @@ class SituationTally:
         Args:
             size: absolute errors in report units ``(tick, target)``.
             scored: ticks that count.
-            by_axis: what `Situations.of` says of the same ticks.
+            by_axis: result of `Situations.of` for the same samples.
         """
         for target, ticks_of in by_axis:
             self.scored[target] += scored.sum()

@@ -46,7 +46,7 @@ class ChannelImportanceSpec:
         lags: ticks back at which other channels may tell of a renewed one.
         rows: training rows that the rule for renewing is fitted on.
         skip: first ticks of each recording that are not scored; None leaves out a whole window.
-        seed: of the exchanges.
+        seed: random seed of the exchanges.
     """
 
     # Three donors a channel: one exchange may by chance bring a similar course.
@@ -108,8 +108,8 @@ class ChannelImportances:
     """Importances of all channels with the reference error.
 
     Attributes:
-        rows: by group, horizon and target; the mean of the targets first.
-        error: by horizon and target, the undisturbed mean absolute error.
+        rows: importance by group, horizon and target; the mean over targets comes first.
+        error: mean absolute error with all channels, by horizon and target.
         units: report unit of each target; ``mean`` has that of the targets, where they share it.
         recordings: names of the judged recordings.
     """
@@ -140,7 +140,7 @@ def measure_channel_importance(
     Args:
         predictor: the network; channels that only a physics base reads are taken away like the others.
         data: prepared series: ``data.test`` is judged, ``data.train`` tells what channels say of each other.
-        spec: how.
+        spec: settings.
         progress: receiver of the progress; its units are channels, or groups of them.
 
     Raises:

@@ -23,12 +23,12 @@ class CompressedRow:
 
     Attributes:
         name: network and format.
-        recipe: how the network was made, in words.
+        recipe: description of the training and compression.
         number_format: a name of `edp.workflows.compression.FORMATS`; `label`: as tables show it.
-        resource_usage: what it takes of the controller.
+        resource_usage: estimated resources on the controller.
         over: limits that it exceeds: what it takes, and what is granted; `fits`: whether there are none.
-        scores: on the recordings that compare, in its format.
-        before: the same in float32.
+        scores: scores in this format on the comparison recordings.
+        before: scores in float32 on the same recordings.
         error: MAE divided by that of the teacher in float32, the mean over horizons.
         run: folder of the network's run; empty for one of a search.
     """
@@ -57,10 +57,10 @@ class HeldOutTest:
 
     Attributes:
         seen_before: whether networks were evaluated on them before these.
-        name: of the sealed test set; None where it stayed closed.
-        opened: when, in ISO 8601.
-        openings: of the test set, oldest first.
-        scores: of ``teacher`` and ``chosen``.
+        name: name of the sealed test set; None if it was not opened.
+        opened: time of opening, ISO 8601.
+        openings: all openings of the test set, oldest first.
+        scores: scores of ``teacher`` and ``chosen``.
         error: MAE of the chosen network divided by the teacher's, mean over horizons.
     """
 
@@ -94,11 +94,11 @@ class CompressionResult(ResultFile):
     """Content of ``compression.json``.
 
     Attributes:
-        unit: of the scores.
+        unit: unit of the scores.
         teacher: the teacher in float32; `rows`: all networks in all formats.
         front: indices of the rows that no other one surpasses in error, cycles and bytes of parameters.
         chosen: index of the row that fits with the smallest error; None if none fits.
-        notes: what was left out, and why.
+        notes: omitted parts, each with the reason.
     """
 
     NAME: ClassVar[str] = "compression.json"

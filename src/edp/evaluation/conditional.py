@@ -29,7 +29,7 @@ class OthersModel:
     Attributes:
         lags: ticks back, 0 among them.
         knees: shape ``(knee, channel)``.
-        mean, deviation: of the terms, shape ``(term,)``.
+        mean, deviation: mean and standard deviation of the terms, shape ``(term,)``.
         gram: sums of products of the terms over rows, shape ``(term, term)``, over the count.
         owner: channel of each term, shape ``(term,)``.
     """

@@ -27,7 +27,7 @@ class Contexts:
     """Errors by the time since reset, at the same ticks for all.
 
     Attributes:
-        seconds: from the reset to the first scored tick of a block.
+        seconds: time from the reset to the first scored sample of a block.
         machines: names; recordings that do not say theirs are a machine each.
         errors: mean absolute error ``(context, machine, horizon, target)``, report units.
         ticks: scored ticks of all machines.
@@ -82,8 +82,8 @@ def context_errors(
 
     Args:
         predictor: the network.
-        series: what it is judged on; series that are too short for the longest context are left out.
-        kinds: of the targets, for report units.
+        series: evaluated series. Series shorter than the longest context are omitted.
+        kinds: kinds of the targets, for report units.
         seconds: contexts; those longer than all series are dropped.
         on_done: called with each context once it is measured.
 

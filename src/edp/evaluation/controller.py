@@ -34,7 +34,7 @@ class NumberFormat:
     10 % less.
 
     Attributes:
-        state_bytes: of a number that is carried from tick to tick, working memory included; the most that was seen.
+        state_bytes: bytes per number of state and working memory, the maximum of all measured networks.
         per_mac: cycles of a multiply-accumulate.
         per_output: cycles of a feature that a part writes.
         per_tree_step: cycles of a comparison of a regression tree, or of taking its leaf.
@@ -58,9 +58,9 @@ class LimitCheck:
 
     Attributes:
         what: the resource.
-        value, limit: in `unit`.
+        value, limit: value and limit in `unit`.
         fits: whether the value is within the limit.
-        note: how the value is estimated.
+        note: method of estimation.
     """
 
     what: str
@@ -76,9 +76,9 @@ class ProcessorCore:
     """Processor core with its cycle counts relative to a Cortex-M4F.
 
     Attributes:
-        label: how tables call it.
-        low: at best.
-        typical: as a rule.
+        label: name in tables.
+        low: factor in the best case.
+        typical: typical factor.
     """
 
     label: str
@@ -100,7 +100,7 @@ class Budget:
     """Resource limits of the target controller (default: thesis, section 3.5.2).
 
     Attributes:
-        name: how reports call it.
+        name: name in reports.
         core: a name of `CORES`.
         cycles: processor cycles per prediction: a 4 ms slice of a 180 MHz core.
         parameter_bytes: memory for parameters.
@@ -132,7 +132,7 @@ class ResourceUsage:
     Attributes:
         parameters: trainable numbers, after folding.
         macs_tick: multiply-accumulates of a tick.
-        macs_window: the same of a window, as the thesis counts.
+        macs_window: multiply-accumulates of a window, as the thesis counts them.
         cycles: low, typical and high estimate of a tick; the high one decides.
         parameter_bytes: memory for parameters.
         ram_bytes: weights, state, working memory and stack.
@@ -207,10 +207,10 @@ def estimate(costs: Sequence[Cost], state_numbers: int, number_format: str, size
     """Estimate a network in one number format.
 
     Args:
-        costs: of all its parts.
-        state_numbers: how many numbers it carries from tick to tick.
+        costs: costs of all parts.
+        state_numbers: number of state values.
         number_format: a name of `FORMATS`.
-        sizes: of its C code in this format.
+        sizes: sizes of its C code in this format.
     """
     form = FORMATS[number_format]
     macs = sum(cost.per_column + cost.per_prediction + cost.pooling for cost in costs)

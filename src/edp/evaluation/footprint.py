@@ -37,7 +37,7 @@ class Footprint:
             in the thesis's tables).
         macs_tick: multiply-accumulates of one tick of the stream, pooling included.
         peak_activation_bytes: largest input plus output of one layer in a stream, float32.
-        peak_activation_bytes_window: the same when a whole window is held.
+        peak_activation_bytes_window: peak activation memory when a whole window is stored.
         state_bytes: state carried from tick to tick, float32.
         window: W in samples.
         rows: costs by part.
@@ -157,8 +157,8 @@ def check_possible(budget: Budget, least: Footprint) -> None:
     """Refuse a budget that not even the smallest network meets.
 
     Args:
-        budget: what the controller grants.
-        least: of the narrowest network for the same inputs and targets.
+        budget: limits of the controller.
+        least: resource usage of the narrowest network for the same inputs and targets.
 
     Raises:
         ConfigError: each limit that is too small, and what the smallest network needs.

@@ -58,7 +58,7 @@ class FreeRunJudgeSpec:
         coverage: share of free runs that an interval is meant to hold.
         covered_at_s: times after the start at which coverage is counted.
         calibration_starts: free runs in each validation recording that calibrate the intervals.
-        ahead_ticks: how far it looks ahead of measured ports, told the commands in between.
+        ahead_ticks: horizon of k-step-ahead predictions from measured outputs, with given commands.
 
     Raises:
         ConfigError: a value out of range.
@@ -88,7 +88,7 @@ class FreeRuns:
     """Free-run simulations with the corresponding measurements.
 
     Attributes:
-        channels: of the twin.
+        channels: channels of the twin.
         names: recording of each run.
         answers: ``(run, tick, answer)``, SI units; row t is tick t + 1 of the free run.
         truth: measured, of the same shape.
@@ -189,10 +189,10 @@ def check_runs(
     """Raise an error if `free_runs` would find no start in these recordings, before the twin is trained.
 
     Args:
-        channels: of the twin to be.
-        scales: with its end stops.
+        channels: channels of the future twin.
+        scales: scales with the end stops.
         prefix: its measured ticks before a free run.
-        series: what it will be judged on.
+        series: evaluated series.
         seconds: length of a run, see `free_runs`.
         starts: runs in each stretch.
 
@@ -219,7 +219,7 @@ def runs_of(twin: Twin, names: tuple[str, ...], answers: Array, truth: Array) ->
     """Combine the outputs of a twin with the measurements.
 
     Args:
-        twin: that answered.
+        twin: twin that computed the outputs.
         names: recording of each run.
         answers: ``(run, tick, answer)``.
         truth: measured ``(run, tick + 1, answer)``, from the last tick before the first answer.
@@ -268,7 +268,7 @@ def free_run_scores(
         runs: free runs.
         spec: the times after the start at which strokes are compared and coverage is counted; those beyond the runs
             are left out.
-        intervals: of the twin that answered, where it has some.
+        intervals: prediction intervals of the twin, if it has any.
         labels: way of driving by name of recording; none where they do not tell.
     """
     channels, names = runs.channels, np.array(runs.names)

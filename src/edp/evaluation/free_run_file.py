@@ -26,9 +26,9 @@ class ChannelErrors:
     """Mean errors of channels.
 
     Attributes:
-        unit: of all channels; None where they differ.
+        unit: common unit of all channels; None if they differ.
         by_channel: mean of each channel; None without samples.
-        units: by channel, where they differ.
+        units: unit by channel if they differ.
         mean: over channels; None where they have no common unit.
     """
 
@@ -203,7 +203,7 @@ class PredictorComparison:
         trained_on: recordings that the predictor was trained on.
         seconds: time ahead.
         moments: number of samples.
-        errors: by kind of channel.
+        errors: errors by kind of channel.
     """
 
     run: str = ""
@@ -243,8 +243,8 @@ class FreeRunScores(FreeRunErrors):
         runs: number of free runs.
         recordings: number of their recordings.
         seconds: length of a run.
-        by_driving: by way of driving; empty where recordings do not tell.
-        situations: by what actuators do; one that never occurs is left out.
+        by_driving: errors by driving task; empty if recordings do not state it.
+        situations: errors by situation of the actuators; situations that do not occur are omitted.
         intervals: None without intervals.
         ahead: None where no recording is long enough.
         beyond: commands that leave their range in training.
@@ -368,7 +368,7 @@ class CandidateRow:
 
     Attributes:
         label: its name.
-        error: of free runs that its fits had not seen, over the static map's; None where it could not be fitted.
+        error: free-run error on data not used by its fits, relative to the static map; None if the fit failed.
         seconds: processor time.
         chosen: whether it is the one that is kept.
         why: the reason why it was left out; empty for none.

@@ -37,7 +37,7 @@ def by_channel(channels: Sequence[Channel], values: NDArray[Any], integral: bool
     """Return the mean of each channel in report units, and over all channels if they share a unit.
 
     Args:
-        channels: of the columns.
+        channels: channels of the columns.
         values: SI units, ``(channel,)`` or ``(run, channel)``.
         integral: whether they are integrals of the channels over seconds.
     """
@@ -74,10 +74,10 @@ def nrmse_by_channel(
     """Root mean square error of each pressure in its deviations over all runs, and their mean.
 
     Args:
-        channels: of the twin.
+        channels: channels of the twin.
         answers: ``(run, tick, answer)``, SI units; `truth` likewise.
         truth: measured.
-        ticks: those that count ``(run, tick)``; all by default.
+        ticks: mask of samples that count ``(run, tick)``; all by default.
     """
     columns = channels.parts["pressures"]
     spread = truth[..., columns].astype(np.float64).std(axis=(0, 1))
@@ -97,9 +97,10 @@ def by_horizon(channels: TwinChannels, errors: Array, stroke_errors: NDArray[np.
     """Return the mean absolute error of each output at geometrically spaced horizons, in report units.
 
     Args:
-        channels: of the twin.
+        channels: channels of the twin.
         errors: ``(run, tick, answer)``, SI units.
-        stroke_errors: of strokes, or of integrals where none are measured ``(run, tick, velocity)``.
+        stroke_errors: errors of strokes, or of integrated velocities without measured strokes ``(run, tick,
+            velocity)``.
     """
     longest = errors.shape[1]
     count = max(2, round(HORIZONS_A_DECADE * np.log10(longest)) + 1)
@@ -134,7 +135,7 @@ def situations(
     that is what counts for pressures, whose pumps serve several actuators.
 
     Args:
-        channels: of the twin.
+        channels: channels of the twin.
         answers: ``(run, tick, answer)``, SI units; `truth` likewise.
         truth: measured.
         low: least value of each answer; `high` likewise.

@@ -76,16 +76,16 @@ class ErrorVerdict:
     """A model against its best reference.
 
     Attributes:
-        label: how tables call the reference.
+        label: name of the reference in tables.
         less: share by which the error of the reference is less, over all outputs and horizons; negative where the
             model has less.
         outputs: targets on which the reference has less error, over all horizons.
-        judged: what is judged.
-        advice: what to do where it is worse.
+        judged: name of the evaluated model.
+        advice: advice if the model is worse.
         interval: 95 % interval, over recordings, of the relative change of the model's error; None for too few.
         recordings: number of recordings, or other units, that were compared.
-        ground: on what both were compared, in the plural.
-        unit: what the interval is over, in the singular.
+        ground: data of the comparison, in the plural.
+        unit: unit of resampling for the interval, in the singular.
     """
 
     label: str
@@ -176,8 +176,8 @@ def by_recording(logs: Mapping[str, Sequence[float]]) -> dict[str, float]:
     """Return the mean logarithm of the error ratio of each recording.
 
     Args:
-        logs: by recording, or by stretch of one, such as ``name[100:200]``; stretches share the day, the driver and
-            the oil, so that they are one unit.
+        logs: errors by recording, or by segment of a recording such as ``name[100:200]``. Segments of one recording are
+            one unit, because they share day, driver and oil temperature.
     """
     pooled: dict[str, list[float]] = {}
     for name, values in logs.items():
@@ -191,8 +191,8 @@ def best_verdict(ratios: Iterable[ErrorRatios], template: ErrorVerdict) -> Error
     """Return the verdict against the reference with the least error; None without a reference.
 
     Args:
-        ratios: of each reference.
-        template: what is judged, the advice and the ground.
+        ratios: error ratios by reference.
+        template: verdict with the name of the model, advice and ground.
     """
     worst: tuple[float, ErrorVerdict] | None = None
     for one in ratios:
@@ -216,7 +216,7 @@ def network_verdict(scores: ScoresFile, minutes: float | None = None) -> ErrorVe
 
     Args:
         scores: the content of ``scores.json``.
-        minutes: that the preset auto was given; None for any other training.
+        minutes: time budget of the preset auto; None for any other training.
     """
     models = scores.models
     if NETWORK not in models:
@@ -267,9 +267,9 @@ class LostOutput:
 
     Attributes:
         target: name of the output.
-        label: how tables call the best baseline on it.
-        less: by which share its error is less.
-        horizon: where it is less by most, in samples.
+        label: name of the best baseline in tables.
+        less: relative difference of the errors.
+        horizon: horizon with the largest difference, in samples.
     """
 
     target: str
@@ -376,7 +376,7 @@ def change_verdict(change: float, by_unit: Mapping[str, float], reference: Error
 
     Args:
         change: error over that of the reference, less one, over all recordings.
-        by_unit: the same of each recording, or of each reference of a controller.
+        by_unit: error ratios of each recording, or of each reference of a controller.
         reference: a verdict with the label of the reference, what is judged, the advice and the ground.
     """
     mean = math.log1p(change)
@@ -389,7 +389,7 @@ def free_run_error(scores: FreeRunErrors, reference: FreeRunErrors) -> float:
 
     Args:
         scores: see `edp.evaluation.free_run.free_run_scores`.
-        reference: of another twin.
+        reference: scores of another twin.
 
     Returns:
         The geometric mean, over actuators, of the ratios of velocity errors and of stroke errors at each time.

@@ -59,7 +59,7 @@ class JudgeSpec:
         history: samples of history that baselines may use.
         skip: first ticks of each stretch that are not scored; None leaves out a whole window (start-up), and as many
             as baselines need of history: all are measured on the same ticks.
-        seed: of the baselines' row sampling and initial weights.
+        seed: seed of the baselines' row sampling and initial weights.
     """
 
     baselines: tuple[str, ...] = tuple(BASELINES)
@@ -133,8 +133,8 @@ def judge(
     Args:
         predictor: the network.
         data: prepared series; baselines train on ``data.train`` and choose sizes on ``data.validation``.
-        spec: which baselines, how much history, which ticks.
-        label: how reports call the network.
+        spec: evaluation settings: baselines, history and samples.
+        label: name of the network in reports.
         seconds: its training time.
         progress: receiver of the name of each model before it runs.
         minutes: after which no further baseline is begun, the cheapest being first; scores name those left out.
@@ -173,9 +173,9 @@ class JudgedPart:
     """Metrics of a network on a part of the test recordings, and its plot data.
 
     Attributes:
-        measured: of the part.
+        measured: accumulated metrics of the part.
         intervals: None for a network without intervals.
-        tensors: by ``recording/name``.
+        tensors: plot data by ``recording/name``.
     """
 
     measured: MeasuredState
@@ -228,7 +228,7 @@ class ModelBench:
     Args:
         predictor: the network.
         data: prepared series.
-        spec: which baselines, how much history, which ticks.
+        spec: evaluation settings: baselines, history and samples.
 
     Raises:
         DataError: no tick of the test series can be scored.
@@ -355,7 +355,7 @@ def score_predictions(predictions: Iterable[NDArray[np.float32]], data: Prepared
     """Return scores of predictions ``(time, horizon, target)`` for each of ``data.test``, as `judge` does.
 
     Args:
-        predictions: in SI units.
+        predictions: predictions in SI units.
         data: series with truth.
         skip: first ticks of each stretch that are not scored.
 

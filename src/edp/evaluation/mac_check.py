@@ -35,10 +35,10 @@ class Trace(TorchDispatchMode):
     Double precision keeps recurrent layers off fused kernels, which cannot be looked into.
 
     Args:
-        network: whose parts are distinguished; hooks are removed at the end.
+        network: network whose parts are distinguished; hooks are removed at the end.
 
     Attributes:
-        operations: how often each ran, by part.
+        operations: number of executions of each operation, by part.
         macs: multiply-accumulates by part.
         opaque: operations on weights, or on several values, of which nobody knows what they multiply, by part.
     """

@@ -53,8 +53,8 @@ class Measured:
     part of the recordings. Parts that are added in their order give the bits of one process that does the same.
 
     Attributes:
-        tallies, by_situation, speeds: of each horizon.
-        integrals: by target that is integrated its ticks, and the sum of squares of the integral's error.
+        tallies, by_situation, speeds: accumulated values of each horizon.
+        integrals: by integrated target, the number of samples and the sum of squared errors of the integral.
         recordings: scores by number of the recording and horizon.
     """
 

@@ -130,9 +130,9 @@ class NetworkCost:
     """A network of a monitor.
 
     Attributes:
-        footprint: by itself.
-        number_format: that it is exported in.
-        runs: in one of its ticks.
+        footprint: counts of the network.
+        number_format: number format of the export.
+        runs: number of evaluations per sample of the network.
         every: ticks from one of its ticks to the next.
         first: the first of them.
     """
@@ -165,7 +165,7 @@ class MonitorFootprint:
         constants: bytes in read-only memory.
         ram_bytes: state, working memory and stack.
         program_bytes: code, an estimate.
-        state_bytes: of the chain alone.
+        state_bytes: state of the chain without networks, bytes.
     """
 
     networks: tuple[NetworkCost, ...]

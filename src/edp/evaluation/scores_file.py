@@ -32,10 +32,10 @@ class ScoredTask:
     """The task that was evaluated.
 
     Attributes:
-        name: of the task.
+        name: name of the task.
         horizons: samples ahead.
         rate_hz: samples per second; None where unknown.
-        mode: how targets are predicted.
+        mode: prediction mode of the targets.
         skip: first samples of each segment that are not evaluated.
     """
 
@@ -143,8 +143,8 @@ class ModelScores:
         spread: order statistics over recordings of the mean absolute error, by horizon.
         by_speed, by_situation: errors by horizon.
         integrated: error of the running integral, by target.
-        intervals: by horizon; empty for a model without intervals.
-        weighted_interval_score: by horizon.
+        intervals: interval metrics by horizon; empty for a model without intervals.
+        weighted_interval_score: weighted interval score by horizon.
         validation: metrics on the validation part, of a baseline.
     """
 
@@ -179,7 +179,7 @@ class TargetChange:
 
     Attributes:
         target: name.
-        horizon: in samples.
+        horizon: horizon in samples.
         ratio: root-mean-square change over that in training.
         beyond: fraction of the changes that are larger than any in training.
     """
@@ -221,10 +221,10 @@ class ScoresFile(ResultFile):
     """Content of ``scores.json``.
 
     Attributes:
-        models: by name; the network is ``network``.
+        models: scores by model name; the network is ``network``.
         left_out: baselines that were asked for and not run.
         drawn: the part of the recordings that was evaluated; None for all.
-        key: of the evaluation, see `edp.storage.runs.run_key`; empty where `left_out` names some.
+        key: key of the evaluation, see `edp.storage.runs.run_key`; empty if `left_out` has entries.
         files: hashes of files in the same folder.
     """
 

@@ -80,12 +80,12 @@ class TransferFile(ResultFile):
         method: name of the method that is kept.
         before: name of the method that stands for the network as it was.
         network: description of the network.
-        settings: of the training.
+        settings: settings of the training.
         source: weights and recordings of the network as it was.
-        methods: by name.
-        distributions: by horizon and target.
+        methods: scores by method.
+        distributions: error distributions by horizon and target.
         logs: the recordings in words.
-        notes: what a reader must know.
+        notes: remarks for the reader of the page.
         files: hashes of files in the same folder.
     """
 

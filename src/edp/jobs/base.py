@@ -24,12 +24,12 @@ class Job:
     state (`edp.storage.ledger.WithState`). What decides its result is in `identity`, so that its key covers it.
 
     Attributes:
-        identity: what to train.
-        where: what the function needs and the result does not depend on, such as where the recordings lie. Under
-            `START` the file of a state that it may go on from (`edp.storage.ledger.read_state`).
+        identity: settings that determine the result.
+        where: inputs that do not affect the result, such as paths of recordings. `START` is the key for the file of a
+            state to continue from (`edp.storage.ledger.read_state`).
         seconds: cap on its time, from the call of the function on.
         memory_mb: cap on the memory of its process.
-        folder: of the ledger; where given, the process claims the training there and leaves its record, and its state.
+        folder: folder of the ledger. If set, the process claims the training there and writes its record and state.
     """
 
     identity: TrainingIdentity
@@ -56,7 +56,7 @@ class Executor(Protocol):
         """Take a job; it starts when a worker is free, in the order of submission.
 
         Raises:
-            ConfigError: the same training was submitted and has not come back.
+            ConfigError: the same training was submitted and has not finished.
         """
         ...
 
@@ -126,7 +126,7 @@ def iterate_ends(
     """Yield the end of every job: results in the ledger first, others as soon as they end.
 
     Args:
-        ledger: of the study; each record is on disk before it is yielded.
+        ledger: ledger of the study. Each record is on disk before it is yielded.
         executor: does what the ledger does not hold; jobs of others that it runs must not come back meanwhile.
         jobs: equal ones are done once.
         wake_s: interval after which None is yielded while jobs are under way; None: never.

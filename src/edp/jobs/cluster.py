@@ -46,9 +46,9 @@ class RayPool(ClosedAtExit):
     the node; a training whose node or Ray worker is lost starts again elsewhere.
 
     Args:
-        address: of the cluster, for example ``10.0.0.1:6379``, or ``auto``.
-        threads: of each training, and cores that it takes.
-        retries: how often a training whose node or worker is lost starts again.
+        address: address of the cluster, for example ``10.0.0.1:6379``, or ``auto``.
+        threads: number of threads and cores of each training.
+        retries: maximum number of restarts of a training whose node or worker is lost.
         open_cluster: take a cluster without a token at an address that other computers may reach.
 
     Raises:
@@ -189,8 +189,8 @@ def _perform_there(job: Job, threads: int, start: _StateFile | None) -> tuple[by
     """Run a training in a Ray process on some node, through a pool of one whose process is reused.
 
     Args:
-        job: to do.
-        threads: of it.
+        job: training to run.
+        threads: number of threads of the training.
         start: the state that it goes on from.
 
     Returns:
@@ -241,7 +241,7 @@ def check_closed(address: str) -> None:
     away a client without one, so a client that is set up without a token can only ever reach an open cluster.
 
     Args:
-        address: of the cluster; ``auto`` may lead anywhere.
+        address: address of the cluster; ``auto`` may lead to any cluster.
 
     Raises:
         ConfigError: the address is not loopback, and Ray's token authentication is off here.

@@ -37,9 +37,9 @@ def perform(
     """Run a training; every outcome becomes a record.
 
     Args:
-        identity: what to train.
+        identity: settings that determine the result.
         where: see `edp.jobs.base.Job`.
-        folder: of the ledger, to claim the training and leave its state and its record.
+        folder: folder of the ledger, to claim the training and write its state and record.
         begun: called before the function of the training.
     """
     with contextlib.ExitStack() as stack:

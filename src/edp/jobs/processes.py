@@ -123,8 +123,8 @@ class LocalPool(ClosedAtExit):
 
     Args:
         workers: processes; they start when there is something to do.
-        threads: of each training; another number gives other bits, so it belongs into the key.
-        retries: how often a training whose process was killed starts again.
+        threads: number of threads of each training. Another number gives other bits, so it belongs in the key.
+        retries: maximum number of restarts of a training whose process was killed.
     """
 
     def __init__(self, workers: int, threads: int = 1, retries: int = RETRIES) -> None:

@@ -59,10 +59,10 @@ class WorkUnit:
     Attributes:
         function: ``package.module:name``, called as ``function(identity, where)``; its arguments are
             ``identity.config``. It returns plain values, or these with bytes (`edp.storage.ledger.WithState`).
-        label: for messages.
+        label: name for messages.
         arguments: plain values that decide the result.
         data: digest of what it reads.
-        where: where things are, or the things themselves; the same paths on every node.
+        where: inputs, or their paths, which are the same on every node.
         size: number by which the progress counts the unit.
     """
 

@@ -18,7 +18,7 @@ class BindAddress:
     """Network address that a server of this computer binds.
 
     Attributes:
-        host: as the user gave it.
+        host: host name as the user typed it.
         numeric: IP address that `host` stands for; the first one of a name.
         is_loopback: whether only programs of this computer reach every address of `host`.
     """
@@ -47,7 +47,7 @@ def resolve_bind(host: str, option: str) -> BindAddress:
 
     Args:
         host: IP address or name.
-        option: that gave the host, for messages.
+        option: option of the host, for messages.
 
     Raises:
         ConfigError: `host` is empty, too long or not printable, or nothing is known by this name.

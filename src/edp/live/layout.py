@@ -16,11 +16,11 @@ class LiveTrace:
     """One column of measured values.
 
     Attributes:
-        name: as text; nothing in it is markup.
-        unit: that the page shows.
-        factor: from SI to that unit.
+        name: name as plain text, without markup.
+        unit: displayed unit.
+        factor: factor from SI to the displayed unit.
         offset: added behind the factor.
-        description: in words.
+        description: description in words.
     """
 
     name: str
@@ -43,16 +43,16 @@ class Forecast:
     """A prediction, made at a tick for `ticks` later, with its interval.
 
     Attributes:
-        name: of what is predicted.
+        name: name of the predicted channel.
         unit: see `LiveTrace`; `factor` likewise.
-        factor: from SI to that unit.
-        ticks: how far ahead; 0 where the value of the present tick is meant.
-        column: of the prediction.
+        factor: factor from SI to the displayed unit.
+        ticks: horizon in samples; 0 for the present sample.
+        column: column of the prediction.
         lower: column of the interval's lower bound, None without one; `upper` likewise.
         upper: see `lower`.
         coverage: share that the interval is meant to hold.
         measured: column of what then happened, None where nothing measures it.
-        model: what made it, in words.
+        model: name of the model.
     """
 
     name: str
@@ -77,18 +77,18 @@ class LiveLayout:
     """Columns of a session, and the data that a page needs to show them.
 
     Attributes:
-        title: of the page.
-        source: where the rows come from, in words.
+        title: title of the page.
+        source: source of the rows, in words.
         rate_hz: ticks per second.
         width: number of columns.
-        traces: of the first columns, in order.
-        forecasts: of further columns.
-        geometry: of the machine for the side view; None without one.
+        traces: traces of the first columns, in order.
+        forecasts: predictions in the remaining columns.
+        geometry: machine geometry for the side view; None without one.
         angles: columns of the joint angles (rad) of boom, arm and bucket; empty without a side view.
         levers: columns that an operator or controller commands.
         statistics: columns of a monitor's statistics over their limit, by name; an alarm is raised above 1.
         steered: whether viewers may pause the source, change its speed and let it run ahead.
-        ticks: of the whole source, where its end is known.
+        ticks: length of the source in samples, if known.
     """
 
     title: str

@@ -30,7 +30,7 @@ class Pace:
         speed: factor on real time.
         paused: whether ticks wait.
         stopped: whether the session is over.
-        late: how often time was given up.
+        late: number of times that the clock was reset because processing was too slow.
     """
 
     def __init__(self, rate_hz: float, speed: float = 1.0, clock: Callable[[], float] = time.monotonic) -> None:

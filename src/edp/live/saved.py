@@ -23,7 +23,7 @@ def live_page(title: str, host: str) -> tuple[str, str]:
     """Return the page of a server with its content security policy.
 
     Args:
-        title: of the page.
+        title: title of the page.
         host: address and port under which the page was asked for, checked.
     """
     script, style = parts()

@@ -54,16 +54,16 @@ class LiveServer:
     """Page and socket of one session.
 
     Args:
-        session: what is shown.
-        pace: of the source; None where viewers cannot steer it.
+        session: session to display.
+        pace: clock of the source; None if viewers cannot control it.
         host: address to listen on; loopback unless told otherwise.
         port: 0 for a free one.
 
     Attributes:
-        token: that page and socket ask for.
+        token: token required by page and socket.
         port: once it listens.
         bind: address that `host` stands for.
-        viewers: that are connected.
+        viewers: connected viewers.
         skipped: rows that were sent to nobody, since the source ran ahead.
     """
 

@@ -26,10 +26,10 @@ class LiveEvent:
     """Something that happened.
 
     Attributes:
-        number: of the event in its session, from 0.
-        tick: at which.
+        number: number of the event in its session, from 0.
+        tick: sample of the event.
         kind: one of `KINDS`.
-        text: for a reader.
+        text: message.
         group: events of one group say the same again; empty for none.
     """
 
@@ -48,12 +48,12 @@ class LiveSession:
     """A session under way.
 
     Args:
-        layout: of the columns.
-        history_bytes: of rows that are kept; the oldest go first.
-        preparing: what happens before the first row, in words; empty where that takes no time.
+        layout: layout of the columns.
+        history_bytes: maximum size of the stored rows in bytes; the oldest rows are removed first.
+        preparing: description of the work before the first row; empty if it takes no time.
 
     Attributes:
-        layout: of the columns.
+        layout: layout of the columns.
         preparing: see above.
         ticks: streamed so far.
         ended: why nothing more comes, in words; empty while it runs.

@@ -176,7 +176,7 @@ class _Opener:
         child: the reader.
         memory: handle of its memory.
         readable: files and folders that it may open.
-        listener: where its calls are announced.
+        listener: descriptor that announces the system calls of the reader.
     """
 
     def __init__(self, child: int, memory: int, readable: Iterable[Path], listener: int) -> None:

@@ -27,10 +27,10 @@ class SandboxLayer:
     """One layer of the sandbox.
 
     Attributes:
-        name: for messages and tables.
-        stops: what native code in a reader can do where the layer is missing.
+        name: name for messages and tables.
+        stops: actions of native code in a reader that this layer prevents.
         needs: systems that have it.
-        advice: what to do where it is missing.
+        advice: advice if the layer is missing.
     """
 
     name: str
@@ -69,7 +69,7 @@ class _State:
         required: logs are refused where a layer is missing.
         seen: why each layer is missing (empty where it holds), as the last reader said; None before the first log.
         announced: a missing layer was announced.
-        announce: how.
+        announce: function that reports a missing layer.
     """
 
     required: bool = False

@@ -69,7 +69,7 @@ def receive(read_into: ReadInto, most: int = 0) -> tuple[Header, list[NDArray[An
 
     Raises:
         EOFError: the other side is gone.
-        ValueError: what came is no message, or larger than allowed.
+        ValueError: the data received are not a message, or exceed the limit.
     """
     length = bytearray(_LENGTH.size)
     read_into(memoryview(length))

@@ -72,9 +72,9 @@ def open_channel(worker: str, modules: Sequence[str], path: Path, libraries: Seq
 
     Args:
         worker: module to run as the worker (``python -m``); its `main` calls `edp.sandbox.sandbox_worker.main`.
-        modules: to import before the fork.
+        modules: modules to import before the fork.
         path: the log, for messages.
-        libraries: to import before, too, where they are installed.
+        libraries: optional libraries to import before the fork if they are installed.
 
     Raises:
         DataError: no process can be started.

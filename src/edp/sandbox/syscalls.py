@@ -156,7 +156,7 @@ def filter_program(column: int, architecture: int, own_pid: int) -> list[Instruc
     """Return the instructions (code, steps if true, steps if false, value) that decide about a call.
 
     Args:
-        column: of the tables above.
+        column: column of the tables above.
         architecture: the kernel's number of it.
         own_pid: process id of the reader.
     """

@@ -27,8 +27,8 @@ class Rule:
     Attributes:
         alpha: level of the adjusted p-value.
         least_gain: improvement of the mean score over the baseline's that is worth having, as a share.
-        interim_analyses: of the race; none: every module goes all the way.
-        level: of the intervals.
+        interim_analyses: interim analyses of the race; empty to run every module to the end.
+        level: confidence level of the intervals.
     """
 
     alpha: float = 0.05
@@ -52,15 +52,15 @@ class ModuleEvidence:
         module: name.
         confirmed: whether it passed all gates.
         reason: why, or why not, as a sentence.
-        runs: of the module, 0 where it never reached the confirmation.
+        runs: number of runs of the module; 0 if the module did not reach the confirmation.
         dropped_after: runs after which the race dropped it; 0 where it did not.
         change: mean difference over the baseline's mean score.
         low, high: interval of `change`.
-        p, adjusted: of the clustered test; adjusted over all registered modules.
-        resampled_p: of Nadeau and Bengio's test on run means.
-        paired_p: of the plain t-test on run means.
-        mixed_p: of the thesis's mixed model on run means.
-        d_z: of the run means; None with fewer than two runs.
+        p, adjusted: p-value of the clustered test, plain and adjusted over all registered modules.
+        resampled_p: p-value of Nadeau and Bengio's test on run means.
+        paired_p: p-value of the plain t-test on run means.
+        mixed_p: p-value of the thesis's mixed model on run means.
+        d_z: effect size of the run means; None with fewer than two runs.
         stability: share of the runs in which the module won.
     """
 
@@ -99,7 +99,7 @@ def confirm(
         registered: every module of the study, in the order of the answer; those not in `modules` were dropped
             before and enter the adjustment with p = 1.
         tested: ``(run, session)``; None: every run is judged on every session.
-        rule: what a module must show; None: the defaults.
+        rule: acceptance criteria; None for the defaults.
         worst: ``(session,)``, the least that a failed cell costs; see `fill_worst`.
 
     Raises:

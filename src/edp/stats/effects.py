@@ -48,7 +48,7 @@ def effect_size(differences: ArrayLike, level: float = 0.95) -> EffectSize:
     """d_z of one list of split differences, with its interval.
 
     Raises:
-        DataError: as `cohens_dz`.
+        DataError: see `cohens_dz`.
     """
     value = float(cohens_dz(differences))
     return effect_interval(value, int(np.asarray(differences).shape[-1]), level)
@@ -93,7 +93,7 @@ class Concordance:
 
     Attributes:
         w: 1 where every split ranks the modules alike, about 1 / splits where the ranks are chance.
-        p: of no agreement at all, by the chi-square approximation ``splits (modules - 1) W``.
+        p: p-value of no agreement, by the chi-square approximation ``splits (modules - 1) W``.
     """
 
     w: float

@@ -19,8 +19,8 @@ class SizeScore:
     """Best score that was reached with one size of network.
 
     Attributes:
-        name: for the report, such as ``128 units``.
-        parameters: of the network, or any other cost (multiply-accumulates per tick, bytes).
+        name: name for the report, such as ``128 units``.
+        parameters: number of parameters, or another cost (multiply-accumulates per sample, bytes).
         score: lower is better, above zero.
         error: standard error of the score; 0 where it is not known.
     """

@@ -22,7 +22,7 @@ class MainEffect:
 
     Attributes:
         factor: name.
-        effect: on minus off, in the unit of the scores; negative is better.
+        effect: mean score with the factor minus mean score without it, in the unit of the scores; negative is better.
         error: standard error.
         p: one-sided, small where on is better.
         importance: the factor's share of the variance that all factors explain, 0 to 1.

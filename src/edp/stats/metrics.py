@@ -95,8 +95,8 @@ def interval_scores(lower: ArrayLike, upper: ArrayLike, truth: ArrayLike) -> tup
 
     Args:
         lower: ``(sample,)`` in the unit of the width.
-        upper: likewise.
-        truth: likewise.
+        upper: upper bounds, same shape.
+        truth: true values, same shape.
 
     Raises:
         DataError: the arrays are empty, not one-dimensional, of unequal length, or hold NaN or infinite values.
@@ -117,12 +117,12 @@ def interval_score(lower: ArrayLike, upper: ArrayLike, truth: ArrayLike, coverag
 
     Args:
         lower: ``(sample,)`` in the unit of the score.
-        upper: likewise.
-        truth: likewise.
+        upper: upper bounds, same shape.
+        truth: true values, same shape.
         coverage: share of the truth that the interval is meant to hold, between 0 and 1.
 
     Raises:
-        DataError: as `interval_scores`, or the coverage is none.
+        DataError: see `interval_scores`; also for a coverage outside 0 to 1.
     """
     if not 0.0 < coverage < 1.0:
         raise DataError(f"coverage {coverage!r} came; a share between 0 and 1 must hold")

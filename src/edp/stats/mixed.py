@@ -19,8 +19,8 @@ class MixedModel:
     Attributes:
         intercept: b0, mean of the baseline.
         effect: test of b1 < 0 by z, as the thesis does.
-        split_variance: of the random intercepts; zero where splits differ by less than chance.
-        residual_variance: of the runs within a split.
+        split_variance: variance of the random intercepts; zero if splits differ by less than chance.
+        residual_variance: variance of the runs within a split.
     """
 
     intercept: Array
@@ -42,7 +42,7 @@ def mixed_model(module: ArrayLike, baseline: ArrayLike) -> MixedModel:
 
     Args:
         module: ``(..., split, seed)``.
-        baseline: the same shape.
+        baseline: scores of the baseline, same shape.
 
     Raises:
         DataError: unequal shapes, fewer than two splits, or values that are not finite (fill failed runs first).

@@ -56,7 +56,7 @@ def paired(
     With several modules use `fill_worst` on all arms at once, so that all share one worst.
 
     Raises:
-        DataError: as `fill_worst`.
+        DataError: see `fill_worst`.
     """
     first, second = np.asarray(module, dtype=np.float64), np.asarray(baseline, dtype=np.float64)
     if first.shape != second.shape:

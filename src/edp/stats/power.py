@@ -22,7 +22,7 @@ class ConfirmationPlan:
 
     Attributes:
         runs: training runs of each arm, a whole number of repeats; None where no number suffices.
-        power: at that many runs, or at the most that were allowed.
+        power: power for this number of runs.
         limit: power with endlessly many runs on these sessions.
         sessions_needed: sessions with which `runs` of them would do; None where these suffice.
         reason: the answer as a sentence.
@@ -40,7 +40,7 @@ def power(delta: float, variance: PairedVariance, sessions: int, runs: float, fo
 
     Args:
         delta: improvement of the mean score to be seen, above zero.
-        variance: of the paired differences.
+        variance: variance components of the paired differences.
         sessions: development sessions.
         runs: training runs of each arm; infinite is allowed.
         folds: into which the sessions are dealt.
@@ -72,7 +72,7 @@ def plan_runs(
 
     Args:
         delta: improvement to be seen, in the unit of the scores, above zero.
-        variance: of the paired differences.
+        variance: variance components of the paired differences.
         sessions: development sessions.
         folds: into which they are dealt.
         alpha: level of the test.
@@ -149,11 +149,11 @@ def simulated_power(
 
     Args:
         delta: improvement, in the unit of the scores.
-        variance: of the paired differences.
+        variance: variance components of the paired differences.
         tested: ``(run, session)``.
         alpha: level of the test.
         repetitions: simulated studies.
-        seed: of the draws.
+        seed: random seed.
     """
     mask = tested_mask(tested, np.asarray(tested).shape)
     draws = simulate_differences(variance, mask, -delta, repetitions, np.random.default_rng(seed))

@@ -38,7 +38,7 @@ class RaceResult:
 
     Attributes:
         dropped_after: runs after which it was dropped; 0 where it went all the way.
-        runs: that it took.
+        runs: number of runs until the decision.
         p: one-sided p-value over all runs; 1 where it was dropped.
     """
 
@@ -61,11 +61,12 @@ def race(
         differences: ``(..., run, session)`` in the order of the runs; values after the analysis that drops a
             module is not used.
         tested: ``(run, session)``; None: all.
-        interim_analyses: in ascending order; those at or beyond the number of runs are not taken.
+        interim_analyses: numbers of runs in ascending order; analyses at or beyond the total number of runs are
+            omitted.
 
     Raises:
         ConfigError: analyses out of order, before the second run, or with levels outside 0 to 1.
-        DataError: as `clustered_t`.
+        DataError: see `clustered_t`.
     """
     _check(interim_analyses)
     array = np.asarray(differences, dtype=np.float64)
@@ -87,9 +88,9 @@ class RaceRates:
 
     Attributes:
         confirmed: share with p below alpha at the end.
-        confirmed_without: the same without interim analyses.
+        confirmed_without: fraction confirmed without interim analyses.
         dropped: share dropped at each interim analysis, by its number of runs.
-        mean_runs: of the module.
+        mean_runs: mean number of runs of the module.
     """
 
     confirmed: float
@@ -112,12 +113,12 @@ def race_rates(
 
     Args:
         delta: improvement, in the unit of the scores.
-        variance: of the paired differences.
+        variance: variance components of the paired differences.
         tested: ``(run, session)``.
-        interim_analyses: in ascending order.
+        interim_analyses: numbers of runs in ascending order.
         alpha: level of the test at the end.
         repetitions: simulated studies.
-        seed: of the draws.
+        seed: random seed.
     """
     mask = tested_mask(tested, np.asarray(tested).shape)
     draws = simulate_differences(variance, mask, -delta, repetitions, np.random.default_rng(seed))

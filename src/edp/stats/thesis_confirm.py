@@ -31,7 +31,7 @@ class ThesisEvidence:
         p: one-sided z-test of the mixed model.
         adjusted: Benjamini-Hochberg over all modules and metrics at once ("globally", 3.3.4).
         printed_p: Phi(d_z sqrt(J)), what Table 4.5 prints.
-        d_z: of the differences of split means.
+        d_z: effect size of the differences of split means.
         stability: share of the J S pairs won.
         passed: all three gates on this metric.
         confirmed: the module passed on any metric.

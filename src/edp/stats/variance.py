@@ -56,7 +56,7 @@ def split_variance(scores: ArrayLike, level: float = 0.95) -> SplitVariance:
 
     Args:
         scores: ``(split, seed)``.
-        level: of the intervals.
+        level: confidence level of the intervals.
 
     Raises:
         DataError: fewer than two splits or values that are not finite.
@@ -113,7 +113,7 @@ def seed_correlation(module: ArrayLike, baseline: ArrayLike) -> float:
 
     Args:
         module: ``(split, seed)``, the same seeds in both.
-        baseline: the same shape.
+        baseline: scores of the baseline, same shape.
 
     Raises:
         DataError: one seed, unequal shapes, values that are not finite, or an arm without spread.
@@ -133,9 +133,9 @@ class PairedVariance:
     """Variances of the paired differences of two arms, in the squared unit of the scores.
 
     Attributes:
-        session: of the module's effect between sessions, sigma_h^2; no number of runs takes it away.
-        run: of the effect between training runs: the split's and the seeds', sigma_f^2 + 2 sigma_s^2 (1 - rho).
-        cell: what is left in each cell of a run and a session.
+        session: variance of the module's effect between sessions, sigma_h^2, which more runs do not reduce.
+        run: variance of the effect between training runs, from splits and seeds: sigma_f^2 + 2 sigma_s^2 (1 - rho).
+        cell: residual variance of each cell of a run and a session.
     """
 
     session: float

@@ -29,7 +29,7 @@ def sample_excavator_twin(machine: str = "M22", kind: str = "static") -> Twin:
 
     Args:
         machine: name or file of the machine.
-        kind: of `edp.networks.twin.TWINS`, one that needs no training.
+        kind: kind in `edp.networks.twin.TWINS` that needs no training.
     """
     channels, scales, series = _sample(machine)
     twin: Twin = TWINS[kind]().start(channels, scales, series, 0)

@@ -21,8 +21,8 @@ def rig_sessions(count: int, ticks: int, seed: int = 0, rate_hz: float = 100.0, 
     """Healthy sessions of a linear rig with sensor noise, all channels of `RIG` in SI units.
 
     Args:
-        count: of sessions.
-        ticks: of each.
+        count: number of sessions.
+        ticks: length of each session in samples.
         seed: root of every random choice; session n is the same however many there are.
         rate_hz: ticks per second.
         first: number of the first session.

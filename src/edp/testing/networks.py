@@ -143,7 +143,7 @@ def check_block(block: type[Any], **options: Any) -> None:
 
     Args:
         block: a class entered with ``@BLOCKS.register("name")``.
-        options: of the block; make it small, for networks of five channels are built around it.
+        options: options of the block; choose a small block, because networks of five channels are built around it.
 
     Raises:
         ConfigError: it is not registered, refuses its options, or contradicts every network that is tried.

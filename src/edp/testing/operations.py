@@ -102,7 +102,7 @@ def check_operations(predictor: Predictor) -> None:
     """Check that every part declares in `operations` exactly what it uses, so that an export target can refuse it.
 
     Args:
-        predictor: in double precision, in evaluation mode.
+        predictor: predictor in double precision, in evaluation mode.
 
     Raises:
         ContractError: an operation that is not declared, is declared and not used, or has no word.

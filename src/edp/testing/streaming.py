@@ -51,7 +51,7 @@ def check_shapes(predictor: Predictor) -> None:
     """Predictions have the shape and type of the contract, the state keeps its own; encoding undoes decoding.
 
     Args:
-        predictor: in single precision.
+        predictor: predictor in single precision.
 
     Raises:
         ContractError: one of them is broken.
@@ -77,7 +77,7 @@ def check_causality(predictor: Predictor) -> None:
     """No prediction depends on a later tick, and the present tick is read.
 
     Args:
-        predictor: in double precision, in evaluation mode.
+        predictor: predictor in double precision, in evaluation mode.
     """
     x, cut = drawn_inputs(predictor), 13
     changed = x.clone()
@@ -93,7 +93,7 @@ def check_chunks(predictor: Predictor) -> None:
     """Check that single samples, chunks with carried state, and a whole window agree at the last sample.
 
     Args:
-        predictor: in double precision, in evaluation mode.
+        predictor: predictor in double precision, in evaluation mode.
     """
     window = predictor.spec.window
     # In the usual range: what is far outside may overflow the single precision of a stream, which then restarts.
@@ -117,7 +117,7 @@ def check_reset(predictor: Predictor) -> None:
     """Check that a reset clears the requested streams and leaves the others.
 
     Args:
-        predictor: in double precision, in evaluation mode.
+        predictor: predictor in double precision, in evaluation mode.
     """
     x, later = drawn_inputs(predictor), drawn_inputs(predictor, seed=2)
     _, state = run_network(predictor, x)
@@ -148,7 +148,7 @@ def check_determinism(predictor: Predictor) -> None:
     """Check that evaluation is deterministic, and that training is random if there is dropout.
 
     Args:
-        predictor: in single precision, in evaluation mode.
+        predictor: predictor in single precision, in evaluation mode.
     """
     x = drawn_inputs(predictor)
     first = run_network(predictor, x)[0]
@@ -165,7 +165,7 @@ def check_batch(predictor: Predictor) -> None:
     """Streams side by side do not meet.
 
     Args:
-        predictor: in double precision, in evaluation mode.
+        predictor: predictor in double precision, in evaluation mode.
     """
     x = drawn_inputs(predictor, batch=4)
     together = run_network(predictor, x)[0]
@@ -178,7 +178,7 @@ def check_gradients(predictor: Predictor) -> None:
     """Check that the error reaches every trainable parameter, except those of an untrained skip connection.
 
     Args:
-        predictor: in double precision.
+        predictor: predictor in double precision.
     """
     torch.manual_seed(5)
     x = drawn_inputs(predictor, batch=4)
@@ -228,7 +228,7 @@ def check_graph(predictor: Predictor) -> None:
     """Check that the layer graph for exports computes the same as the network.
 
     Args:
-        predictor: in double precision, with weights that single precision holds.
+        predictor: predictor in double precision, with weights that single precision represents exactly.
 
     Raises:
         ContractError: it means something else.

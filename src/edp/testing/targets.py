@@ -84,7 +84,7 @@ def check_export_target(target: type, **options: object) -> None:
 
     Args:
         target: a class entered with ``@TARGETS.register("name")``.
-        options: of the target.
+        options: options of the target.
 
     Raises:
         ConfigError: it is not registered, or has no such option.

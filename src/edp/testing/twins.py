@@ -30,7 +30,7 @@ def sample_actuators(
 
     Args:
         ticks: length, at 50 Hz.
-        seed: of the levers and of the sensors' noise.
+        seed: seed of the levers and of the sensor noise.
         axes: number of actuators.
         strokes: whether positions are measured.
         pressures: whether pressures are measured.
@@ -61,7 +61,7 @@ def sample_front(ticks: int = 600, seed: int = 0) -> Recording:
 
     Args:
         ticks: length.
-        seed: of all values.
+        seed: seed of all values.
     """
     rng = np.random.default_rng(seed)
     lever = np.repeat(rng.uniform(-1.0, 1.0, (ticks // 25 + 1, 3)), 25, axis=0)[:ticks]
@@ -85,7 +85,7 @@ def sample_twin(spec: TwinSpec, recording: Recording | None = None) -> tuple[Twi
 
     Args:
         spec: the formulation; what needs training keeps the weights that it starts with.
-        recording: that it is fitted to; by default that of `sample_actuators`.
+        recording: recording for the fit; by default that of `sample_actuators`.
     """
     recording = recording or sample_actuators()
     channels = twin_channels(recording)
@@ -103,11 +103,11 @@ def check_twin(name: str, options: TwinSpec | None = None, recordings: Sequence[
 
     Args:
         name: under which it is registered.
-        options: of the formulation; its defaults where left out.
-        recordings: to hold it to in place of those, for options that need a machine of their own.
+        options: options of the formulation; missing ones have their defaults.
+        recordings: recordings to use instead, for options that need a particular machine.
 
     Raises:
-        ContractError: what does not hold, and for which channels.
+        ContractError: the contract is violated; the message names the rule and the channels.
     """
     samples = (sample_actuators(), sample_actuators(axes=1, strokes=False, pressures=False))
     for recording in recordings or samples:

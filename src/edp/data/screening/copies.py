@@ -195,7 +195,7 @@ def copy_flags(
 
     Args:
         names: channels.
-        pairs: as found, usually each pair in both directions.
+        pairs: pairs of equal channels, usually in both directions.
         trusted: columns of the channels known to be measured; never flagged.
         innovation: share of each channel's variance that its own past does not explain, ``(channel,)``.
         settled: columns that are flagged already, of no use as originals.

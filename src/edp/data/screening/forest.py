@@ -31,7 +31,7 @@ class Rows:
 
     Attributes:
         inputs: channels at t, float32 ``(row, channel)``.
-        changes: what is predicted: target at t + horizon less that at t (the target itself at horizon 0), scaled to
+        changes: predicted values: target at t + horizon minus target at t (the target itself at horizon 0), scaled to
             deviation 1 over all rows, ``(row, target)``.
         pieces: piece of each row.
     """
@@ -157,7 +157,7 @@ def importances(
 
     Args:
         table: the data.
-        columns: of the table, that the forest reads.
+        columns: indices of the columns that the forest reads.
         groups: places in `columns` that are permuted together.
         held_out: pieces held out.
         spec: sizes and seed.

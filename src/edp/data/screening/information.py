@@ -113,7 +113,7 @@ class Information:
     Args:
         sample: ``(row, channel)``.
         neighbours: k.
-        seed: of the noise that tells equal values apart.
+        seed: random seed of the noise that separates equal values.
     """
 
     def __init__(self, sample: FloatArray, neighbours: int, seed: int = 0) -> None:

@@ -120,7 +120,7 @@ def lagged_covariances(
     Args:
         table: the data.
         reach: largest lag, samples.
-        shifts: with how many other pieces each piece is paired for chance.
+        shifts: number of other segments with which each segment is paired to estimate the level of chance.
         on_share: hears the share that is done.
     """
     live = np.flatnonzero(table.live)

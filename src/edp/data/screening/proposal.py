@@ -41,12 +41,12 @@ class ScreeningEvidence:
     Attributes:
         table: the data.
         live: columns of the table that change.
-        correlations: of live channels, ``[reach + lag, i, j]``, over all pieces.
+        correlations: correlations of live channels over all segments, ``[reach + lag, i, j]``.
         relations: tests of live channels against targets.
         pieces: correlation of each piece at the best lag with the best target, ``(piece, live channel)``.
         curves: lag curves.
-        importance: of the forest, all entries.
-        values: of linear models.
+        importance: permutation importance in the forest, all entries.
+        values: Granger gains in linear models.
         clusters: collinear channels.
         history: held-out error by window, and the shortest that suffices.
     """

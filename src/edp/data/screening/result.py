@@ -42,9 +42,10 @@ class Flag:
 
     Attributes:
         channel: the channel.
-        kind: what is wrong.
+        kind: type of the defect.
         source: the channel of which it is a copy or whose future it knows; empty where there is none.
-        lag: of the channel against `source`: -12 means that it shows the source's value of 12 samples later.
+        lag: delay of the channel relative to `source` in samples: -12 means that it has the value of the source 12
+            samples later.
         value: the figure that decided (a correlation, a share), 0 to 1.
         evidence: a sentence with the figures.
     """
@@ -114,7 +115,7 @@ class LagRange:
     Attributes:
         group: kind of signal.
         low, high: smallest and largest best lag, samples.
-        channels: those whose best lag is certain and within the search.
+        channels: channels whose best lag is significant and within the search range.
         left_out: the others of the group.
     """
 
@@ -213,7 +214,7 @@ class ChannelVerdict:
         rank: 1 is the most useful; kept channels come first.
         score: 0 to 1, what the rank goes by.
         reason: one or two sentences with the figures.
-        flags: what is wrong with it.
+        flags: defects of the channel.
     """
 
     channel: str
@@ -231,8 +232,8 @@ class Proposal:
     Attributes:
         choices: all candidates by rank.
         window: suggested W, samples.
-        window_reason: where it comes from.
-        notes: what the data does not tell, and what to do about it.
+        window_reason: source of the window length.
+        notes: limits of the data, each with advice.
     """
 
     choices: tuple[ChannelVerdict, ...]
@@ -262,16 +263,16 @@ class ScreeningResult:
         rate_hz: samples per second.
         channels: candidates, targets among them, in the order of the recordings.
         groups: kind of signal of each candidate, as Table 4.2 groups them.
-        targets: what is to be predicted.
+        targets: predicted channels.
         horizon: samples ahead.
         matrices: dependencies at one instant.
         lags: a curve for each candidate and target.
         stability: metrics by piece.
-        importance: of groups, for each target and for all.
+        importance: importance of groups, for each target and for all.
         values: linear value of each channel with its past.
         clusters: collinear channels, those of one member left out.
         flags: all of them.
-        proposal: what to keep.
+        proposal: proposed feature set and memory.
         options: the options of the screening.
         seconds: time of each stage.
     """

@@ -83,7 +83,7 @@ def screen(
     """Select input channels and memory length for a model that predicts the targets. Omitted channels get a reason.
 
     Args:
-        recordings: at one rate; every channel of the first must be in all.
+        recordings: recordings with one sample rate; all contain every channel of the first one.
         spec: options; None takes the defaults.
         on_progress: called with the stage and the share of the whole that is done.
 

@@ -63,18 +63,18 @@ class ScreeningSpec:
         candidates: channels to judge; empty takes all of the recordings. Targets are always among them.
         trusted: channels known to be measured on the machine, besides the targets and the names of Table A.1. Of a
             channel and its copy, the trusted one is taken for the original.
-        horizon: how far ahead the model will predict.
+        horizon: prediction horizon of the model.
         max_lag: lags from -max_lag to max_lag are searched.
         pieces: least number of stretches to compare; recordings are cut where there are fewer.
         neighbours: k of the nearest-neighbour estimate of mutual information.
         information_samples: rows for that estimate, evenly spread over the data.
-        rank_samples: the same for Kendall's tau.
+        rank_samples: number of samples for Kendall's tau.
         piece_samples: rows of each piece for the metrics that are compared among pieces.
         collinear: rank correlation from which channels form a cluster.
         copy: correlation at the best lag from which one channel is a copy of another.
         level: chance of a false alarm of each test of significance, shared among the channels.
         forest: the forest.
-        seed: of everything drawn.
+        seed: seed of all random numbers.
     """
 
     targets: tuple[str, ...] = ()

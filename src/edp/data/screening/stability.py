@@ -36,7 +36,7 @@ class Metrics:
     """Metrics of live channels at t and targets at t + horizon.
 
     Attributes:
-        own: of each piece, ``(metric, piece, channel, target)``.
+        own: metrics of each segment, ``(metric, piece, channel, target)``.
         crossed: channels of a piece with targets of others, ``(metric, shift, piece, channel, target)``.
     """
 
@@ -143,7 +143,7 @@ class Relations:
 
     Attributes:
         linear: correlation at the best lag at which the channel is not later than the target, mean over the pieces.
-        linear_chance: the same between pieces, the largest draw.
+        linear_chance: largest linear relation between different segments.
         linear_t: mean over its standard error among the pieces.
         information: mutual information at the horizon less that between pieces, mean over the pieces, nat.
         information_t: mean over its standard error.
@@ -173,8 +173,8 @@ def relations_of(lagged: Lagged, places: NDArray[np.int64], metrics: Metrics, le
 
     Args:
         lagged: covariances.
-        places: which of its channels are targets.
-        metrics: by piece.
+        places: indices of the targets among the channels.
+        metrics: metrics by segment.
         level: chance of a false alarm, shared among all channels and targets.
     """
     until = lagged.reach + 1  # lags at which the channel is not later than the target

@@ -49,7 +49,7 @@ class CandidateTable:
         names: channels, in the order of the columns.
         groups: kind of signal of each, as Table 4.2 groups them.
         targets: columns of the targets.
-        pieces: what is compared.
+        pieces: candidates to compare.
         rate_hz: samples per second.
         missing: names of the candidates left out since values are missing, with their count.
         left_out: names of recordings that are too short for the lags.

@@ -91,7 +91,7 @@ def linear_values(
     """Return the Granger gain of each used channel for each target.
 
     Args:
-        names: of the channels of `lagged`.
+        names: names of the channels of `lagged`.
         lagged: covariances of every piece.
         used: columns that a model may read; targets too, unless the horizon is 0.
         targets: columns of the targets.

@@ -21,7 +21,7 @@ class BaselineTask(LagTask):
     """Task of a baseline: a `LagTask` with a seed.
 
     Attributes:
-        seed: of row sampling and initial weights.
+        seed: seed of row sampling and initial weights.
     """
 
     seed: int

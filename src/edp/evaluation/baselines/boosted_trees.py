@@ -27,7 +27,7 @@ class BoostedTrees(Baseline):
     The number of trees is the one with the least squared error on validation; without validation all are used.
 
     Args:
-        task: what to predict from what.
+        task: channels to read and to predict.
         row_cap: training rows, drawn with the task's seed.
         trees: largest number of trees per ensemble.
     """

@@ -87,7 +87,7 @@ def predict_from_lags(
 
     Args:
         inputs: ``(time, input)``.
-        task: what is predicted.
+        task: channels to read and to predict.
         means: training means ``(target,)``.
         change_of: maps features ``(row, lag * input)`` to changes ``(row, horizon * target)``.
 

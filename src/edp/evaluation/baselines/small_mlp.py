@@ -24,7 +24,7 @@ class SmallMlp(Baseline):
     `epochs` and keeps the last weights.
 
     Args:
-        task: what to predict from what.
+        task: channels to read and to predict.
         row_cap: training rows, drawn with the task's seed.
         epochs: most passes over these rows.
         patience: epochs without a better validation error after which training stops.
