@@ -38,11 +38,11 @@ def recording_of_columns(
     Args:
         name: the recording's name.
         columns: numbers or time stamps, each of shape ``(time,)``.
-        units: of columns; a column without one is in SI units, or a plain number.
+        units: unit of each column; columns without an entry are in SI units or dimensionless.
         rate_hz: samples per second; without it a column of time stamps tells the rate.
-        signal_map: which columns become which channels; without it every column of numbers is taken under its own
-            name, and its kind is that of the vocabulary or of its unit.
-        repair: what may be repaired; by default nothing is.
+        signal_map: assignment of columns to channels. Without a map each numeric column becomes a channel of the same
+            name, with the kind of the vocabulary or of its unit.
+        repair: allowed repairs; none by default.
 
     Raises:
         DataError: no column, a rate that is not positive, no time stamps where they are needed, text for numbers, or

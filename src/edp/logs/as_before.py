@@ -21,7 +21,7 @@ def read_as_before(source: DataSource, reader: Table) -> DataSource:
 
     Args:
         source: logs, or a folder of them; stores and data-set files have maps of their own.
-        reader: how the others were read (`DataSource.to_plain`).
+        reader: how the other logs were read (`DataSource.to_plain`).
     """
     if source.signal_map is not None or source.stored or source.address or source.path.suffix == ".toml":
         return source

@@ -46,12 +46,12 @@ class Assembly:
     Attributes:
         raw: the file.
         sources: the channels, in order.
-        repair: what may be repaired.
-        lines: how each time column is sampled.
-        rate_hz: of the grid.
+        repair: allowed repairs.
+        lines: sampling of each time column.
+        rate_hz: sample rate of the grid.
         ticks: the ticks of the grid that the recording keeps.
-        missing: which of them lie in a gap, shape ``(time,)``.
-        repairs: those made to time.
+        missing: mask of samples in a gap, shape ``(time,)``.
+        repairs: repairs of the time axis.
         untouched: every row of every channel is taken as it is in the file, by its own rate and map.
     """
 
@@ -85,7 +85,7 @@ class Assembly:
 
         Args:
             start: the first.
-            stop: behind the last.
+            stop: index after the last sample.
             name: the recording's name; None: as the file says.
             before: the last good value of each channel before `start`, shape ``(channel,)``, to hold.
 

@@ -63,7 +63,7 @@ class BucketReader:
     """Read access to one bucket.
 
     Args:
-        address: of anything in it.
+        address: address of any object in the bucket.
 
     Raises:
         ConfigError: an address that names no bucket, or holds credentials.
@@ -239,7 +239,7 @@ def copied(file: RemoteFile) -> Iterator[Path]:
     """Yield an object as a local temporary file under its own name.
 
     Raises:
-        EdpError: as `BucketReader.copy`.
+        EdpError: see `BucketReader.copy`.
     """
     with TemporaryDirectory(prefix="edp_") as folder:
         check_room(Path(folder), file.size, file.address)

@@ -16,9 +16,9 @@ class Drawn:
     """Amount of data selected from a data set.
 
     Attributes:
-        hours: of the stretches.
-        of_hours: of all recordings.
-        stretches: how many.
+        hours: total length of the segments, h.
+        of_hours: total length of all recordings, h.
+        stretches: number of segments.
     """
 
     hours: float

@@ -41,11 +41,11 @@ def read_recording(
 
     Args:
         path: a log of any known format (`edp.logs.known_suffixes`), or the folder of a ROS 2 bag.
-        signal_map: which columns become which channels; an empty map takes the vocabulary's names with the units
-            that the file states (SI where it states none).
+        signal_map: assignment of columns to channels. An empty map uses the names of the vocabulary and the units
+            stated in the file (SI units if none is stated).
         name: the recording's name; default: as the file says, else the file's stem.
         rows: ``(start, stop)`` of the resulting samples, stop exclusive, None for the end.
-        repair: what may be repaired; by default nothing is, and defects are errors.
+        repair: allowed repairs. By default there are none, and defects are errors.
 
     Returns:
         values float32, shape ``(time, channel)``. Time is brought to a uniform grid by the rule stated in
@@ -69,16 +69,17 @@ def read_parts(
     """Read a log in consecutive parts, for logs whose channels do not fit into memory together.
 
     Args:
-        path: as in `read_recording`.
-        signal_map: as in `read_recording`.
-        samples: of a part; the last one is shorter.
-        repair: as in `read_recording`; a part that begins with a missing value holds the last good one before it.
+        path: see `read_recording`.
+        signal_map: see `read_recording`.
+        samples: length of a part in samples; the last part is shorter.
+        repair: see `read_recording`. A part that begins with a missing value repeats the last valid one before it.
 
     Yields:
         recordings that, one after the other, hold the values of `read_recording`; named ``NAME[start:stop]``.
 
     Raises:
-        DataError: as `read_recording`; defects of time before the first part, those of values when their part comes.
+        DataError: see `read_recording`. Defects of time are reported before the first part, defects of values with
+            their part.
     """
     if samples < 1:
         raise DataError(f"parts of {samples} samples asked for; give at least 1")
@@ -170,13 +171,13 @@ def read_data_set(
 
     Args:
         paths: files or folders, or one of them.
-        signal_map: as in `read_recording`, the same for all.
-        repair: as in `read_recording`.
+        signal_map: see `read_recording`; common to all logs.
+        repair: see `read_recording`.
 
     Raises:
-        DataError: as `read_recording`, and for mixed rates or channel sets. Truth of a simulation that only some of
-            them hold is left out instead, unless the map asks for it; and so is any channel that only some hold where
-            the map takes `others`.
+        DataError: see `read_recording`; also for mixed sample rates or channel sets. Simulated truth that only some
+            logs contain is omitted instead, unless the map selects it. If the map takes `others`, any channel that only
+            some logs contain is omitted.
     """
     path_list = [paths] if isinstance(paths, str | Path) else list(paths)
     # A folder and a file in it may both be given; each log counts once.
@@ -195,7 +196,7 @@ def alike(recordings: list[Recording], files: Sequence[Path], truth_asked: bool 
     """Return recordings of one data set after a check of rates and channels against the first.
 
     Args:
-        recordings: with unique names.
+        recordings: recordings with unique names.
         files: their logs, for messages.
         truth_asked: truth of a simulation that only some hold is an error instead of left out.
 

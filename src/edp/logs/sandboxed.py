@@ -41,8 +41,8 @@ def read_apart(chosen: LogFormat, path: Path, size: int, signal_map: SignalMap) 
     Args:
         chosen: a format of `FORMATS`; where it is defined must be a module that can be imported.
         path: the log, a file or the folder of a bag.
-        size: of all its files, in bytes.
-        signal_map: as in `edp.logs.open_log`.
+        size: total size of its files in bytes.
+        signal_map: see `edp.logs.open_log`.
 
     Raises:
         DataError: the file cannot be read, or not within its limits; no process can be started; or a layer of the

@@ -19,7 +19,7 @@ def write_recording(recording: Recording, path: str | Path, options: WriteOption
     """Write a recording; the ending of `path` chooses the format, values are written in SI units.
 
     Args:
-        recording: what to write.
+        recording: recording to write.
         path: its ending is one of `edp.logs.known_suffixes`; an existing file is replaced only by a complete new one.
         options: the layout of a MAT file; where truth goes.
 
@@ -53,9 +53,9 @@ def write_with_events(recording: Recording, path: str | Path, events: Sequence[L
     """Write a recording as MDF 4 with events, which measurement tools mark along its signals.
 
     Args:
-        recording: what to write.
+        recording: recording to write.
         path: an existing file is replaced only by a complete new one.
-        events: at most `edp.logs.formats.mdf_events.MOST_EVENTS`.
+        events: events, at most `edp.logs.formats.mdf_events.MOST_EVENTS`.
 
     Raises:
         DataError: an ending other than MDF's, nothing to write, too many events, or the package asammdf is missing.

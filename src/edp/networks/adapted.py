@@ -19,14 +19,14 @@ class AdaptedStream(Stream):
 
     Args:
         predictor: the network; it is put in evaluation mode.
-        adaptation: how it is corrected.
-        threads: as of `Stream`.
+        adaptation: settings of the correction.
+        threads: see `Stream`.
 
     Attributes:
-        adapter: what was learned; `adapter.learned` outlives a restart, `adapter.restore` brings it back.
+        adapter: learned correction; `adapter.learned` is saved across a restart, `adapter.restore` loads it.
         learn: False freezes what was learned.
-        status: what the adaptation has done in the last step.
-        correction: what it added ``(horizon, target)``, SI units.
+        status: status of the adaptation in the last step.
+        correction: added correction ``(horizon, target)``, SI units.
     """
 
     def __init__(self, predictor: Predictor, adaptation: Adaptation, threads: int = 1) -> None:

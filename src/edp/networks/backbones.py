@@ -256,8 +256,9 @@ class CommitteeSpec:
         activations: ``tanh``, ``relu`` or both; each has its own group of members. None leaves the linear model.
         dropout: rate after each hidden layer, in training.
         centres: radial basis functions on all columns; a training on folds places them.
-        near: of as many more for each entry, the span among `lags` whose changes they read beside the present values;
-            0 for present values alone. Where rows are few, what reads few columns learns more from them.
+        near: additional perceptrons that read the present values and the changes over one span only. Each entry selects
+            the span among `lags`; 0 selects present values alone. With few rows, perceptrons of few inputs generalise
+            better.
         trees: regression trees for each predicted number; their sums join the representation. A training on folds
             fits them.
         tree_depth: comparisons from the root of a tree to a leaf.

@@ -27,7 +27,7 @@ class Members(Streaming):
     """Perceptrons of equal size without memory, ``(batch, time, width)`` to ``(batch, time, members units)``.
 
     Attributes:
-        weights: of each layer, ``(member, in, units)``; `biases` ``(member, units)``.
+        weights: weights of each layer, ``(member, in, units)``; `biases` has shape ``(member, units)``.
     """
 
     matrices = (("weights", (0, 2)),)
@@ -87,10 +87,10 @@ class Committee(Streaming):
 
     Args:
         bank: gives what the others read.
-        groups: of perceptrons.
+        groups: groups of perceptrons.
         radial: nearness to typical rows; None for none.
         near: nearness in few columns, each one to typical rows.
-        trees: for each predicted number, horizons times targets; None for none.
+        trees: number of trees for each prediction (horizon and target); None without trees.
     """
 
     def __init__(

@@ -16,7 +16,7 @@ class Decomposition:
     Attributes:
         backbone: names of parameters by part of the backbone, from the input on; parts are the beginnings of names.
         head: names of all others: gate, heads, output, activation, skip connection and what a physics base learns.
-        last: those of `head` that are the last linear layer of the heads.
+        last: parameters of `head` that belong to the last linear layer of the heads.
     """
 
     backbone: dict[str, tuple[str, ...]]

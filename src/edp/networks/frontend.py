@@ -24,7 +24,7 @@ class _Span:
 
     Attributes:
         of_changes: see `Derivation`.
-        ticks: of the span; 1 needs no mean.
+        ticks: length of the span in samples; 1 needs no mean.
         entries: their numbers among the derived channels.
     """
 

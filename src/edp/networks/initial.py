@@ -102,7 +102,7 @@ class LearnedConstant(Streaming):
 class LearnedFromPrefix(Streaming):
     """Recurrent layers whose state is corrected once, `ticks` ticks after a reset.
 
-    State: that of the layers; the sum of the prefix so far ``(batch, width_in)``; the ticks since reset, up to
+    State: state of the layers; sum of the prefix so far ``(batch, width_in)``; samples since the reset, up to
     `ticks`, ``(batch, 1)``. The network runs at every call and its result is used at one, so that all ticks of a
     stream take the same time.
     """

@@ -61,7 +61,7 @@ class LagBank(Streaming):
         bounded: whether columns are held within `low` and `high`.
 
     Attributes:
-        gain: what each change is multiplied by, ``(lag + smoothed, width)``; a trainer sets one over its deviation.
+        gain: factor of each change, ``(lag + smoothed, width)``; training sets it to the inverse standard deviation.
         low: least value of each column, ``(columns,)``, of a bounded bank; until it is set it holds nothing back.
         high: largest likewise.
     """

@@ -21,10 +21,10 @@ class Matrix:
     """A weight of multiply-accumulates.
 
     Attributes:
-        name: in the network.
+        name: name in the network.
         part: the module that is called with it.
         holder: the module that it is a parameter of, under `key`.
-        axes: of its outputs.
+        axes: axes of its outputs.
     """
 
     name: str

@@ -57,7 +57,7 @@ class Output(nn.Module):
     """Interpretation of the additional head outputs as intervals; this class has point predictions only.
 
     Args:
-        coverages: of its intervals.
+        coverages: coverages of its intervals.
         horizons: number of horizons.
         outputs: number of targets.
     """
@@ -91,7 +91,7 @@ class Output(nn.Module):
         Args:
             build: takes the layers.
             center: the prediction, ``horizon * output``.
-            y: what the heads give, ``horizon * value * output``.
+            y: output of the heads, ``horizon * value * output``.
         """
         if not self.coverages:
             return None
@@ -118,7 +118,7 @@ class Output(nn.Module):
         """Return the index of the interval with this coverage.
 
         Raises:
-            ConfigError: none has.
+            ConfigError: no interval has this coverage.
         """
         for which, own_coverage in enumerate(self.coverages):
             if math.isclose(own_coverage, coverage, abs_tol=1e-6):
@@ -134,7 +134,7 @@ class Output(nn.Module):
         The factor is the ``(n + 1) c / n`` quantile of the error in units of the distance to the bound on its side.
 
         Args:
-            answer: for n ticks not used in training, ``(1, tick, horizon, output)`` and so on.
+            answer: outputs for n samples not used in training, ``(1, tick, horizon, output)`` etc.
             target: standardised, ``(1, tick, horizon, output)``.
         """
         error = target - answer.center
@@ -251,7 +251,7 @@ class _Law:
     """Options of an output that states the variance of its error.
 
     Attributes:
-        coverages: of the intervals that are calibrated and judged, decreasing.
+        coverages: coverages of the calibrated and evaluated intervals, decreasing.
         calibrated: stretch the intervals after training so that they hold their share of the validation part.
 
     Raises:

@@ -86,7 +86,7 @@ class Predictor(Streaming):
     ``intervals`` gives lower and upper bounds too.
 
     Attributes:
-        number_format: of what it computes with; a bundle holds float32 only.
+        number_format: number format of the computation; bundles contain float32 only.
     """
 
     number_format = "float32"

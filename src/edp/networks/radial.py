@@ -41,18 +41,17 @@ class RadialFeatures(Streaming):
 
     Args:
         width: columns of its input.
-        centres: how many.
-        columns: those that it reads, in their order, each no further than within its limits; None for all of them, as
-            they are.
+        centres: number of centres.
+        columns: indices of the columns that it reads, each limited to its range; None for all columns without limits.
 
     Attributes:
-        columns: that it reads.
-        gain: what each of these is multiplied by, one over the product of length and spread, ``(column,)``.
+        columns: indices of the columns that it reads.
+        gain: factor of each column: one divided by the product of length scale and standard deviation, ``(column,)``.
         weight: ``(centre, column + 1)``; at first all centres are at the origin.
         bias: ``(centre,)``.
         low: limits of the columns, ``(column,)``, where some are chosen; at first all numbers of single precision.
             Few columns allow long basis functions with large weights, which run away where no row was.
-        high: likewise.
+        high: upper limits, same shape.
     """
 
     gain: Tensor

@@ -24,7 +24,7 @@ def size_at_most(spec: Any, task: Task) -> tuple[int, int]:
 
     Args:
         spec: a `ModelSpec`.
-        task: what it reads and predicts.
+        task: channels to read and to predict.
     """
     # Options alone: building a network to count it could exhaust the memory that is to be protected.
     options = list(_integers((spec.backbone, spec.head, *spec.blocks)))

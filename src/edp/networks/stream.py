@@ -44,9 +44,9 @@ class StreamTick:
         prediction: ``(horizon, target)``, float32, SI units. After `RESTARTED` the last valid one, as in C, where the
             output is left as it was; NaN before the first.
         lower: bounds of intervals ``(coverage, horizon, target)``, SI units; no rows where the network has none.
-        upper: the same.
-        coverages: of the intervals, in the order of their rows.
-        status: what was done.
+        upper: upper bounds, same shape.
+        coverages: coverages of the intervals, in the order of their rows.
+        status: status of the step.
     """
 
     prediction: Rows
@@ -82,7 +82,7 @@ class Stream:
 
     Args:
         predictor: the network; it is put in evaluation mode.
-        threads: of PyTorch while a tick is computed; a tick is too small to be shared out.
+        threads: number of PyTorch threads during a step; a step is too small to be divided.
 
     Attributes:
         ticks: steps and held ticks since the last reset.

@@ -25,7 +25,7 @@ class Cost:
     Attributes:
         part: name of the layer.
         parameters: trainable numbers as stored (weight-norm gains and STanh amplitudes included).
-        foldable: those of them that an inference build merges into its neighbours (gains, output amplitudes).
+        foldable: operations that an inference build merges into neighbouring layers (gains, output amplitudes).
         per_column: multiply-accumulates for each new time step of the input.
         per_prediction: multiply-accumulates once per prediction.
         pooling: multiply-accumulates of window pooling, once per prediction; the thesis's windowed figures
@@ -80,7 +80,7 @@ class Streaming(nn.Module, ABC):
     output as one call (chunk invariance); output t never depends on inputs after t (causality).
 
     Attributes:
-        operations: what the part itself computes, without the parts inside it.
+        operations: operations of the part itself, without those of the parts inside it.
         matrices: weights of multiply-accumulates among its own parameters: name, and axes of its outputs. Those of
             PyTorch's layers inside it are known.
         fixed: names of its parameters that no training changes (``requires_grad`` is False).

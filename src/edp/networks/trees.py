@@ -31,12 +31,12 @@ class Trees(Streaming):
     Args:
         width: columns that they read.
         outputs: sums.
-        trees: of each sum.
+        trees: number of trees per sum.
         depth: comparisons from the root to a leaf.
 
     Attributes:
         feature: ``(output, tree, 2^depth - 1)``, int64.
-        threshold: likewise; at first no node splits.
+        threshold: thresholds, same shape; initially no node splits.
         leaf: ``(output, tree, 2^depth)``, at first zeros.
     """
 

@@ -99,11 +99,11 @@ class RawLog:
         scalars: single numbers of a MAT file (gains and the like); used only where a map names them.
         rate_hz: the rate the file itself states; its rows are then uniform.
         name: the recording's name as the file states it.
-        source: where the recording came from as the file states it.
+        source: origin of the recording as stated in the file.
         meta: facts the file carries.
         aliases: further names of columns, each with its name in `signals` (the whole path of a signal).
         repeated: names that several columns have, with the names in `signals` that tell them apart.
-        digest: of the values that EDP wrote (`Recording.digest`), where the file states it.
+        digest: hash of the values that EDP wrote (`Recording.digest`), if the file states it.
     """
 
     path: Path

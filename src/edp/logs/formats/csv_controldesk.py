@@ -38,9 +38,9 @@ class ControlDeskHead:
     """The head of an export.
 
     Attributes:
-        names: of the cells of a row; empty for the key and for time.
-        units: of the cells.
-        paths: of the cells, in the model; empty where there is none.
+        names: names of the cells of a row; empty for the key and for time.
+        units: units of the cells.
+        paths: model paths of the cells; empty without a path.
         times: places of the columns of time.
         repeated: names that several traces have in the file, with the names that tell them apart.
         delimiter: between cells.
@@ -64,7 +64,7 @@ def controldesk_head(path: Path, lines: Sequence[str], encoding: str) -> Control
     Args:
         path: the file.
         lines: the first lines of it.
-        encoding: of the text.
+        encoding: encoding of the text.
 
     Raises:
         DataError: the head has no rows of numbers behind it, or no time.
@@ -147,8 +147,8 @@ def read_controldesk(path: Path, head: ControlDeskHead, encoding: str) -> RawLog
 
     Args:
         path: the file.
-        head: of it.
-        encoding: of the text.
+        head: head of the export.
+        encoding: encoding of the text.
 
     Raises:
         DataError: rows of another width than the head, or a time that is no number.

@@ -50,7 +50,7 @@ def leftovers_of(path: Path, encoding: str, delimiter: str, skip: int, width: in
 
     Args:
         path: the file.
-        encoding: of it.
+        encoding: encoding of the file.
         delimiter: between its cells.
         skip: lines above the table.
         width: cells of a row.
@@ -151,7 +151,7 @@ class TableText(PassedText):
         skip: lines above the table, which stay.
         delimiter: between its cells.
         width: cells of a row.
-        leftovers: what is passed over.
+        leftovers: lines to skip.
     """
 
     def __init__(self, path: Path, skip: int, delimiter: str, width: int, leftovers: Leftovers) -> None:

@@ -36,8 +36,8 @@ class ScopeHead:
     """The head of an export.
 
     Attributes:
-        names: of the cells of a row, `SampleTime[ms]` where a cell holds time.
-        units: of the cells.
+        names: names of the cells of a row; `SampleTime[ms]` for time.
+        units: units of the cells.
         delimiter: between cells.
         lines: before the first row of numbers.
     """
@@ -105,9 +105,9 @@ def read_scope(path: Path, head: ScopeHead, sample: Sequence[str], encoding: str
 
     Args:
         path: the file.
-        head: of it.
+        head: head of the export.
         sample: some of its rows of numbers.
-        encoding: of the text.
+        encoding: encoding of the text.
 
     Raises:
         DataError: cells that are no numbers, or more of them than the free memory holds.

@@ -142,7 +142,7 @@ class SqueezedText(PassedText):
 
     Args:
         path: the text.
-        encoding: of it.
+        encoding: encoding of the text.
         skip: lines before the table.
     """
 

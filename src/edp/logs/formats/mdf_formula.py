@@ -64,7 +64,7 @@ class Formula:
     """A formula in reverse Polish order, each step a number, ``X`` or an operation.
 
     Attributes:
-        steps: in the order of evaluation.
+        steps: steps in the order of evaluation.
     """
 
     steps: tuple[float | str, ...]

@@ -167,7 +167,7 @@ class Relation:
     Attributes:
         how: ``change`` (its change in time), ``copy`` or ``reference`` (what the other one follows).
         other: name of the other column.
-        factor: for a change the column over the change of the other a row.
+        factor: for a change, the column divided by the change per row of the other column.
         strength: correlation.
     """
 

@@ -34,13 +34,13 @@ class ClockGuess:
 
     Attributes:
         column: the time column; None where rows are even, or signals have times of their own.
-        unit: of it.
+        unit: unit of the time column.
         sample_time_s: step of rows without a time column.
         rate_hz: samples a second, None where nothing tells.
         wanted_hz: rate to bring a fast log to; None keeps its own.
         beside: columns that also tell time, and are no channels.
-        confidence: from 0 to 1.
-        check: what a person should look at.
+        confidence: confidence, 0 to 1.
+        check: advice for a manual check.
     """
 
     column: str | None

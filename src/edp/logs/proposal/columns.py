@@ -56,10 +56,10 @@ class LogColumn:
         name: the file's own.
         pieces: values of consecutive rows, float64, NaN where missing; the first piece is the beginning.
         samples: rows that the file has.
-        unit: as the file states it.
-        kind: as the file states it (EDP's own).
+        unit: unit stated in the file.
+        kind: kind stated in the file (EDP's own formats).
         own_time: it has time stamps of its own, as signals of MDF and bags do.
-        clock: what these say; None where they are not looked at.
+        clock: time in these columns; None if they were not examined.
     """
 
     name: str
@@ -82,16 +82,16 @@ class LogLook:
 
     Attributes:
         path: the log.
-        columns: those of numbers, in the file's order; of one length.
+        columns: numeric columns of equal length, in the order of the file.
         texts: names of columns that hold text.
-        rows: of the file, or of its part.
-        rate_hz: as the file states it.
+        rows: number of rows of the file or part.
+        rate_hz: sample rate stated in the file.
         time: the column that the reader takes for time by its name or its dates.
         step_s: median step of the times that the reader made of it, None where there are none.
         headerless: the file names no columns.
         shared: every name occurs once.
         left_out: columns that were not looked at, by the reason.
-        part: what share of the file was looked at, in words; empty for all of it.
+        part: description of the examined part of the file; empty for the whole file.
         experiments: names of those that stand beside each other in a variable of a MAT file.
     """
 

@@ -21,9 +21,9 @@ class Experiments:
     """Experiments with the same columns.
 
     Attributes:
-        group: those that were looked at, as logs.
+        group: examined experiments, as logs.
         entries: file and name of each.
-        others: those among these with other columns, by file and name.
+        others: experiments with other columns, by file and name.
     """
 
     group: LogGroup

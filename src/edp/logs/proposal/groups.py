@@ -25,7 +25,7 @@ class LogGroup:
     """Logs with the same columns, give or take a few.
 
     Attributes:
-        looks: those that were looked at, the longest first.
+        looks: examined logs, the longest first.
         paths: all of them.
         names: columns of those that were not looked at but compared.
     """
@@ -49,14 +49,14 @@ def group_logs(paths: Sequence[Path], progress: Progress = SILENT) -> tuple[list
     """Look at logs and sort them by their columns, the most rows first.
 
     Args:
-        paths: of the logs.
+        paths: paths of the logs.
         progress: receiver of the progress; its units are logs.
 
     Returns:
         the groups, and what is wrong with the logs that cannot be read.
 
     Raises:
-        DataError: none can be read.
+        DataError: no log can be read.
     """
     chosen = some_of(paths)
     groups: list[list[LogLook]] = []

@@ -39,11 +39,11 @@ class KindGuess:
     """Kind and unit of a column.
 
     Attributes:
-        kind: what it measures; generic below `BOUND`.
-        unit: of the numbers in the file; "1" where they are taken as they are.
-        confidence: from 0 to 1.
-        why: what it was taken from.
-        check: what a person should look at; empty where nothing is open.
+        kind: physical quantity; generic for a confidence below `BOUND`.
+        unit: unit of the numbers in the file; "1" if they are used without conversion.
+        confidence: confidence, 0 to 1.
+        why: evidence for the guess.
+        check: advice for a manual check; empty if nothing is uncertain.
     """
 
     kind: Kind
@@ -67,8 +67,8 @@ def kind_of(column: LogColumn, behaviour: Behaviour, family: int) -> KindGuess:
 
     Args:
         column: the column.
-        behaviour: of its numbers.
-        family: how many tags of instruments with the same letters the log has, this one included.
+        behaviour: statistics of the column.
+        family: number of instrument tags in the log that begin with the same letters, including this one.
     """
     if column.kind is not None:
         unit = known_unit(column.unit) or KINDS[column.kind].si_unit
@@ -192,8 +192,8 @@ def kind_of_change(relation: Relation, other: KindGuess, rate_hz: float | None) 
     """Kind and unit of a column that is the change in time of one whose kind and unit are known; None for others.
 
     Args:
-        relation: of the column to the other one.
-        other: what that is.
+        relation: relation of the column to the other column.
+        other: kind and unit of the other column.
         rate_hz: rows a second.
     """
     kind = _RATES.get(other.kind)

@@ -57,10 +57,10 @@ class ColumnGuess:
         channel: name of the channel; empty where it becomes none.
         role: ``time``, ``counter``, ``constant``, ``text``, ``remark``, or one of `MAPPED_ROLES`.
         kind: kind and unit.
-        confidence: of role and kind together, from 0 to 1.
-        why: what the role was taken from.
-        check: what a person should look at.
-        relation: how it follows from another column.
+        confidence: joint confidence of role and kind, 0 to 1.
+        why: evidence for the role.
+        check: advice for a manual check.
+        relation: dependency on another column.
     """
 
     column: str

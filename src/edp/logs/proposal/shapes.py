@@ -33,7 +33,7 @@ def shape_notes(look: LogLook) -> list[str]:
     """Return warnings that a table is not a log with one channel per column.
 
     Args:
-        look: what was looked at.
+        look: examined part of the log.
     """
     if look.headerless and len(look.columns) >= _LEAST_COLUMNS and _neighbours_continue(look):
         return [
@@ -60,8 +60,8 @@ def pace_notes(look: LogLook, clock: ClockGuess, targets: Collection[str]) -> li
     """Return a warning if the targets move faster than the reduced rate can represent.
 
     Args:
-        look: what was looked at.
-        clock: of its rows.
+        look: examined part of the log.
+        clock: time of the rows.
         targets: columns to predict.
     """
     rate, wanted_hz = clock.rate_hz, clock.wanted_hz
@@ -95,7 +95,7 @@ def beside_notes(source: Path, paths: Collection[Path]) -> list[str]:
     """Return warnings about text files with tables that are ignored next to logs of other formats.
 
     Args:
-        source: what was asked about.
+        source: source that the user named.
         paths: the logs that were found there.
     """
     if not is_folder_at(source) or any(path.suffix.lower() == ".txt" for path in paths):

@@ -29,7 +29,7 @@ class Timing:
 
     Attributes:
         rate_hz: the rate to bring all of them to; None where they have one.
-        repairs: for each log that was looked at and needs some, as ``--repair`` takes them.
+        repairs: required repairs of each examined log, in the notation of ``--repair``.
     """
 
     rate_hz: float | None

@@ -49,10 +49,10 @@ class Finding:
     Attributes:
         severity: ``error`` (cannot be used as it is), ``warning`` (look at it) or ``note``.
         channel: the channel concerned, None for the whole log.
-        what: what was found.
-        count: how many samples, stamps or stretches.
+        what: description of the finding.
+        count: number of affected samples, time stamps or segments.
         where: first place, as row and time.
-        advice: what to do.
+        advice: recommended action.
     """
 
     severity: str

@@ -29,7 +29,7 @@ class DataQuality:
     Attributes:
         reports: one for each log.
         repeats: pairs of recordings that hold the same session.
-        findings: what else stands out between recordings.
+        findings: other differences between recordings.
     """
 
     reports: tuple[QualityReport, ...]
@@ -67,9 +67,9 @@ def compare(reports: Sequence[QualityReport], sketches: Sketches, more: Sequence
     """Compare the recordings of a data set.
 
     Args:
-        reports: of the recordings, each alone.
-        sketches: of those that could be read.
-        more: what else is to be said of all of them.
+        reports: reports of the single recordings.
+        sketches: sketches of the readable recordings.
+        more: additional findings on the whole data set.
     """
     repeats = find_repeats(sketches.all)
     advice = (

@@ -47,7 +47,7 @@ def inspect_log(path: str | Path, signal_map: SignalMap | None = None) -> Qualit
 
     Args:
         path: a log of any known format.
-        signal_map: as in `read_recording`.
+        signal_map: see `read_recording`.
 
     Raises:
         DataError: only where the file itself cannot be read (missing, damaged, of another format).
@@ -66,13 +66,14 @@ def look_into(
 
     Args:
         path: a log file of a known format.
-        signal_map: as in `read_recording`.
-        name: as in `read_recording`.
-        rows: as in `read_recording`.
-        repair: what will be repaired when it is read: such defects of time are warnings. Nothing is repaired here.
+        signal_map: see `read_recording`.
+        name: see `read_recording`.
+        rows: see `read_recording`.
+        repair: repairs that will be applied when the log is read. Defects of time that they repair are warnings. This
+            function repairs nothing.
 
     Raises:
-        DataError: as `inspect_log`.
+        DataError: see `inspect_log`.
     """
     original_map = signal_map or SignalMap()
     raw, signal_map, sources, problems = _opened(Path(path), original_map)

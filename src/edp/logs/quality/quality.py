@@ -30,8 +30,8 @@ class ChannelFacts:
     """Facts of one channel in its report unit (``mm/s``, ``bar`` and so on); missing samples are left out.
 
     Attributes:
-        name: of the channel.
-        kind: what it measures.
+        name: name of the channel.
+        kind: physical quantity.
         unit: the report unit.
         min: smallest value.
         max: largest value.
@@ -43,7 +43,7 @@ class ChannelFacts:
         levels: distinct values, of at most 500,000 samples.
         noise: deviation of its white noise at rest.
         snr_db: deviation over noise in decibels, None without noise.
-        new_hz: how often a new value comes.
+        new_hz: rate of new values, Hz.
         stuck_s: longest time at exactly one value between the ends of the range.
         at_ends: share of the samples at the minimum or maximum.
         verdict: ``good``, ``check`` or ``unusable``.

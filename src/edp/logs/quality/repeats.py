@@ -58,12 +58,12 @@ class Repeat:
     Attributes:
         first: one recording.
         second: the other.
-        seconds: how much of it they share.
-        share: of the shorter recording.
-        first_from_s: where the shared part begins in the first.
-        second_from_s: where it begins in the second.
-        channels: how many channels agree.
-        compared: how many channels that move there could be compared.
+        seconds: length of the common part, s.
+        share: fraction of the shorter recording.
+        first_from_s: start of the common part in the first recording, s.
+        second_from_s: start of the common part in the second recording, s.
+        channels: number of channels that agree.
+        compared: number of moving channels that were compared.
         correlation: median over windows and channels that agree.
         renamed: channels that agree under another name, as (first, second).
         identical: every sample is the same.
@@ -235,7 +235,7 @@ def _fingerprints(values: Floats, places: NDArray[np.int64]) -> tuple[Floats, ND
 
     Args:
         values: blocks of a channel.
-        places: where the windows begin.
+        places: start indices of the windows.
     """
     windows = np.lib.stride_tricks.sliding_window_view(values, WINDOW)[places]
     phase = np.pi * (np.arange(WINDOW) + 0.5) / WINDOW

@@ -24,12 +24,12 @@ class Sketch:
     """A recording at a low rate.
 
     Attributes:
-        name: of the recording.
+        name: name of the recording.
         channels: names, in the order of the columns.
         values: means over 0.1 s, each channel over its deviation about its mean, shape ``(block, channel)``.
         hz: blocks per second; `SKETCH_HZ`, or the recording's own rate where that is lower.
-        digest: of the samples, whatever the channels are called.
-        seconds: that the recording lasts.
+        digest: hash of the samples, independent of channel names.
+        seconds: length of the recording, s.
     """
 
     name: str

@@ -49,7 +49,7 @@ class OutputSpace:
         features: scaled features.
         horizons: look-ahead times.
         outputs: targets.
-        present: for each target the feature that holds its present value, None where it is not measured.
+        present: for each target, the feature with its present value; None if it is not measured.
         gain: ``(horizon, output)``; a present value in the standardised space of its target is its scaled feature
             times `gain` plus `shift`.
         shift: ``(horizon, output)``.
@@ -68,7 +68,7 @@ class BlockSpec(Protocol):
     """A frozen dataclass of a block's options; a subclass-free interface, one per slot adds `build`.
 
     Attributes:
-        slot: where it sits.
+        slot: position of the block in the network.
         space: values worth searching, by option; a block that has some is among the modules of every search.
     """
 

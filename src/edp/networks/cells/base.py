@@ -37,7 +37,7 @@ def check_cell(backbone: str, cell: CellSpec, zoneout: float, families: Sequence
     """Raise ConfigError for a layer that does not fit the backbone, or for zoneout on a layer without it.
 
     Raises:
-        ConfigError: with the reason.
+        ConfigError: the layer does not fit; the message states the reason.
     """
     kind = CELLS.name_of(cell)
     if families and cell.family not in families:

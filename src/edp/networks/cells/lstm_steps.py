@@ -41,8 +41,8 @@ def lstm_steps(
     Args:
         projected: ``(time, batch, 4 units)``, the input's part of the pre-activations, with all that is added.
         recurrent: ``(4 units, units)``.
-        norm: where given, ``U h`` is normalised and multiplied with ``(4 units,)``, and ``tanh`` acts on c normalised,
-            multiplied with and shifted by ``(units,)`` each.
+        norm: layer normalisation, optional: ``U h`` is normalised and multiplied by ``(4 units,)``; ``tanh`` acts on c
+            after normalisation, multiplication and addition of ``(units,)`` each.
         state: h and c, each ``(batch, units)``.
         share: ``h = h_before + share (h~ - h_before)``, and likewise c; 1 without zoneout.
 

@@ -22,8 +22,8 @@ class Prediction:
         spread: ``(batch, time, horizon, number, output)``: what it says about its own error. Nothing for a point
             (no numbers); for quantiles the signed distance of each other level from the median; for a law the
             logarithm of the variance.
-        levels: of the quantiles in `spread`, in order.
-        law: of the error, ``normal`` or ``laplace``, where `spread` is a variance.
+        levels: levels of the quantiles in `spread`, in order.
+        law: distribution of the error, ``normal`` or ``laplace``, if `spread` is a variance.
     """
 
     center: Tensor
@@ -68,7 +68,7 @@ def masked_loss(spec: LossSpec, answer: Prediction, target: Tensor, valid: Tenso
 
     Args:
         spec: the loss.
-        answer: what the network says.
+        answer: output of the network.
         target: standardised, ``(batch, time, horizon, output)``.
         valid: ``(batch, time)``; ticks that count.
         weights: ``(horizon, output)`` or ``(output,)``.

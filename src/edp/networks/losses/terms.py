@@ -18,7 +18,7 @@ class Course:
 
     Attributes:
         predicted: ``(stream, time, horizon, output)``, as the network's standardised output.
-        target: likewise.
+        target: targets, same shape and unit.
         level: ``(stream, time, 1 or horizon, output)``: what both are counted from, the present value in delta mode;
             zero in absolute mode. ``predicted + level`` is the prediction of the value itself.
         valid: ``(stream, time)``; ticks that count.

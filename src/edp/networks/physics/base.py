@@ -184,7 +184,7 @@ class PhysicsBase(Streaming):
 
         Args:
             x: inputs ``(batch, time, input)``.
-            pose: at each tick.
+            pose: pose at each sample.
             rate: joint rates in rad/s, ``(batch, time, 3)``.
             speed: cylinder velocities J rate in m/s, ``(batch, time, 3)``.
         """

@@ -29,9 +29,9 @@ class DynamicSpec(PhysicsSpec):
     """Options of the bases that integrate forces.
 
     Attributes:
-        load: what is taken off the cylinder force ``A_A p_A - A_B p_B``: ``none`` (the thesis's equations to the
-            letter), ``gravity``, or ``all``: gravity, Coriolis torques, the seals'
-            friction and the ends of the stroke.
+        load: forces subtracted from the cylinder force ``A_A p_A - A_B p_B``: ``none`` (exactly the equations of the
+            thesis), ``gravity``, or ``all``: gravity, Coriolis torques, friction of the seals and forces of the end
+            stops.
         fade_s: time constant in s with which the acceleration dies away over the horizon, as the oil's stiffness
             takes up the force; 0 holds it for all of the k steps, as the thesis does. 0.03 is near the best at
             100 ms on M22 and C14.

@@ -23,7 +23,7 @@ class Symbol:
     Args:
         build: takes the layers.
         value: name of the value in the graph.
-        shape: of the numbers, the last dimension next to each other.
+        shape: shape of the values; the last dimension is contiguous.
     """
 
     def __init__(self, build: Builder, value: str, shape: tuple[int, ...]) -> None:

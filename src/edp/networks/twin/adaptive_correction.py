@@ -79,8 +79,8 @@ class TunedCorrection:
         """Process one sample and correct the prediction made from it.
 
         Args:
-            command: of the twin ``(command,)``; one that is missing interrupts.
-            measured: what the twin answers ``(answer,)``, NaN where a sensor is missing.
+            command: commands of the twin ``(command,)``; a missing value stops the correction.
+            measured: measured outputs of the twin ``(answer,)``, NaN for a missing sensor.
             prediction: the network's ``(horizon, target)``, SI units; as it is where it is not finite.
             oil_c: temperature of the oil (degC); NaN: not measured.
         """

@@ -56,10 +56,10 @@ class NumberGroup:
     """Numbers of a grey box that grow and shrink together.
 
     Attributes:
-        powers: by how their names begin, the power of the group's factor by which they grow.
+        powers: for each prefix of parameter names, the power of the group's factor that multiplies these parameters.
         deviation: prior deviation of the logarithm of the factor.
         shared: one group for the machine; else one for each actuator, its valves included.
-        per_kelvin: by how much the logarithm changes with the oil's temperature, where that is measured.
+        per_kelvin: change of the logarithm per kelvin of oil temperature, if that is measured.
     """
 
     powers: Mapping[str, float]
@@ -83,11 +83,11 @@ class TunedSpec:
     """Speed and limits of the parameter adaptation.
 
     Attributes:
-        groups: of `NUMBER_GROUPS`, what is learned.
+        groups: names in `NUMBER_GROUPS` of the groups to adapt.
         learn_ticks: length of a stretch that is run again.
         forgetting_s: seconds of motion after which what was learned has 1/e of its weight.
-        gain: of the observer, as a share of the way to the measurement.
-        load_share: of a new force that the estimate takes over in a tick; 0: no forces are estimated.
+        gain: gain of the observer, as a fraction of the innovation.
+        load_share: fraction of a new force that the estimate adopts per sample; 0 to estimate no forces.
         oil_c: temperature of the oil (degC) in the logs to which the twin was fitted, for ticks that tell theirs; NaN:
             not known.
 
@@ -147,15 +147,15 @@ class AdaptiveTwin:
 
     Args:
         twin: the grey box of the machine as it was.
-        spec: how it follows.
+        spec: settings of the adaptation.
 
     Attributes:
-        labels: of the groups.
+        labels: labels of the groups.
         moves: powers by which each number grows with each group's factor ``(number, group)``.
         deviation: prior, of the logarithms of the factors ``(group,)``.
         warmth: their change by a kelvin ``(group,)``.
         logs: logarithms of the groups' factors, less `by_oil` ``(group,)``; 0 where nothing has changed.
-        by_oil: what the oil's temperature makes of them ``(group,)``.
+        by_oil: factor of the oil temperature for each group ``(group,)``.
         learn: False freezes them.
         learned: stretches that have taught.
 

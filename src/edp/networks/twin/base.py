@@ -39,8 +39,8 @@ class Twin(ABC):
     from a kept state. Arrays are float32 in SI units; nothing here needs torch.
 
     Attributes:
-        channels: what commands it and what it answers.
-        scales: of its numbers, and the bounds of its answers.
+        channels: commands and outputs.
+        scales: scales of the network, and bounds of the outputs.
         prefix_ticks: least number of measured ticks before a free run.
     """
 
@@ -65,7 +65,7 @@ class Twin(ABC):
         Args:
             build: the layers in the making.
             commands: scaled ``(command,)``.
-            fed: what the ports read, scaled ``(answer,)``.
+            fed: scaled feedback inputs ``(answer,)``.
 
         Raises:
             ExportError: the formulation has no form as layers; that of this class always.
@@ -163,8 +163,8 @@ class Twin(ABC):
 
         Args:
             commands: ``(run, tick, command)``, those of a run the first one's before it branches off.
-            state: of that one machine, a batch of one.
-            measured: what its ports read at the first tick ``(answer,)``, NaN where a port is free.
+            state: state of one machine, a batch of one.
+            measured: feedback inputs at the first sample ``(answer,)``, NaN for outputs that run free.
             first: tick at which each run branches off the first one ``(run,)``, ascending, its own zero.
 
         Returns:
@@ -197,7 +197,7 @@ class Twin(ABC):
         into the stop is zero.
 
         Args:
-            feedback: what the ports read ``(batch, answer)``.
+            feedback: feedback inputs ``(batch, answer)``.
             velocity: proposed velocities ``(batch, velocity)``; `pressure` likewise.
             pressure: proposed pressures.
         """
@@ -254,7 +254,7 @@ class TwinRunner:
     Values are those of the twin's own methods but for rounding. A controller asks so a hundred times a second.
 
     Args:
-        twin: that runs; later changes of its numbers may or may not show.
+        twin: twin to run. Later changes of its parameters may or may not take effect.
 
     Attributes:
         resistance: forces against each velocity (N, or N m) that the load does not know of; None where the twin's

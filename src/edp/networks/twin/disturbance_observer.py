@@ -27,7 +27,7 @@ def force_slopes(
     """Slopes of velocities after a tick by forces against them, m/s by N ``(velocity, velocity)``.
 
     Args:
-        runner: of a model with a load; its `resistance` is left as it was.
+        runner: runner of a model with a load; its `resistance` is restored.
         velocities: columns of its answers.
         tick: command, row that its ports read, and state before it.
         expected: the velocities with its present resistance.
@@ -51,9 +51,9 @@ class DisturbanceObserver:
     what it moves. What the model knows wrongly of friction or gravity counts as one, too.
 
     Args:
-        runner: of a model with a load; its `resistance` is written.
+        runner: runner of a model with a load; the observer writes its `resistance`.
         velocities: columns of its answers, which begin with all velocities.
-        share: of a new error that the estimate takes over in a tick; 0: none.
+        share: fraction of a new error that the estimate adopts per sample; 0 to switch the observer off.
     """
 
     def __init__(self, runner: TwinRunner, velocities: NDArray[np.int64], share: float) -> None:
@@ -75,8 +75,8 @@ class DisturbanceObserver:
         """Store the model's prediction of a sample.
 
         Args:
-            command: of it ``(command,)``.
-            row: that its ports read ``(answer,)``.
+            command: command of the sample ``(command,)``.
+            row: feedback inputs of the sample ``(answer,)``.
             before: state before it.
             after: state after it.
         """

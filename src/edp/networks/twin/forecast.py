@@ -64,7 +64,7 @@ def choose_gain(twin: Twin, series: Sequence[Series], horizons: Sequence[int]) -
     Args:
         twin: any formulation.
         series: inputs are commands, targets are what the twin answers; the first ones are used.
-        horizons: how many ticks ahead.
+        horizons: horizons in samples.
     """
     ends, parts = sorted({min(horizons), max(horizons)}), list(series)[:CHOICE_LOGS]
     least = twin.prefix_ticks + ends[-1] + 1
@@ -92,8 +92,8 @@ def forecast(twin: Twin, commands: Array, measured: Array, horizons: Sequence[in
         twin: any formulation.
         commands: ``(tick, command)``, finite.
         measured: ``(tick, answer)``, NaN where a sensor is missing.
-        horizons: how many ticks ahead.
-        gain: of the observer; see `choose_gain`.
+        horizons: horizons in samples.
+        gain: gain of the observer; see `choose_gain`.
 
     Returns:
         ``(tick, horizon, answer)``, SI units; NaN in the ticks before the observer has settled: `Twin.prefix_ticks`

@@ -32,9 +32,9 @@ class MatVariables:
         signals: the columns; equal times of two columns are one array.
         scalars: single numbers.
         repeated: names that several columns have, with the names that tell them apart.
-        names: of the variables.
+        names: names of the variables.
         info: EDP's facts, a text; None where the file has none.
-        experiments: in one ``iddata``; those of more than one are read one by one.
+        experiments: experiments of one ``iddata``; if there are several, each is read separately.
         experiment_names: names of those that stand beside each other in one variable (``train{1}``).
     """
 

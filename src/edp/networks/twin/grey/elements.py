@@ -20,7 +20,7 @@ class PumpElement:
     """A pump with its line: flow by the levers, power limit, open centre, main relief.
 
     Attributes:
-        name: that valves call it by.
+        name: name used by valves.
         pressure: channel of its line; empty: not measured.
     """
 
@@ -33,7 +33,7 @@ class CylinderElement:
     """A cylinder with its load.
 
     Attributes:
-        name: that valves call it by.
+        name: name used by valves.
         velocity: channel, extension positive.
         stroke: channel of its position; empty: the one of the velocity, where strokes are measured.
         head: channel of the head chamber's pressure; empty: not measured.
@@ -90,12 +90,12 @@ class MotorElement:
     A gear belongs to it: velocity, displacement and load are those of the shaft whose velocity is measured.
 
     Attributes:
-        name: that valves call it by.
+        name: name used by valves.
         velocity: channel of its angular velocity, positive where oil goes from `a` to `b`.
         angle: channel of its angle; empty: the one of the velocity, where positions are measured.
         a: channel of the pressure at the port that extension feeds; empty: not measured.
         b: channel of the pressure at the other port; empty: not measured.
-        displacement: of one motor, m^3/rad; 0: not known, learned from a plausible one.
+        displacement: displacement of one motor, m^3/rad; 0 if unknown, to be fitted from its prior.
         count: motors side by side on one shaft.
         load_by_angle: whether inertia and potential depend on its angle, which must be measured then and stays where it
             was in the training data; otherwise it turns without end, and no load depends on it.
@@ -140,7 +140,7 @@ class ValveElement:
     """A spool that connects a pump with a cylinder or a motor.
 
     Attributes:
-        name: for readers.
+        name: name for messages and tables.
         actuator: name of the cylinder or motor.
         extend: channel that commands extension (of a motor: positive turning), or both ways by its sign where `retract`
             is empty.
