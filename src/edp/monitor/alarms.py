@@ -17,15 +17,15 @@ class MonitorAlarm:
     """One alarm of a monitor.
 
     Attributes:
-        recording: that it was raised in; empty in a stream.
+        recording: recording of the alarm; empty for a stream.
         raised_s: end of the block at which the statistic passed its limit, s from the start.
         since_s: estimate of the onset: end of the last block at which the statistic was at a healthy level.
         detector: name of the detector that raised it.
         statistic: over the scale of its watch.
-        limit: that it passed.
+        limit: exceeded limit.
         evidence: names of summaries with their mean conditioned deviation since `since_s`, in healthy standard
             deviations, the largest first.
-        causes: of a diagnosis, the most probable first; empty without one.
+        causes: possible causes, the most probable first; empty without a diagnosis.
         sentence: all of this for a reader.
         severity: grade of the alarm.
     """
@@ -71,7 +71,7 @@ def episodes(alarms: Iterable[AnyAlarm]) -> list[list[AnyAlarm]]:
     residual deviates most.
 
     Args:
-        alarms: in any order.
+        alarms: alarms in any order.
 
     Returns:
         Lists in order of time, by their first alarms.

@@ -30,9 +30,9 @@ class AlarmLimit:
     """Alarm limit and its false alarms.
 
     Attributes:
-        limit: that a statistic has to pass.
-        alarms: on the healthy sessions; new ones of this kind have up to one more.
-        hours: of them.
+        limit: limit of a statistic.
+        alarms: number of alarms on the healthy sessions. The expected number on new sessions is at most one higher.
+        hours: total length of the healthy sessions, h.
         promised_hours: operating hours to one false alarm that were asked for.
         low_hours: shortest and `high_hours` longest mean time between false alarms that go with the count, exact for
             independent alarms (Garwood 1936), at `CONFIDENCE`; `high_hours` is infinite where there was none.

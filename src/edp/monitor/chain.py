@@ -38,11 +38,11 @@ class ChainState:
 
     Attributes:
         summary: sums of the block that has begun.
-        blocks: that have ended since the start.
-        drift: what was learned of slow changes, shape (summaries,).
+        blocks: number of complete blocks since the start.
+        drift: estimated slow changes, shape (summaries,).
         bank: detectors at work; None before the first block. They change in place: copy the state to branch off.
         since: blocks that had ended when the statistic was last at a healthy level.
-        sums: of the conditioned rows since then, shape (summaries,); `counts` of them that were there.
+        sums: sums of the conditioned rows since then, shape (summaries,); `counts` are the numbers of valid rows.
         counts: see `sums`.
     """
 
@@ -61,7 +61,7 @@ class BlockVerdict:
 
     Attributes:
         block: its number from the start.
-        statistics: of each watch over its scale.
+        statistics: statistic of each watch divided by its scale.
         row: conditioned summaries, NaN where missing.
         alarm: place of the watch that passed the limit, None without an alarm.
         since: block after which the deviation began.
@@ -81,12 +81,12 @@ class MonitorChain:
     """The fitted chain.
 
     Attributes:
-        summaries: of blocks.
-        conditioning: on the operating point.
+        summaries: summaries of blocks.
+        conditioning: conditioning on the operating point.
         drift: slow changes that are followed.
         watches: views and their detectors.
-        limit: for the largest statistic over its scale.
-        quiet: below which the largest statistic is at a healthy level.
+        limit: alarm limit of the largest scaled statistic.
+        quiet: level below which the largest scaled statistic is healthy.
         settle: blocks after a start that are not watched.
     """
 

@@ -29,8 +29,8 @@ class Conditioning:
     """z = (s - W p) / max(V p, floor), where p is the operating point, scaled and limited.
 
     Attributes:
-        offset: of the operating point without its 1, shape (points - 1,).
-        width: the same, above zero.
+        offset: offset of the operating point without its constant, shape (points - 1,).
+        width: scale of the operating point, positive, same shape.
         usual: W, shape (summaries, points).
         spread: V, shape (summaries, points).
         floor: least width of each summary, above zero, shape (summaries,).

@@ -92,7 +92,7 @@ class FoundSize:
         share: fraction of the trials in which `size` (or `largest`) was found.
         trials: number of trials per size.
         minutes: length of all healthy logs of the fit.
-        change: what was injected; earlier versions have shifts alone.
+        change: type of the injected change; earlier versions inject shifts only.
     """
 
     channel: str
@@ -170,7 +170,7 @@ def measure_found_sizes(
     time of the fit, and `MIN_EFFORT_S`.
 
     Args:
-        monitor: as fitted.
+        monitor: fitted monitor.
         segments: healthy recordings that did not set the limits.
         minutes: length of all healthy logs of the fit.
         fit_s: processor time of the fit before.
@@ -365,7 +365,7 @@ def outside_line(monitor: Monitor, rows: Any) -> str:
     """Return the name of a residual outside its healthy range; an empty text if all are inside.
 
     Args:
-        monitor: that watched.
+        monitor: monitor of the recording.
         rows: conditioned summaries, shape (blocks, summaries).
     """
     reach = monitor.provenance.get("healthy_range", {})

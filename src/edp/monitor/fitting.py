@@ -58,8 +58,8 @@ class ChainSpec:
         watches: views with their detectors.
         folds: parts into which sessions are dealt, at most as many as there are; what judges a session was fitted
             without its part. Of few parts each lacks much of what the monitor itself is fitted to: limits are too high.
-        drift_per_hour: of the level of a summary that is followed, in healthy standard deviations.
-        most_drift: of them together.
+        drift_per_hour: maximum drift per hour of a summary level that is followed, in healthy standard deviations.
+        most_drift: maximum total drift, in healthy standard deviations.
         tolerance: share by which numbers of machines of the series may lie off that of the logs. The sessions that set
             the limit are seen as those of such machines, a machine each, by the residuals that know what a machine is
             made of; 0 watches this one machine, and sees smaller faults of it.
@@ -101,8 +101,8 @@ class FittedChain:
     """Result of a fit.
 
     Attributes:
-        chain: on all sessions that were kept.
-        limit: from sessions that the judging parts were not fitted to.
+        chain: chain fitted to all remaining sessions.
+        limit: limit from sessions not used in the fits.
         doubtful: names of sessions that were left out.
         sessions: blocks of those that were not.
     """

@@ -50,9 +50,9 @@ def other_machine(
     """Return a message if the flow balances of all axes deviate at the start and over the whole log; otherwise empty.
 
     Args:
-        sources: of the monitor.
-        chain: of it.
-        scatter: of `scatter_of`.
+        sources: sources of the monitor.
+        chain: chain of the monitor.
+        scatter: result of `scatter_of`.
         rows: conditioned summaries of the log, NaN where missing, shape (blocks, summaries).
         block_s: length of a block, s.
     """

@@ -43,8 +43,8 @@ class MonitorState:
     """All that a monitor remembers of one machine.
 
     Attributes:
-        sources: of each source of residuals.
-        chain: of the chain.
+        sources: state of each source of residuals.
+        chain: state of the chain.
         ticks: since the start.
         missing: ticks since the end of the last block at which each input was missing, shape (inputs,).
     """
@@ -62,7 +62,8 @@ class Verdict:
     Attributes:
         alarm: raised at this tick.
         silent: channels that are missing, so that what judges or reads them says nothing.
-        statistics: of each watch at the last block's end, over its scale; compare with the monitor's limit.
+        statistics: statistic of each watch at the end of the last block divided by its scale; compare with the
+            monitor's limit.
         block_ended: whether this tick ended a block.
     """
 
@@ -77,8 +78,8 @@ class Watched:
     """Result of a monitor on a recording.
 
     Attributes:
-        alarms: in order.
-        statistics: of each watch over its scale, shape (blocks, watches).
+        alarms: alarms in order of time.
+        statistics: statistics of each watch divided by its scale, shape (blocks, watches).
         rows: conditioned summaries, NaN where missing, shape (blocks, summaries).
     """
 
@@ -94,15 +95,15 @@ class Monitor:
     Attributes:
         channels: raw channels, SI units, in the order of a row.
         rate_hz: ticks per second.
-        sources: of residuals.
-        chain: from residuals to statistics.
-        limit: what is known of its false alarms.
+        sources: sources of residuals.
+        chain: chain from residuals to statistics.
+        limit: alarm limit with its false-alarm rate.
         session_means: mean over healthy sessions of each channel's mean in a session, and its deviation between
             sessions, shape (2, inputs).
         diagnosis: dictionary of faults that names causes; None where alarms have none.
-        provenance: what it was fitted to.
-        scatter: of means over the start of healthy sessions, of each conditioned summary, shape (summaries,); None in
-            monitors of earlier versions.
+        provenance: origin of the training data.
+        scatter: standard deviation of the mean of each conditioned summary over the start of healthy sessions, shape
+            (summaries,); None in monitors of earlier versions.
     """
 
     channels: tuple[Channel, ...]
@@ -196,8 +197,8 @@ class Monitor:
         Causes are named from the rows up to `AFTER_S` behind an alarm, as far as the recording has them.
 
         Args:
-            recording: of this machine.
-            start: of the recording, as a time of day for the sentences.
+            recording: recording of this machine.
+            start: time of day at the start of the recording, for the sentences.
 
         Raises:
             DataError: another rate, or a log of another machine.

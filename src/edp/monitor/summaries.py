@@ -46,7 +46,7 @@ class BlockSummaries:
         scale: one over the healthy width of each residual, shape (residuals,): a controller multiplies faster than it
             divides.
         channel: place of the channel that each residual judges among the raw inputs, shape (residuals,).
-        centre: of each raw input, shape (inputs,).
+        centre: centre of each raw input, shape (inputs,).
         spread: one over the healthy deviation of each, above zero.
         change: D, healthy variance of d of the channel of each residual, shape (residuals,).
         moving: places of inputs whose mean size is part of the operating point.
@@ -227,10 +227,10 @@ class SummaryState:
     """Sums of a block that has begun.
 
     Attributes:
-        ticks: of it.
+        ticks: number of samples in the block so far.
         last: the inputs of the tick before, the last ones that were there, shape (inputs,).
         started: whether there was a tick before.
-        sums: by name.
+        sums: sums by name.
     """
 
     ticks: int

@@ -24,7 +24,7 @@ class RecordingTrace:
     """Trace of one recording under the monitor, one row per block.
 
     Attributes:
-        name: of the recording.
+        name: name of the recording.
         start: time of day of its first sample as ISO 8601 text; empty where it is not known.
         duration_s: its length.
         ratios: statistic over limit of each detector, shape (blocks, detectors); above 1 is an alarm.
@@ -48,7 +48,7 @@ class RunTraces:
         block_s: length of a block, s.
         detectors: names of the columns of `RecordingTrace.ratios`.
         groups: names of the columns of `RecordingTrace.groups`.
-        recordings: in the order in which they ran.
+        recordings: traces in the order of the run.
     """
 
     block_s: float

@@ -21,7 +21,7 @@ class WatchSpec:
     """Options of one view.
 
     Attributes:
-        detector: that sees it.
+        detector: detector of the view.
         memory_s: time over which rows are averaged where the covariance is taken that the view makes white; 0 takes
             single rows. A slow fault is a shift of averages, and averages of healthy sessions scatter more widely,
             in other directions, than independent rows would.
@@ -54,10 +54,10 @@ class Watch:
     """A fitted view.
 
     Attributes:
-        detector: that sees it.
-        mean: of healthy rows, shape (summaries,).
+        detector: detector of the view.
+        mean: mean of healthy rows, shape (summaries,).
         matrix: shape (summaries, directions), or (summaries,) of factors where it sees each summary by itself.
-        scale: of the detector's statistic: over it, statistics of all watches are compared with one limit.
+        scale: scale of the statistic. Scaled statistics of all watches are compared with one limit.
     """
 
     detector: DetectorSpec
@@ -225,7 +225,7 @@ def scaled_alike(specs: Sequence[WatchSpec], watches: Sequence[Watch], sessions:
 
     Args:
         specs: options of the watches; their reserve is a factor of the scale.
-        watches: with a scale of one.
+        watches: watches with scale one.
         sessions: white rows of healthy sessions as a bank of these watches takes them.
     """
     result, first = [], 0

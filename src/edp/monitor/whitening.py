@@ -20,7 +20,7 @@ class Whitening:
     """A linear map of residuals.
 
     Attributes:
-        mean: of healthy residuals, shape (channels,).
+        mean: mean of healthy residuals, shape (channels,).
         matrix: shape (channels, directions); directions without variance are left out.
     """
 

@@ -59,11 +59,11 @@ class DataSetSpec:
     Attributes:
         machine: name of a machine, or path of a machine file.
         minutes: length of all recordings together.
-        recordings: how many recordings, all of one length.
+        recordings: number of recordings of equal length.
         seed: root of every random choice.
-        family: how many random machines take turns in place of `machine`; 0 for none.
+        family: number of random machines that replace `machine`; 0 for none.
         masses: lightest and heaviest machine of the family, t.
-        scatter: how widely the machines of the family scatter about the laws of scaling: a factor, at most 2.5.
+        scatter: scatter of the machines of the family about the laws of scaling: a factor, at most 2.5.
         mix: share of the recordings by excitation.
         materials: share of the recordings of families that work the ground (grading, dig) by soil; ``air`` is none.
             The other families always move in free air.
@@ -72,7 +72,7 @@ class DataSetSpec:
         start_strokes: range of the strokes to start from, as shares of full.
         sensor_noise: False logs the truth.
         sensors: values that replace those of the machine's ``[sensors]``.
-        faults: of machine and sensors, in every recording; see `edp.sim.faults`.
+        faults: faults of machine and sensors in every recording; see `edp.sim.faults`.
 
     Raises:
         ConfigError: a value is out of range or a name is unknown.

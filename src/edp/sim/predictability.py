@@ -54,9 +54,9 @@ class LimitSpec:
 
     Attributes:
         horizons: samples ahead, rising.
-        moments: how many moments are branched, spread over the recordings.
+        moments: number of branching points, spread over the recordings.
         branches: futures from each; even.
-        recordings: at most so many of the recordings are used.
+        recordings: maximum number of recordings to use.
         seed: root of the choice of moments and of all branches.
 
     Raises:
@@ -209,11 +209,11 @@ def find_limit(
     """Return the predictability limit of a data set in mm/s, equal for any number of workers.
 
     Args:
-        scenarios: of the recordings.
+        scenarios: scenarios of the recordings.
         spec: moments, branches and horizons.
         workers: who simulates the branches.
         progress: receiver of the progress; its units are recordings.
-        folder: of the errors of each recording, so that a stopped call continues; None keeps none.
+        folder: folder for the errors of each recording, from which a stopped call continues; None to store nothing.
 
     Raises:
         ConfigError: the recordings are too short.

@@ -40,8 +40,8 @@ class Scenario:
         material: soil that the bucket works in, see `soil.material_names`; empty for free air.
         start_strokes: range of the strokes to start from, as shares of full.
         sensors: values that replace those of the machine's ``[sensors]``, by key: to switch faults on or off.
-        seed: the same seed gives the same bits on the same machine.
-        faults: of machine and sensors; each may be given as a text or as a table, see `edp.sim.faults`.
+        seed: random seed. Equal seeds give equal bits on the same machine.
+        faults: faults of machine and sensors, each as a text or as a table; see `edp.sim.faults`.
         name: name of the recording; empty builds one from machine, excitation and seed.
 
     Raises:

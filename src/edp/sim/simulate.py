@@ -29,7 +29,7 @@ class Simulation:
     """Running simulation of a scenario: run it for some time, take snapshots, restore them, or branch off.
 
     Args:
-        scenario: what to simulate.
+        scenario: scenario to simulate.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -166,7 +166,7 @@ def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None
     """Simulate one scenario.
 
     Args:
-        scenario: what to simulate.
+        scenario: scenario to simulate.
         progress: called with the share done, 0 to 1, now and then.
 
     Returns:

@@ -91,7 +91,7 @@ def alarms(detector: Detector, sessions: Array, limit: float | Array) -> list[Al
     Args:
         detector: is reset first.
         sessions: residuals.
-        limit: that a statistic has to pass; one, or one a lane.
+        limit: limit of the statistic, common or one per stream.
     """
     detector.reset()
     raised = []

@@ -31,7 +31,7 @@ class EwmaSpec(DetectorSpec):
     """T2 of exponentially weighted means.
 
     Attributes:
-        weight: of the newest row; 1 is Hotelling's T2 of single rows.
+        weight: weight of the newest row; 1 gives Hotelling's T2 of single rows.
 
     Raises:
         ConfigError: a value is out of its bounds.

@@ -22,11 +22,11 @@ class FaultClass:
 
     Attributes:
         kind: name of the kind.
-        site: where it sits; empty where a machine has one such part only.
+        site: site of the fault; empty if a machine has only one such component.
         component: the part that a mechanic would look at.
         at_fault: whether the machine or a sensor is at fault.
-        unit: of the sizes; empty for faults that are there or not.
-        sizes: for which there are signatures, in `unit`, the smallest first; of one sign. Empty without sizes.
+        unit: unit of the sizes; empty for faults without a size.
+        sizes: sizes with signatures in `unit`, ascending and of one sign; empty for faults without a size.
         neutral: the size that is no fault.
         grave: whether a load may fall or a movement may not stop.
         words: a sentence with ``{size}``, ``{high}`` and ``{large}`` where it has a size.
@@ -59,14 +59,14 @@ class Cause:
 
     Attributes:
         kind: name of the kind of fault, or `NONE_OF_THESE`.
-        site: where it sits.
+        site: site of the fault.
         component: the part that a mechanic would look at; empty for `NONE_OF_THESE`.
         at_fault: whether the machine or a sensor is at fault.
         size: estimated from the evidence, in `unit`; None for faults that are there or not.
-        unit: of the size.
+        unit: unit of the size.
         probability: 0 to 1, of this cause among all.
         words: a sentence without the probability.
-        grade: how large it is on the ladder of its kind, 0 (hardly visible) to 1 (gross); None without sizes.
+        grade: position of the size on the ladder of its kind, 0 (hardly visible) to 1 (gross); None without sizes.
         grave: whether a load may fall or a movement may not stop.
     """
 

@@ -26,10 +26,10 @@ def diagnosed(alarm: MonitorAlarm, dictionary: Dictionary, rows: Array, start: d
     """Return the alarm with causes, sentence and severity.
 
     Args:
-        alarm: as the chain raised it.
-        dictionary: of the monitor.
+        alarm: alarm of the chain.
+        dictionary: dictionary of the monitor.
         rows: conditioned rows since the onset, shape (blocks, summaries).
-        start: of the recording, as a time of day.
+        start: time of day at the start of the recording.
     """
     matched = match(dictionary, rows[-MOST_ROWS:], fresh=len(rows) <= MOST_ROWS)
     causes = causes_of(dictionary, matched)

@@ -34,11 +34,11 @@ class SimulatedFault:
     """Effect of a fault in one session.
 
     Attributes:
-        draw: of the session.
+        draw: index of the session.
         owner: place of the fault in the classes.
-        size: of the fault.
+        size: size of the fault.
         change: mean features at the onset and after it, less those of the sound twin, shape (2, features).
-        sensors: what further channels show, less what they show of the sound twin, by name; standardised.
+        sensors: readings of additional channels minus those of the same session without a fault, by name; standardised.
     """
 
     draw: int
@@ -83,7 +83,7 @@ def fit_dictionary(
         faults: their sessions, of one draw or more.
         healthy: conditioned rows of healthy sessions, shape (blocks, summaries) each.
         provenance: machine, seed, sessions.
-        seed: of the stretches that are drawn.
+        seed: seed for drawing the segments.
 
     Raises:
         DataError: too few healthy sessions, or a fault without a session.

@@ -39,7 +39,7 @@ class Match:
     """Fit of each fault to the evidence.
 
     Attributes:
-        probabilities: of each fault, shape (faults,); with `none` they sum to 1.
+        probabilities: probability of each fault, shape (faults,). Together with `none` they sum to 1.
         sizes: the most likely size of each fault, NaN for faults without, shape (faults,).
         none: probability that no fault of the dictionary explains the evidence.
         misfit: mean squared misfit of a direction under the best fault, in its own variance.
@@ -59,7 +59,7 @@ def match(dictionary: Dictionary, rows: Array, fresh: bool = True) -> Match:
     blocks, and a share of the squared signature: the same fault looks otherwise from session to session.
 
     Args:
-        dictionary: of the monitor.
+        dictionary: dictionary of the monitor.
         rows: conditioned rows since the onset, NaN where missing, shape (blocks, summaries).
         fresh: whether they begin at an onset, not at an earlier alarm of a fault that has stayed.
     """
@@ -91,8 +91,8 @@ class Candidates:
 
     Attributes:
         owner: number of the fault, ascending, shape (candidates,).
-        sizes: in the unit of the fault, NaN for faults without, shape (candidates,).
-        signatures: at the onset and after it, shape (2, candidates, features).
+        sizes: sizes in the unit of the fault, shape (candidates,); NaN for faults without a size.
+        signatures: signatures at the onset and after it, shape (2, candidates, features).
         firsts: first candidate of each fault, shape (faults,).
     """
 

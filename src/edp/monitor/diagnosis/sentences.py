@@ -52,7 +52,7 @@ def alarm_sentence(causes: Sequence[Cause], since_s: float, start: datetime | No
     Args:
         causes: the most likely one first; may be empty where there is no dictionary.
         since_s: estimated onset, s from the start of the recording.
-        start: of the recording, as a time of day.
+        start: time of day at the start of the recording.
     """
     since = f"since {clock(since_s, start)}"
     if not causes:

@@ -31,13 +31,13 @@ class Dictionary:
     Attributes:
         summaries: names of the monitor's summaries, in order.
         classes: the faults.
-        scatter: of healthy sessions.
+        scatter: scatter of healthy sessions.
         signatures: mean change of the directions by a fault of a size, at its onset and after it, shape
             (2, signatures, features).
         owner: number of the fault of each signature in `classes`, shape (signatures,).
-        sizes: of each signature in the unit of its class, shape (signatures,).
+        sizes: size of each signature in the unit of its class, shape (signatures,).
         changing: share of a signature by which it differs from session to session, as a variance over its square.
-        temperature: by which log-likelihoods are divided so that probabilities hold on left-out sessions.
+        temperature: divisor of log-likelihoods that calibrates the probabilities on left-out sessions.
         strange: mean squared misfit of a direction, in its own variance, above which no fault explains an alarm.
         confusions: faults that cannot be told apart.
         provenance: machine, seed, sessions, time.
@@ -69,7 +69,7 @@ def signatures_of(
     Args:
         classes: the faults.
         owner: number of the fault of each session.
-        sizes: of each session.
+        sizes: size of the fault in each session.
         changes: directions of each session less those of its sound twin, at the onset and after it, shape
             (sessions, 2, features).
 
@@ -122,7 +122,7 @@ def load_dictionary(folder: Path, summaries: Sequence[str]) -> Dictionary | None
     """Read the dictionary of a monitor; None if there is none.
 
     Args:
-        folder: of the monitor.
+        folder: folder of the monitor.
         summaries: names of its summaries, which must be those of the dictionary.
 
     Raises:

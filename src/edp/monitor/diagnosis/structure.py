@@ -28,7 +28,7 @@ class Confusion:
         first: kind and site of one, and `second` of the other.
         error: share of wrong answers between the two on sessions that nothing was fitted to.
         sensor: channel that would separate them best; empty where none does.
-        sensor_error: the same share with it; None without one.
+        sensor_error: fraction confused with the additional sensor; None without one.
 
     Raises:
         ConfigError: a share outside of 0 to 1, or a name that is too long.
@@ -51,10 +51,10 @@ def confusions(
     """Return pairs of indistinguishable faults, the worst first.
 
     Args:
-        names: of the faults.
-        probabilities: of each fault for sessions that nothing was fitted to, shape (sessions, faults).
-        truth: which fault each session has, shape (sessions,).
-        sensors: what a further channel shows of each session, by its name, shape (sessions, values); standardised.
+        names: names of the faults.
+        probabilities: probability of each fault for sessions not used in the fit, shape (sessions, faults).
+        truth: index of the true fault of each session, shape (sessions,).
+        sensors: standardised values of an additional channel in each session, by its name, shape (sessions, values).
     """
     logits = np.log(np.maximum(probabilities, 1e-12))
     rows = {fault: np.flatnonzero(truth == fault) for fault in range(len(names))}

@@ -54,8 +54,8 @@ class Balances(ResidualSource):
     Args:
         inputs: raw channels, SI units.
         pairs: places of level and rate among the inputs, one a residual, shape (residuals, 2).
-        gains: of each rate.
-        memories_s: of each residual.
+        gains: gain of each rate.
+        memories_s: memory of each residual, s.
         rate_hz: ticks per second.
         middle: mean of each input on healthy sessions.
         units: SI unit of each residual.
@@ -142,8 +142,8 @@ class BalancesSpec(ResidualSpec):
 
     Attributes:
         memory_s: times after which the residual of a position has faded.
-        rate_memory_s: the same of a velocity against its acceleration.
-        slow_memory_s: the same of a temperature against itself.
+        rate_memory_s: memory of a velocity compared with its acceleration, s.
+        slow_memory_s: memory of a temperature compared with itself, s.
         match: correlation of changes, above which a rate belongs to a level.
 
     Raises:

@@ -32,7 +32,7 @@ class FitMaterial:
     Attributes:
         train: healthy sessions, all with `channels` at `rate_hz`.
         validation: further ones, for the choice among fits.
-        channels: that are watched, in the order of the monitor's inputs.
+        channels: monitored channels, in the order of the monitor's inputs.
         rate_hz: ticks per second.
         predictors: look-ahead networks of this machine.
         twins: plant models of this machine.
@@ -81,7 +81,7 @@ class SourceState:
     Attributes:
         last: the last value of each input that was there, shape (streams, inputs).
         ever: whether there was one, shape (streams, inputs).
-        own: what the source itself carries.
+        own: state of the source itself.
     """
 
     last: Rows
@@ -102,7 +102,7 @@ class ResidualSource(ABC):
         reads: all inputs that each residual depends on, those that are judged among them.
         units: SI unit of each residual.
         inputs: raw channels, SI units.
-        middle: what stands in for an input that was never there, shape (inputs,).
+        middle: substitute for an input that has not been received yet, shape (inputs,).
         delay: ticks after which an offset of a judged channel shows at the latest.
     """
 

@@ -103,8 +103,8 @@ class CyclesSpec(ResidualSpec):
     """Each channel at its place in a cycle that the machine repeats.
 
     Attributes:
-        period_s: of a cycle, s, a whole number of ticks; logs begin with one, and hold one after the other. 0: each log
-            is one cycle, as long as the shortest one; what comes behind that is not judged.
+        period_s: length of a cycle, s, a whole number of samples. Logs begin with a cycle and consist of consecutive
+            cycles. 0: each log is one cycle of the length of the shortest log; later samples are not evaluated.
 
     Raises:
         ConfigError: a value is out of its bounds.

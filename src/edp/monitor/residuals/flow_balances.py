@@ -56,9 +56,9 @@ class ChamberCurves:
     """Numbers of a chamber's balance.
 
     Attributes:
-        spots: of its channels.
-        values: of its curves at the knots, shape (paths, knots).
-        slopes: of its curves from each knot on, shape (paths, knots).
+        spots: indices of its channels.
+        values: values of its curves at the knots, shape (paths, knots).
+        slopes: slopes of its curves after each knot, shape (paths, knots).
         lines: factors of the terms without a spool, shape (LINES,).
         doubts: factors of what makes it uncertain, none negative and the first one positive, shape (DOUBTS,).
     """
@@ -84,7 +84,7 @@ class OilRange:
     """Temperatures of the oil at which balances are known to hold: leaks and dead times go with its viscosity.
 
     Attributes:
-        column: of the thermometer among the inputs.
+        column: index of the thermometer among the inputs.
         low: lowest temperature, in the unit of the channel.
         high: highest one.
     """
@@ -110,7 +110,7 @@ class FlowBalances(ResidualSource):
     Args:
         inputs: raw channels, SI units.
         middle: mean of each on healthy sessions.
-        spools: by their commands.
+        spools: spool models by command.
         chambers: the balances.
         rate_hz: ticks per second.
         oil: temperatures at which they hold; None without a thermometer.
@@ -291,7 +291,7 @@ class FlowBalancesSpec(ResidualSpec):
 
     Attributes:
         rows: ticks that curves are fitted to, at most.
-        trials: of dead times, frequencies and play of an axis' spools.
+        trials: numbers of trials for dead times, frequencies and play of the spools of an axis.
         least: share of the mean size of the velocity that a balance must tell on sessions that did not train it; of
             less it judges nothing.
 

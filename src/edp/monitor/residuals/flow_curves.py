@@ -43,7 +43,7 @@ class SpoolModel:
 
     Attributes:
         extend: place of the command that extends, among the inputs, shape (spools,).
-        retract: of the one that retracts; -1 where one signed channel commands both.
+        retract: index of the command that retracts; -1 if one signed channel commands both directions.
         gain: one over the full command, shape (spools,).
         dead: dead time in ticks, shape (spools,).
         stages: b1, b2, a1, a2 of each stage, shape (spools, 2, 4).
@@ -167,12 +167,12 @@ class ChamberPlaces:
     """Indices of the channels of a chamber's balance among the inputs.
 
     Attributes:
-        velocity: of its cylinder.
+        velocity: index of the velocity of its cylinder.
         own: its pressure.
-        other: that of the chamber on the other side.
+        other: index of the pressure of the opposite chamber.
         stroke: -1 where there is none.
         supplies: pressures of the pumps.
-        spools: of `SpoolModel`, the first one and, where there is one, that of the second pump.
+        spools: indices of `SpoolModel`: the first spool and, if present, that of the second pump.
         sign: 1 for a chamber that grows with the velocity, -1 for the other.
         end: stroke at which its outflow is cushioned, m.
         far: stroke at the other end, m.
@@ -201,11 +201,11 @@ class ChamberPlaces:
 def paths_of(spots: ChamberPlaces, rows: Singles, spools: Singles) -> list[tuple[Singles, Singles]]:
     """Return the travel that opens each path and the root of its driving pressure.
 
-    Paths: in from the pumps, in from the other chamber, out to the tank, out to the other chamber, and the parts
+    Paths: from the pumps, from the opposite chamber, to the tank, to the opposite chamber, and the parts
     blocked by a cushion.
 
     Args:
-        spots: of the chamber.
+        spots: indices of the channels of the chamber.
         rows: inputs, shape (..., inputs).
         spools: shape (..., spools).
     """
@@ -248,9 +248,9 @@ def doubts_of(spots: ChamberPlaces, rows: Singles, rates: Singles, through: Sing
     spools.
 
     Args:
-        spots: of the chamber.
+        spots: indices of the channels of the chamber.
         rows: inputs, shape (..., inputs).
-        rates: of all inputs, per second, shape (..., inputs).
+        rates: rates of all inputs, per second, shape (..., inputs).
         through: sizes of the flows of all paths, summed, shape (...).
     """
     own, rate = rows[..., spots.own] * MEGA, np.abs(rates[..., spots.own] * MEGA)
@@ -267,9 +267,9 @@ def lines_of(spots: ChamberPlaces, rows: Singles, rates: Singles) -> list[Single
     Relief valves.
 
     Args:
-        spots: of the chamber.
+        spots: indices of the channels of the chamber.
         rows: inputs, shape (..., inputs).
-        rates: of all inputs, per second, shape (..., inputs).
+        rates: rates of all inputs, per second, shape (..., inputs).
     """
     own, other, rate = rows[..., spots.own] * MEGA, rows[..., spots.other] * MEGA, rates[..., spots.own] * MEGA
     soft = np.float32(1.0) / (np.maximum(own, np.float32(0.0)) + CAVITY)
@@ -308,8 +308,8 @@ def opened(travel: Singles, values: Singles, slopes: Singles) -> Singles:
 
     Args:
         travel: any shape.
-        values: at the knots, shape (knots,).
-        slopes: from each knot on, the last one zero, shape (knots,).
+        values: values at the knots, shape (knots,).
+        slopes: slopes after each knot, shape (knots,); the last one is zero.
     """
     inside = np.maximum(travel, KNOTS[0])
     at = np.searchsorted(KNOTS, inside, side="right") - 1

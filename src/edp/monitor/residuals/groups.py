@@ -20,7 +20,7 @@ class Group:
     """Channels that are monitored together.
 
     Attributes:
-        name: for messages.
+        name: name for messages.
         judged: the channels.
         unread: channels that would tell what is judged and must not be read, those that are judged left out.
     """

@@ -40,7 +40,7 @@ class LookAhead(ResidualSource):
     reads: it shows onsets and noise, not lasting offsets.
 
     Args:
-        bundles: by a number from 0 on, as text.
+        bundles: bundles by a number from 0, as text.
         inputs: raw channels, SI units.
         middle: mean of each on healthy sessions.
     """
@@ -130,7 +130,7 @@ class LookAheadSpec(CommitteeOptions, ResidualSpec):
     """Errors of the look-ahead networks that the monitor is given; without any, of one that is trained for it.
 
     Attributes:
-        horizons_s: of the network that is trained, s; at least a tick.
+        horizons_s: horizons of the trained network, s; at least one sample.
 
     Raises:
         ConfigError: a value is out of its bounds.

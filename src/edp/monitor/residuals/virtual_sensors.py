@@ -57,7 +57,7 @@ class VirtualSensors(ResidualSource):
     """Fitted networks, one a group.
 
     Args:
-        bundles: by the name of the group.
+        bundles: bundles by group name.
         inputs: raw channels, SI units, in the order in which they are fed.
         middle: mean of each on healthy sessions.
         every: ticks from one run of a network to the next; network n runs first at tick n modulo `every`.

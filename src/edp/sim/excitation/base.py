@@ -113,12 +113,12 @@ class AxisStream:
         rng: source of randomness.
         rate_hz: samples per second.
         pause: chance that a hold is a pause.
-        axis: of a cylinder, for its own pace and strength; None for neither.
+        axis: index of the cylinder, whose speed and range are used; None for no cylinder.
 
     Attributes:
-        axis: as given; a stream may turn to another cylinder.
+        axis: index of the cylinder; a stream may change it.
         level: lever position now.
-        hold: how long it stays.
+        hold: remaining duration of the move.
     """
 
     LEVELS = (0.15, 1.0)

@@ -114,7 +114,7 @@ def scaled_machine(
         base: the parameter set to scale.
         mass_t: operating weight of the new machine, t.
         draws: the scatter.
-        name: of the new machine; built from base and mass when empty.
+        name: name of the new machine; empty to derive it from base and mass.
         base_mass_t: operating weight of `base`, t.
 
     Raises:

@@ -110,7 +110,7 @@ class Pumps:
         load_margin: Pa by which each pump stays above its highest load; 0 for positive control.
         engine_droop: share of the governed speed by which the engine falls from no load to its full power.
         engine_power: its full power, W.
-        engine_inertia: of engine, flywheel and pumps, kg m^2.
+        engine_inertia: inertia of engine, flywheel and pumps, kg m^2.
         engine_speed_rpm: governed speed without load, 1/min; `max_flow` belongs to it.
     """
 
@@ -183,11 +183,11 @@ class Bucket:
     Attributes:
         width: cutting width.
         capacity: struck volume, m^3.
-        floor_angle_deg: from the line tip-pin to the floor plate, towards the shell.
-        floor_length: from the cutting edge to the heel.
+        floor_angle_deg: angle from the line tip-pin to the floor plate, towards the shell.
+        floor_length: distance from the cutting edge to the heel.
         edge_area: frontal area of lip and teeth, m^2.
         load_x: centre of a full load along the line pin-tip.
-        load_y: the same across it, towards the shell.
+        load_y: the coordinate across it, towards the shell.
     """
 
     width: float
@@ -204,9 +204,9 @@ class Chassis:
     """Compliance of the undercarriage; SI units.
 
     Attributes:
-        boom_foot_height: above level ground.
+        boom_foot_height: height of the boom foot above level ground.
         pitch_inertia: about the tipping line, kg m^2.
-        pitch_frequency: of rocking on the tracks, Hz.
+        pitch_frequency: frequency of rocking on the tracks, Hz.
         pitch_damping: share of critical.
         lift_moment: pitching moment at which the front of the tracks leaves the ground, N m.
     """
@@ -228,22 +228,22 @@ class Motor:
         pump: 1 or 2, that feeds it; of `travel` the left track's, the right one has the other.
         displacement: volume swept for 1 rad (of a track: 1 m) of motion, m^3.
         inertia: kg m^2 (kg) that it moves; of `swing` without the front, whose own follows from its pose.
-        volume: of each port with its line, m^3.
+        volume: volume of each port with its line, m^3.
         leakage: between the ports, m^3/s/Pa.
-        drain_leakage: from each port to tank, m^3/s/Pa.
+        drain_leakage: leakage from each port to tank, m^3/s/Pa.
         coulomb: dry friction and rolling resistance, N m (N).
         viscous: N m s (N s/m).
-        brake: of the parking brake, N m (N).
+        brake: torque (force) of the parking brake, N m (N).
         brake_delay: s after which it falls in, once its spool has closed.
         relief: pressure at which the valve of each port opens, Pa.
         relief_slope: flow through it for each Pa above, m^3/s/Pa.
         pilot_frequency: Hz, as in `Valves`.
         spool_frequency: Hz.
-        dead_time: of its command, s.
+        dead_time: dead time of its command, s.
         dead_band: share of full spool travel, both ways.
         pump_demand: share of full displacement that its full pilot asks for.
-        meter_in: from the pump, at full opening.
-        meter_out: to the tank.
+        meter_in: area from the pump, at full opening.
+        meter_out: area to the tank, at full opening.
     """
 
     pump: int
@@ -272,7 +272,7 @@ class SwingMotor(Motor):
     """The motor that swings the upper structure.
 
     Attributes:
-        boom_foot_ahead: of the axis of the swing, m.
+        boom_foot_ahead: distance of the boom foot ahead of the swing axis, m.
     """
 
     boom_foot_ahead: float
@@ -285,7 +285,7 @@ class Sensors:
     Attributes:
         velocity: white noise of each cylinder velocity, rms.
         pressure: white noise of each cylinder pressure, rms.
-        acceleration_bandwidth: of the differentiated velocity, Hz.
+        acceleration_bandwidth: bandwidth of the differentiated velocity, Hz.
         joint_rate_deg: white error of each joint rate, deg/s rms; times the lever arm in the velocity.
         joint_bias_walk_deg: random walk of its bias, deg/s per root of a minute.
         angle_quantum_deg: quantum of the joint angles, from which the lever arms follow.
@@ -299,8 +299,8 @@ class Sensors:
         can_latency: shortest and longest latency, s.
         can_jitter: rms of the latency, s.
         can_loss: share of frames lost.
-        instance_seed: with the machine's name, the seed of the instance: offsets, clock phases, latencies.
-        pressure_at: where the transmitters sit, at the "cylinder" or, where lines are modelled, at the "valve".
+        instance_seed: seed of the instance, together with the machine's name: offsets, clock phases, latencies.
+        pressure_at: location of the pressure transmitters: "cylinder" or, if lines are modelled, "valve".
     """
 
     velocity: float

@@ -23,7 +23,7 @@ def lugre(v: float, z: float, axes: Array, i: int, viscous: float) -> tuple[floa
         v: cylinder velocity, m/s.
         z: bristle deflection, m.
         axes: parameters of all cylinders.
-        i: which cylinder.
+        i: index of the cylinder.
         viscous: viscous friction at the oil's temperature, N s/m.
 
     Returns:

@@ -257,7 +257,7 @@ def step(
 
     Args:
         moving: state of the plant and its valves; moved.
-        demand: of each spool, shape (6,).
+        demand: demand of each spool, shape (6,).
         clock: step length (s), displacement share and filters of half a step.
         setup: axes, plant, work, and the arrays of the ground.
         near_soil: whether the bucket may touch the ground within this step.

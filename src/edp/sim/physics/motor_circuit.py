@@ -61,8 +61,8 @@ class MotorCircuit:
     """Swing and travel of one plant: parameters, state and past commands.
 
     Args:
-        machine: with `swing` and `travel`.
-        rate_hz: of commands.
+        machine: machine with `swing` and `travel`.
+        rate_hz: rate of commands.
         half_steps_s: half of a coarse and of a fine step.
     """
 

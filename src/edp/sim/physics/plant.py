@@ -140,7 +140,7 @@ class Plant:
         strokes: initial strokes as a share of each cylinder's stroke, shape (3,).
         rate_hz: logging and command rate.
         step_s: integration step; a whole number of them must fill a sample.
-        ground: what the bucket digs in; None in free air.
+        ground: ground that the bucket digs in; None in free air.
         spare_s: dead time that may be added while it runs, s.
         moves: whether swing and travel move, too; without them both stand still and take no oil.
 
@@ -265,8 +265,9 @@ class Plant:
 
         Args:
             strokes: m, shape (3,); held within the stroke.
-            velocities: of the cylinders, m/s, shape (3,).
-            pressures: of heads, rods and pump lines, Pa, shape (8,); NaN leaves one as it is.
+            velocities: velocities of the cylinders, m/s, shape (3,).
+            pressures: pressures of head chambers, rod chambers and pump lines, Pa, shape (8,); NaN leaves a pressure
+                unchanged.
         """
         for i in range(at.AXES):
             within = min(max(float(strokes[i]), 0.0), float(self.axes[i, at.STROKE]))

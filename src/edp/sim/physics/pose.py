@@ -128,8 +128,8 @@ class Kinematics:
     """From strokes to tip poses and back, for one machine.
 
     Args:
-        axes: of `parameters.pack`.
-        plant: the same.
+        axes: axes of `parameters.pack`.
+        plant: plant parameters of `parameters.pack`.
     """
 
     def __init__(self, axes: Array, plant: Array) -> None:

@@ -57,7 +57,7 @@ class Material:
     """One soil; SI units, angles in degrees. `cone_index` is a range from which each ground draws.
 
     Attributes:
-        density: in the bank, kg/m^3.
+        density: density in the bank, kg/m^3.
         bekker_exponent: n of p = (k_c / b + k_phi) z^n.
         shear_length: Janosi's K.
         swell: loose over bank volume.
@@ -67,7 +67,7 @@ class Material:
         compaction: share of the heel's lasting sinkage, up to 0.1 m of it, that stays as a rut once the heel has left.
         back_push: share of the soil in the way of the bucket's back that it pushes ahead; the rest flows around it and
             lies behind. 0: the back meets resistance and moves no soil.
-        back_friction_deg: of the soil on the back while it pushes, at most that of the soil.
+        back_friction_deg: friction angle of the soil on the back while it pushes, at most that of the soil.
 
     Raises:
         ConfigError: a value is out of its bounds, or friction of a back that pushes nothing or more than the soil has.
@@ -153,8 +153,8 @@ class Ground:
     surface lies lower where the heel has pressed it.
 
     Args:
-        material: what it is made of.
-        machine: whose bucket digs; gives the boom foot's height and the reach.
+        material: soil.
+        machine: machine whose bucket digs; defines height of the boom foot and reach.
         rng: draws unevenness, strength, stones and the course of the resistance, all of it at once.
     """
 

@@ -35,8 +35,8 @@ class Frames:
     no later sample than the one that shows it.
 
     Attributes:
-        positions: when the values of each frame were taken, in samples of the log, shape ``(frame,)``.
-        arrivals: when it arrived, in samples; infinite for a lost frame.
+        positions: sampling time of the values in each frame, in samples of the log, shape ``(frame,)``.
+        arrivals: arrival time of each frame, in samples; infinite for a lost frame.
         seen: the newest frame that had arrived at each sample, shape ``(sample,)``.
     """
 

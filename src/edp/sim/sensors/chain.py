@@ -167,7 +167,7 @@ def sense(
         kelvin: oil temperature.
         tick: counted from 0.
         drawn: the tick's row of `draws.draw`.
-        setup: of `draws.pack_sensors`.
+        setup: result of `draws.pack_sensors`.
         state: memory, history (a ring of ticks), scratch of shape (2, 3) and memory of the faults.
         out: filled.
     """

@@ -49,8 +49,8 @@ def draw(machine: Machine, samples: int, rate_hz: float, rng: np.random.Generato
     """Return the random numbers of a recording, shape (samples, chain.DRAWS); zeros without `rng`.
 
     Args:
-        machine: whose ``[sensors]`` holds.
-        samples: of the recording.
+        machine: machine with the ``[sensors]`` to use.
+        samples: number of samples.
         rate_hz: their rate.
         rng: source of noise, bias, jitter and losses of this recording.
     """
@@ -103,10 +103,10 @@ def pack_sensors(machine: Machine, rate_hz: float, noisy: bool, faults: Array | 
     As built, since payload, oil and faults change the plant's own.
 
     Args:
-        machine: whose ``[sensors]`` holds.
+        machine: machine with the ``[sensors]`` to use.
         rate_hz: rate of the log.
         noisy: False for the truth.
-        faults: of the sensors, a row each, see `edp.sim.sensors.alterations`.
+        faults: sensor faults, one row each; see `edp.sim.sensors.alterations`.
     """
     own, step_s = machine.sensors, 1.0 / rate_hz
     numbers = np.zeros(chain.SENSOR_NUMBERS)

@@ -28,10 +28,11 @@ def measured_signals(
 
     Args:
         log: rows of the plant.
-        machine: whose ``[sensors]`` holds.
+        machine: machine with the ``[sensors]`` to use.
         rate_hz: rate of the log.
         rng: source of noise, bias, jitter and losses of this recording.
-        oil_temperature: in K, shape (time,), for the drift of the pressures; default: the machine's constant.
+        oil_temperature: oil temperature for the drift of the pressures, K, shape (time,); default: the machine's
+            constant.
     """
     if oil_temperature is None:
         oil_temperature = np.full(len(log), machine.oil.temperature + 273.15)
@@ -52,12 +53,12 @@ def shown_signals(
 
     Args:
         log: rows of the plant.
-        machine: whose ``[sensors]`` holds.
+        machine: machine with the ``[sensors]`` to use.
         rate_hz: rate of the log.
         noisy: False for the truth.
-        drawn: what is random, from `draws.draw`, and behind it a column a fault.
-        oil_temperature: in K, shape (time,).
-        faults: of the sensors, a row each, see `edp.sim.sensors.alterations`.
+        drawn: random numbers of `draws.draw`, followed by one column per fault.
+        oil_temperature: oil temperature, K, shape (time,).
+        faults: sensor faults, one row each; see `edp.sim.sensors.alterations`.
     """
     setup = draws.pack_sensors(machine, rate_hz, noisy, faults)
     measured = np.empty((len(log), chain.SENSED))
