@@ -14,7 +14,7 @@ def coverage(source: DataSource, inputs: Sequence[str] = (), split: str = "") ->
     """Return the coverage of a data set, see `edp.data.coverage`.
 
     Args:
-        source: where the recordings are.
+        source: source of the recordings.
         inputs: channels that command, where neither names nor kinds tell.
         split: name of a split with its usual settings, to say how far tests lie from training.
 

@@ -89,10 +89,10 @@ def export_bundle(
     Args:
         path: bundle, or run folder.
         to: name of the form.
-        folder: where to.
-        name: of the network in the files.
-        options: of the form.
-        calibration: of a twin, recordings on which it is brought into W8A16.
+        folder: output folder.
+        name: name of the network in the files.
+        options: options of the form.
+        calibration: recordings for the conversion of a twin to W8A16.
 
     Raises:
         EdpError: not a bundle, an unknown form or option, or a network or name that this form cannot hold.

@@ -22,9 +22,9 @@ class ExportOrder:
     Attributes:
         run: bundle, run folder, or a monitor.
         to: name of the form.
-        folder: for the files; an export that it holds is replaced.
-        name: in the exported files; empty for that of the form.
-        options: of the form.
+        folder: output folder. An earlier export in it is replaced.
+        name: name in the exported files; empty for the default of the form.
+        options: options of the form.
         twin: run folder of a grey box, of a form that follows the machine.
         calibration: recordings on which a twin is brought into W8A16.
     """
@@ -43,8 +43,8 @@ class RunForm:
     """Form of a run that is more than a network.
 
     Attributes:
-        summary: what it is, in a line.
-        name: in the exported files where none is given.
+        summary: description in one line.
+        name: default name in the exported files.
         write: writes it; returns the files, the one to read first in front.
         follows: whether it reads the grey box of `ExportOrder.twin`.
     """
@@ -61,7 +61,7 @@ class Exported:
 
     Attributes:
         files: the one to read first in front.
-        name: in the files.
+        name: name in the files.
         without_adaptation: whether the form left an adaptation out.
     """
 

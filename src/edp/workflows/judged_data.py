@@ -18,8 +18,8 @@ def judged_data(
     """Return a run's data with the judged ones as test part, and the drawn amount; None if all are judged.
 
     Args:
-        bundle: of the run.
-        data: of the run.
+        bundle: bundle of the run.
+        data: data of the run.
         others: other recordings; None for the held-out ones.
         at_most_h: evenly spread stretches of so many hours, about, where there are more; None for all.
 

@@ -80,7 +80,7 @@ def prepare_data(source: RecordingSource, experiment: Experiment, frozen: Mappin
     """Read and cut a data set for an experiment.
 
     Args:
-        source: where the recordings are.
+        source: source of the recordings.
         experiment: the settings.
         frozen: names of sessions by digest that must not be among them, unless the split keeps them frozen.
 
@@ -126,12 +126,12 @@ def train(
     """Train on a data set and write a run folder with its bundle; an interrupted run continues.
 
     Args:
-        source: where the recordings are.
+        source: source of the recordings.
         experiment: the settings.
         out: run folder; or a run that the caller has opened, and of which this training is a part.
         on_event: called with progress.
         strategy_factory: teachers, weights to begin with.
-        data: what `prepare_data` gave for this source and experiment, where it is there already.
+        data: result of `prepare_data` for this source and experiment, if available.
 
     Raises:
         EdpError: the data, settings or folder cannot be used; what was on disk stays.
@@ -174,10 +174,10 @@ def keep_fitted(
 
     Args:
         run: the run.
-        source: where the recordings are.
+        source: source of the recordings.
         experiment: the settings.
-        data: what `prepare_data` gave for both.
-        fitted: what the training gave.
+        data: result of `prepare_data` for both.
+        fitted: result of the training.
         facts: further plain values of the provenance.
     """
     run.write_settings(experiment_toml(experiment))
@@ -392,9 +392,9 @@ def channel_importance(
     Args:
         run: run folder.
         source: other recordings.
-        spec: how channels are taken away; without it, collinear channels are also taken away together.
+        spec: method of removing channels; by default collinear channels are also removed together.
         progress: receiver of the progress; its units are channels, or groups of them.
-        at_most_h: as in `evaluate`.
+        at_most_h: see `evaluate`.
 
     Returns:
         The figures, and their file ``channel_importance.json`` in the run folder, or in its subfolder for `source`.

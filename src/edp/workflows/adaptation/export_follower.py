@@ -24,11 +24,11 @@ def export_follower(
     """Write a grey box that follows the machine, and moves the predictions of a run towards its forecasts, as C99.
 
     Args:
-        run: with an adaptation, whose units say what a large correction is.
+        run: run with an adaptation. The units of its channels define what a large correction is.
         twin: run folder of the grey box of the machine as it was.
-        folder: where to.
+        folder: output folder.
         name: prefix of its C functions and files.
-        options: of `TunedSpec`, by name.
+        options: options of `TunedSpec` by name.
 
     Returns:
         The files, the one to read first in front.

@@ -37,8 +37,8 @@ class AdaptedRun:
     """Result of `adapt`.
 
     Attributes:
-        adaptation: with fitted constants.
-        content: of ``adaptation.json``.
+        adaptation: adaptation with fitted constants.
+        content: content of ``adaptation.json``.
     """
 
     adaptation: Adaptation

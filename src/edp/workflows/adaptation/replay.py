@@ -35,12 +35,12 @@ class Replayed:
     """One recording.
 
     Attributes:
-        name: of the recording.
-        base: what the network predicts ``(time, horizon, target)``, SI units.
-        adapted: the same, corrected.
+        name: name of the recording.
+        base: predictions of the network ``(time, horizon, target)``, SI units.
+        adapted: corrected predictions, same shape.
         motion_s: seconds of motion before each tick ``(time,)``.
-        status: what the adaptation did at each tick ``(time,)``.
-        targets: what was measured ``(time, target)``, SI units.
+        status: status of the adaptation at each sample ``(time,)``.
+        targets: measured targets ``(time, target)``, SI units.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Replay:
         recordings: each of them.
         horizons: ticks ahead.
         skip: ticks of the start that do not count.
-        learned: at the end.
+        learned: learned correction at the end.
     """
 
     recordings: list[Replayed]
@@ -143,13 +143,13 @@ def replay(
 
     Args:
         predictor: the network; it starts anew with each recording.
-        adaptation: how it is corrected.
+        adaptation: settings of the correction.
         series: the recordings.
         carry: keep what was learned from one recording to the next, as on one machine; else each starts from nothing.
         learn: False freezes the adaptation.
         progress: receiver of the progress; its units are recordings.
-        moves: what becomes of the network's predictions ``(time, horizon, target)`` of the recordings before the
-            adaptation corrects them; None: nothing.
+        moves: function that changes the network's predictions ``(time, horizon, target)`` of the recordings before the
+            adaptation corrects them; None for no change.
 
     Raises:
         DataError: no recording is longer than start-up and horizon.
@@ -190,7 +190,7 @@ def replay_run(
     """Replay logs through a run that `edp adapt` wrote; see `replay`.
 
     Args:
-        run: with an adaptation.
+        run: run with an adaptation.
         source: the logs.
         carry: keep what was learned from one recording to the next.
         learn: False freezes what was learned.

@@ -42,9 +42,9 @@ def correction_of(twin: Twin, adaptation: Adaptation, task: Task, spec: TunedSpe
 
     Args:
         twin: a grey box of the machine as it was.
-        adaptation: of the network, which tells horizons, and by its units what a large correction is.
-        task: of the network.
-        spec: how the numbers follow.
+        adaptation: adaptation of the network. It defines the horizons, and by its units what a large correction is.
+        task: task of the network.
+        spec: settings of the parameter adaptation.
 
     Raises:
         ConfigError: another rate than the network's, no grey box, or a target that is no velocity of it.
@@ -66,7 +66,7 @@ class TwinMoves:
 
     Args:
         twin: a grey box of the machine as it was.
-        correction: of the network's predictions by it (`correction_of`).
+        correction: correction of the network's predictions (`correction_of`).
     """
 
     def __init__(self, twin: Twin, correction: TunedCorrection) -> None:
@@ -78,7 +78,7 @@ class TwinMoves:
         """Predictions ``(time, horizon, target)`` of each recording, moved.
 
         Args:
-            recordings: with the twin's channels.
+            recordings: recordings with the twin's channels.
             predictions: the network's own.
             carry: keep what was learned from one recording to the next.
             learn: False freezes the numbers.

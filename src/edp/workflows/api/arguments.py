@@ -20,7 +20,7 @@ def check_together(recordings: Sequence[Recording]) -> None:
     """Refuse recordings that do not belong together.
 
     Raises:
-        DataError: none, a name twice, other rates, or other channels.
+        DataError: there are no recordings, two have one name, or rates or channels differ.
     """
     if not recordings:
         raise DataError("no recordings are left; give at least one")

@@ -18,7 +18,7 @@ class ComparedRuns(OneFrame):
     A frame has a row for each run and error.
 
     Args:
-        comparison: of the runs.
+        comparison: comparison of the runs.
     """
 
     def __init__(self, comparison: Comparison) -> None:

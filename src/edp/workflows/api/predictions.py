@@ -26,14 +26,15 @@ class Predictions(OneFrame):
     ``TARGET+HORIZON``; bounds of an interval ``TARGET+HORIZON lower 0.9`` and ``... upper 0.9``.
 
     Attributes:
-        recordings: that were read.
+        recordings: recordings of the predictions.
         targets: predicted channels.
-        kinds: of the targets.
+        kinds: kinds of the targets.
         horizons: look-ahead in samples.
-        coverages: of the intervals; empty where the network has none.
-        values: for each recording float32 ``(time, horizon, target)``; row t was said at t, of t + horizon.
-        bounds: for each recording float32 ``(time, coverage, 2, horizon, target)``, lower then upper; None without
-            intervals.
+        coverages: coverages of the intervals; empty for a network without intervals.
+        values: predictions of each recording, float32 ``(time, horizon, target)``. Row t is the prediction at t of the
+            values at t + horizon.
+        bounds: interval bounds of each recording, float32 ``(time, coverage, 2, horizon, target)``, lower before upper;
+            None without intervals.
     """
 
     recordings: tuple[Recording, ...]

@@ -151,7 +151,7 @@ class TrainedPredictor:
             horizon: look-ahead in samples; the longest by default.
 
         Raises:
-            DataError: as of `predict`.
+            DataError: see `predict`.
             ConfigError: no such horizon.
         """
         return self.predict(as_recordings(test)[:1]).plot(horizon=horizon)
@@ -161,9 +161,9 @@ class TrainedPredictor:
 
         Args:
             target: ``c``, ``onnx``, ``simulink``, ``fmu``, ``casadi`` or ``ros2``.
-            folder: where to; it is made.
-            name: what the network is called there.
-            options: of the target (docs/export.md).
+            folder: output folder, which is created.
+            name: name of the network in the exported files.
+            options: options of the target (docs/export.md).
 
         Returns:
             The files, the one to read first in front.

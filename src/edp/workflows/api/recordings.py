@@ -38,11 +38,11 @@ class Recordings(Sequence[Recording]):
     Iterating and indexing give a `Recording` each (by number or by name), a slice gives `Recordings`.
 
     Args:
-        recordings: at least one; equal channels, equal rates, each with a name of its own.
-        source: where they can be read again, where that is so.
+        recordings: at least one recording; equal channels, equal rates and unique names.
+        source: source from which they can be read again, if there is one.
 
     Raises:
-        DataError: none, or recordings that do not belong together.
+        DataError: there are no recordings, or they do not belong together.
     """
 
     def __init__(self, recordings: Sequence[Recording], source: DataSource | None = None) -> None:
@@ -65,11 +65,11 @@ class Recordings(Sequence[Recording]):
         Args:
             arrays: numbers, each of shape ``(time, channel)``.
             rate_hz: samples per second.
-            names: of the channels; ``channel_0``, ``channel_1``, ... by default.
-            units: of the channels, in their order or by name; values are converted to SI. Without one a value is
-                taken as it is.
-            recording_names: of the recordings; ``recording_0``, ... by default.
-            repair: what may be repaired: ``{"nan": "hold"}`` holds the last good value, ``{"nan": "keep"}`` keeps NaN.
+            names: channel names; ``channel_0``, ``channel_1``, ... by default.
+            units: channel units, in the order of the channels or by name. Values are converted to SI units; without a
+                unit they are used unchanged.
+            recording_names: names of the recordings; ``recording_0``, ... by default.
+            repair: allowed repairs: ``{"nan": "hold"}`` repeats the last valid value, ``{"nan": "keep"}`` keeps NaN.
 
         Raises:
             DataError: shapes, names or units that do not fit, a rate that is not positive, or missing values.
@@ -101,9 +101,9 @@ class Recordings(Sequence[Recording]):
             frames: a frame, or a sequence of them.
             rate_hz: samples per second; every column is then a channel. Without it a column of time stamps (``time_s``,
                 ``time``, ``timestamp`` or the like; numbers or dates) tells the rate, under the time rule of logs.
-            units: by column; values are converted to SI. Without one a value is taken as it is.
-            recording_names: of the recordings; ``recording_0``, ... by default.
-            repair: what may be repaired, as in `read`.
+            units: unit of each column. Values are converted to SI units; without a unit they are used unchanged.
+            recording_names: names of the recordings; ``recording_0``, ... by default.
+            repair: allowed repairs, see `read`.
 
         Raises:
             DataError: no frame, no time stamps and no rate, text for numbers, or missing values.
@@ -213,7 +213,7 @@ class Recordings(Sequence[Recording]):
 
         Args:
             test: share that tests, above 0 and below 1; at least one recording is in each part.
-            seed: of the draw.
+            seed: random seed of the draw.
 
         Raises:
             ConfigError: a share or seed out of range.
@@ -272,11 +272,11 @@ def read(
     """Read recordings from logs and folders of logs, from a data-set file, or from a store.
 
     Args:
-        path: what to read (docs/recordings.md): one path, or a sequence of logs and folders.
-        map: which columns become which channels: a map file, or its content as a mapping. Without one every column of
-            numbers is taken under its own name; the vocabulary or else the file's unit tells its kind.
-        repair: what may be repaired, by default nothing: ``nan`` (``hold``, ``keep``), ``gaps`` (``hold``, ``cut``,
-            ``keep``), ``duplicates`` (``last``), ``falling`` (``sort``, ``cut``).
+        path: source of the recordings (docs/recordings.md): one path, or a sequence of logs and folders.
+        map: assignment of columns to channels: a map file, or its content as a mapping. Without a map each numeric
+            column becomes a channel of the same name, whose kind follows from the vocabulary or the unit in the file.
+        repair: allowed repairs, by default none: ``nan`` (``hold``, ``keep``), ``gaps`` (``hold``, ``cut``, ``keep``),
+            ``duplicates`` (``last``), ``falling`` (``sort``, ``cut``).
 
     Raises:
         DataError: nothing to read, or a log that cannot be used as it is.

@@ -40,7 +40,7 @@ class JudgedScores(OneFrame):
     A frame has a row for each model and horizon.
 
     Args:
-        facts: what was judged.
+        facts: description of the evaluated data.
     """
 
     def __init__(self, facts: Facts) -> None:
@@ -87,7 +87,7 @@ class SearchStudy:
     """State and results of a model search.
 
     Args:
-        facts: of the study.
+        facts: results of the study.
     """
 
     def __init__(self, facts: StudyFile) -> None:
@@ -102,7 +102,7 @@ class SearchStudy:
         """Plot a part of the study: ``variance``, ``pareto``, ``confirmation``, ``screening`` or ``history`` (Plotly).
 
         Args:
-            name: without it the first that there are facts for.
+            name: name of the part; by default the first part that has results.
 
         Raises:
             ConfigError: no such figure, or nothing is decided yet.

@@ -28,12 +28,12 @@ class CompressionRequest:
     """A training that makes a smaller network of a teacher.
 
     Attributes:
-        name: of the network.
+        name: name of the network.
         units: its width; that of the teacher keeps all of it.
         levels: convolution levels; None as `student` chooses.
         pruned: begin with what pruning leaves of the teacher, which needs all its levels.
         distillation: the objective; None for `DistillationSpec()`, and for rows where `imitates` holds.
-        rounding: what is rounded in training, which goes on from `of`.
+        rounding: number format that the training imitates; it continues from the network `of`.
         of: the order whose network a rounded training goes on from; None for the teacher itself.
     """
 
@@ -105,7 +105,7 @@ class Bench:
     Args:
         teacher: the trained network.
         data: series to train on and to choose epochs by; the test part is not touched.
-        training: how a network is trained.
+        training: settings of the trainings.
     """
 
     def __init__(self, teacher: Predictor, data: Prepared, training: TrainingSpec) -> None:

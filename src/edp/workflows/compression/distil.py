@@ -44,7 +44,7 @@ class DistilSpec:
         units: width of the student.
         levels: convolution levels; None for one less than the teacher has.
         pruned: begin with what pruning leaves of the teacher.
-        objective: what is minimised, in chunks; None for the usual one, and for rows of a committee's bank.
+        objective: loss in chunks; None for the default, and for rows of a committee's bank.
 
     Raises:
         ConfigError: a value out of range, or a pruned student with levels of its own.
@@ -68,7 +68,8 @@ class DistilRequest:
     Attributes:
         spec: the student, and how it is taught.
         teachers: run folders or bundles of further teachers.
-        further: where recordings without truth are; the student learns what the teachers say of them.
+        further: source of recordings without measured targets; the student is trained on the teachers' predictions for
+            them.
         changes: settings of the training that differ from the run's: ``key.path=value``, or tables.
     """
 
@@ -89,7 +90,7 @@ def distil(
 
     Args:
         run: run folder of the teacher.
-        request: what is made of it.
+        request: student and its training.
         out: run folder of the student.
         source: recordings to learn on; by default those of the run.
         progress: receiver of the progress; its units are epochs.

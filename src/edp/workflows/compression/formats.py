@@ -27,7 +27,7 @@ class Format(Protocol):
     """A number format.
 
     Attributes:
-        label: how tables call it.
+        label: name in tables.
         estimated: name in `edp.evaluation.controller.FORMATS` of the estimate of its cycles, program and state.
         rounded: whether training with rounded numbers is of use for it.
     """
@@ -115,7 +115,7 @@ def resource_usage(
         predictor: the network; its weights need not be trained.
         name: a name of `FORMATS`.
         budget: says which core.
-        parameter_bytes: where they are known better than the format knows them.
+        parameter_bytes: size of the parameters, if it is known more precisely than from the format.
 
     Raises:
         ExportError: the network has no form in this format.
@@ -141,8 +141,8 @@ class Deployed:
 
     Attributes:
         number_format: a name of `FORMATS`.
-        predict: how it predicts.
-        resource_usage: what it takes.
+        predict: prediction function.
+        resource_usage: resource usage.
     """
 
     number_format: str
@@ -164,7 +164,7 @@ def deploy(
         name: a name of `FORMATS`.
         training_series: training series, on which ranges of activations are found.
         budget: says for which core cycles are estimated.
-        parameter_bytes: where they are known better than the format knows them.
+        parameter_bytes: size of the parameters, if it is known more precisely than from the format.
 
     Raises:
         ConfigError: an unknown format, or a network that it cannot hold.

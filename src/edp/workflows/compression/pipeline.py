@@ -42,8 +42,8 @@ class NetworkResult:
     Attributes:
         plain: scores in float32.
         formats: result in each number format that the network can be in.
-        left_out: by number format, why there is no result.
-        recordings: by number format, scores of each recording; not kept in records.
+        left_out: reason for a missing result, by number format.
+        recordings: scores of each recording, by number format; not stored in records.
     """
 
     plain: Scores
@@ -74,7 +74,7 @@ class Evaluator:
 
     Args:
         data: series; those of ``data.train`` give the ranges of activations.
-        budget: what the controller grants.
+        budget: limits of the controller.
     """
 
     def __init__(self, data: Prepared, budget: Budget) -> None:
@@ -142,7 +142,7 @@ def rows_of(
     """Return a row for each number format of a network.
 
     Args:
-        order: how the network was made; None for the teacher.
+        order: request that produced the network; None for the teacher.
         result: its evaluation.
         teacher: scores of the teacher in float32.
         run: folder of the network's run.

@@ -31,8 +31,8 @@ class CompressionPlan:
 
     Attributes:
         orders: the recipes for each width, widest first.
-        formats: in which a network can be.
-        notes: what was left out, and why.
+        formats: number formats to evaluate.
+        notes: omitted alternatives, each with the reason.
     """
 
     orders: Mapping[int, tuple[CompressionRequest, ...]]
@@ -53,7 +53,7 @@ class CompressionPlan:
         """Return the requests that train the better recipe of each width with rounded numbers.
 
         Args:
-            errors: in float32, by recipe; one that is not in it did not end well.
+            errors: error in float32, by recipe; a recipe without an entry failed.
         """
         if not self.rounds:
             return []
@@ -75,11 +75,11 @@ def make_plan(
 
     Args:
         teacher: the network; its weights need not be trained.
-        budget: what the controller grants.
+        budget: limits of the controller.
         units: widths to make; none given, they are planned.
         formats: names of number formats; none given, all.
         recipes: some of `RECIPES`.
-        shares: of the widest that fits; each plans a width.
+        shares: fractions of the widest network that fits; each gives one width.
 
     Raises:
         ConfigError: an unknown format or recipe, a width that is none, or a budget that no network of this kind meets.

@@ -53,10 +53,10 @@ class CompressionSearchSpec:
     """Table ``[compress]``: the alternatives of the search.
 
     Attributes:
-        budget: what the controller grants.
+        budget: limits of the controller.
         units: widths; none given, they are planned from the budget.
         formats: number formats; none given, all.
-        recipes: how each width is made, some of `edp.workflows.compression.planning.RECIPES`.
+        recipes: training recipes of each width, from `edp.workflows.compression.planning.RECIPES`.
         thesis: also make the variants of Table 4.9 that are narrower than the teacher.
 
     Raises:
@@ -84,7 +84,7 @@ class CompressionSearchRequest:
     """Request to compress a run.
 
     Attributes:
-        spec: what is searched.
+        spec: alternatives of the search.
         again: open the sealed test set again for another choice, which weakens what it can show; it is recorded.
         changes: settings of the trainings that differ from the run's: ``key.path=value``, or tables.
     """
@@ -101,8 +101,8 @@ class DiskBench(Bench):
         teacher: the trained network.
         data: series to train on.
         experiment: settings of the teacher's run.
-        source: where the recordings are.
-        folder: for the runs.
+        source: source of the recordings.
+        folder: folder for the runs.
 
     Attributes:
         networks: stage of the progress whose units are networks.
@@ -164,7 +164,7 @@ def search(
 
     Args:
         run: run folder of the teacher.
-        request: what is made of it.
+        request: run, budget and alternatives.
         out: folder of the search, with a run for each network.
         source: recordings to learn, choose and judge on; by default those of the run.
         progress: receiver of the progress; its units are networks.
@@ -221,7 +221,7 @@ class _SealedRecordings:
 
     Attributes:
         data: they are its test part.
-        name: of the sealed test set.
+        name: name of the sealed test set.
         study: folder of the model search that set it apart and records openings; None where none did, or it is gone.
         opened_before: whether a model search evaluated networks on it already.
     """
@@ -252,13 +252,13 @@ class _Comparison:
 
     Args:
         bench: makes the networks.
-        budget: what the controller grants.
+        budget: limits of the controller.
         run: folder of the teacher.
 
     Attributes:
         teacher: the teacher in float32.
         rows: every network in every format that it can be in.
-        notes: which formats were left out, and why.
+        notes: omitted formats, each with the reason.
     """
 
     def __init__(self, bench: DiskBench, budget: Budget, run: Path) -> None:

@@ -21,11 +21,11 @@ class CompressedCandidate:
     """Smaller network with its number format.
 
     Attributes:
-        name: of the variant.
-        order: what made it.
-        network: in float32; it can be saved and exported.
+        name: name of the variant.
+        order: request that produced it.
+        network: network in float32, which can be saved and exported.
         number_format: a name of `edp.workflows.compression.FORMATS`; it is evaluated in it.
-        parameter_bytes: as Table 4.9 counts them; None where the format says it.
+        parameter_bytes: size as in Table 4.9; None to use the size in the format.
     """
 
     name: str

@@ -36,9 +36,9 @@ class ControlSources:
     """Run folders that closed loops read; None if unused.
 
     Attributes:
-        plant: of a twin, or an FMU, that takes the place of the simulator.
-        twin: of a twin that the controller uses.
-        predictor: of a look-ahead predictor that the controller uses.
+        plant: folder of a twin, or an FMU, that replaces the simulator.
+        twin: folder of the controller's twin.
+        predictor: folder of the controller's look-ahead predictor.
         trusted: whether the native code of an FMU may run here with the rights of this process.
     """
 
@@ -64,13 +64,13 @@ class ControlBench:
     Args:
         experiment: machine, task, seeds and controller.
         sources: models and plant.
-        models: what controllers know; None measures a valve map on the plant and loads the models of the sources.
+        models: models for controllers. None measures a valve map on the plant and loads the models of the sources.
         options: further options of the environment's reset, such as ``oil_temperature``.
 
     Attributes:
-        tasks: of the seeds, in their order.
-        models: what controllers know.
-        plant: what controllers see of the plant.
+        tasks: tasks in the order of the seeds.
+        models: models for controllers.
+        plant: interface of the plant for controllers.
 
     Raises:
         EdpError: settings or models cannot be used.
@@ -115,9 +115,9 @@ class ControlBench:
         """Run every loop with a controller, by default that of the experiment.
 
         Args:
-            spec: of the controller.
+            spec: settings of the controller.
             progress: receiver of the progress; its units are loops.
-            guard: of every loop; begins anew with each.
+            guard: guard of every loop, reset before each.
             divided: who runs the loops, and where results are kept; this process keeps none by default.
 
         Raises:
@@ -133,9 +133,9 @@ class ControlBench:
         """Run one loop.
 
         Args:
-            number: of the task.
-            spec: of the controller.
-            guard: of the loop.
+            number: index of the task.
+            spec: settings of the controller.
+            guard: guard of the loop.
 
         Raises:
             ConfigError: see `results`.
@@ -205,8 +205,8 @@ class DividedLoops:
 
     Attributes:
         workers: who runs them; nodes see plants and models under the same paths.
-        folder: of the results of loops; None keeps none.
-        key: of the run, with the bench among several.
+        folder: folder for the results of single loops; None to store none.
+        key: key of the run, with the index of the bench if there are several.
     """
 
     workers: Workers = IN_PROCESS

@@ -45,7 +45,7 @@ def export_controller(
 
     Args:
         run: its run folder.
-        folder: where to.
+        folder: output folder.
         name: prefix of its C functions and files.
         options: ``iterations``, the solver's most a tick; ``newton``, those of a grey box's equations.
 
@@ -72,9 +72,9 @@ def parts_of(
 
     Args:
         experiment: its settings.
-        plant: that it is for.
+        plant: interface of the plant.
         models: valve map, and the twin of a plan.
-        twin: the same twin with its spec.
+        twin: the same twin together with its settings.
         most: iterations a tick, of the solver and of a grey box's equations.
 
     Raises:

@@ -51,13 +51,13 @@ class KeptController:
 
     Attributes:
         experiment: its settings.
-        plant: what it saw of the plant.
+        plant: interface of the plant for the controller.
         models: valve map and twin.
         twin: the twin with its spec; None without one.
         observed: observations of the first ticks of the first loop, shape (ticks, channel).
-        levers: what it answered, shape (ticks, 3).
-        strokes: of the reference, m, shape (rows, 3).
-        tip: of the reference, shape (rows, 3).
+        levers: outputs of the controller, shape (ticks, 3).
+        strokes: strokes of the reference, m, shape (rows, 3).
+        tip: tip poses of the reference, shape (rows, 3).
     """
 
     experiment: ControlExperiment
@@ -77,8 +77,8 @@ def keep_controller(
 
     Args:
         run: run folder.
-        plant: that the loops were run on.
-        models: that the controller knew.
+        plant: plant of the loops.
+        models: models of the controller.
         twin: run folder of its twin.
         first: task and result of the first loop.
 
@@ -123,7 +123,7 @@ def load_kept(run: str | Path) -> KeptController:
 
     Raises:
         StorageError: not a run of edp control, or one of an earlier version that kept no controller.
-        BundleError: what was kept is damaged.
+        BundleError: the stored controller is damaged.
         ConfigError: the settings or the machine cannot be.
     """
     path = Path(run)

@@ -37,7 +37,7 @@ class ControlRun:
     """Result of `control_loops`.
 
     Attributes:
-        content: of ``results.json``.
+        content: content of ``results.json``.
         results: the loops, in the order of their seeds.
         page: file of the page.
     """
@@ -62,7 +62,7 @@ def control_loops(
         out: run folder; loops of the same settings are run again.
         sources: models and plant.
         progress: receiver of the progress; its units are loops.
-        guard: what the controller may rely on, such as a monitor.
+        guard: guard that permits or forbids the use of models, such as a monitor.
         workers: who runs the loops; nodes see models and run folder under the same paths. A stopped call continues
             after the loops that are done.
 

@@ -23,7 +23,7 @@ class TransferSpec:
 
     Attributes:
         settings: uniformly from what the controller says is worth trying.
-        seed: of the drawing.
+        seed: random seed of the settings.
     """
 
     settings: int = 80
@@ -40,7 +40,7 @@ class TuningTransfer:
 
     Attributes:
         on_model: position errors of the tip on the model.
-        on_plant: the same on the plant.
+        on_plant: costs on the plant, mm, shape (settings,).
     """
 
     on_model: Array

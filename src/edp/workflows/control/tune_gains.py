@@ -37,7 +37,7 @@ class TuningSpec:
         trials: settings tried, the present ones first.
         loops: references that each of them is run along.
         sampler: see `edp.workflows.search.study.SamplerSpec`.
-        seed: of the sampler.
+        seed: seed of the sampler.
     """
 
     trials: int = 40
@@ -78,7 +78,7 @@ def tune_gains(
         out: run folder; a stopped tuning continues after its last trial, and a finished one is read.
         tuned_on: plant and models of the tuning.
         judged_on: plant and models of the judgement.
-        tuning: how.
+        tuning: settings of the tuning.
         progress: receiver of the progress; its units are trials.
         workers: who runs the loops of a trial; nodes see models and run folder under the same paths.
 

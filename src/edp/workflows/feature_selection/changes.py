@@ -23,7 +23,7 @@ def with_changes(
         settings: the set.
         screening: lag curves and horizon.
         recording: one of those that were screened, for the kinds of its channels.
-        name: of the set with changes.
+        name: name of the set with changes.
     """
     added = []
     for channel in settings.channels:

@@ -76,10 +76,10 @@ class Selection:
 
     Attributes:
         screening: the screening.
-        quality: of the recordings.
-        notes: what a reader must know of how the data were read.
+        quality: quality of the recordings.
+        notes: remarks on how the data were read.
         sets: the feature sets by name, the proposed one first.
-        files: by what they are: ``page``, ``screening``, ``quality``, ``settings``, ``sets``, and where there are such,
+        files: written files by type: ``page``, ``screening``, ``quality``, ``settings``, ``sets``, and optionally
             ``settings_with_changes``, ``map``, ``pictures``, ``trials``.
         trials: errors of the sets, where they were tried.
     """
@@ -107,9 +107,9 @@ def select_features(
     """Screen a data set and write the proposed features.
 
     Args:
-        source: where the recordings are. Without a signal map every column of numbers is read.
+        source: source of the recordings. Without a signal map every numeric column is read.
         out: folder of all that is written.
-        order: what is asked.
+        order: request of the user.
         listeners: who hears of the progress.
         workers: who inspects the recordings and trains the trials.
 

@@ -82,15 +82,15 @@ class FeatureSetTrial:
     """Judged feature set.
 
     Attributes:
-        name: of the set.
+        name: name of the set.
         channels: logged channels that it reads.
-        features: what the network sees, derived channels included.
+        features: inputs of the network, including derived channels.
         parameters: trainable numbers of the network.
         error: mean absolute error by horizon, mean over targets, seeds and ticks of the held-out recordings.
-        by_seed: the same for each seed.
-        difference: to the first set by horizon, paired over the held-out recordings; None for the first set, and
-            where there is one recording only.
-        seconds: of training, all seeds.
+        by_seed: errors of each seed.
+        difference: difference to the first set by horizon, paired over the held-out recordings; None for the first set,
+            and with a single recording.
+        seconds: training time of all seeds, s.
     """
 
     name: str
@@ -140,9 +140,9 @@ def try_feature_sets(
     Trainings that are in the folder already are kept; one that was interrupted goes on.
 
     Args:
-        source: where the recordings are.
+        source: source of the recordings.
         experiment: settings of all trainings; only features and seed change.
-        sets: by name, a name as in ``task.features`` or a table; the first one is what the others are compared with.
+        sets: feature sets by name, each a name as in ``task.features`` or a table. The first set is the reference.
         out: folder of the run folders and of ``trials.json``.
         spec: random sets and seeds.
         on_trial: called with the set, how many trainings are done and of how many, and each event of the training.

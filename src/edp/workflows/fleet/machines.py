@@ -41,9 +41,9 @@ class StoredMachine:
     """A machine of a store.
 
     Attributes:
-        name: of the machine.
-        digests: of its recordings.
-        minutes: of them together.
+        name: name of the machine.
+        digests: hashes of its recordings.
+        minutes: total length of its recordings, min.
     """
 
     name: str

@@ -44,10 +44,10 @@ class PersonalOrder:
     """Settings of the fine-tuning for each machine.
 
     Attributes:
-        method: of the fine-tuning; one that trains and needs no recordings of the source.
+        method: method of the fine-tuning, which must train and need no recordings of the source.
         spec: its settings.
         changes: settings of the trainings that differ from those of the source.
-        most_bytes: of a delta.
+        most_bytes: maximum size of a delta.
 
     Raises:
         ConfigError: a method that does not do here, or no room for a delta.
@@ -133,7 +133,7 @@ def network_of(folder: str | Path, machine: str, out: str | Path, base: str | Pa
     """Write the network of a machine, the fleet's with its delta, as a bundle.
 
     Args:
-        folder: of `finetune_fleet`.
+        folder: folder of `finetune_fleet`.
         machine: its name.
         out: folder of the bundle.
         base: run folder or bundle of the fleet's network; None where ``fleet.json`` says that it lies.

@@ -53,13 +53,13 @@ class RegistryEntry(ResultFile):
     Attributes:
         id: content address of the weights, or of all deltas.
         kind: ``network`` or ``fleet``.
-        name: that it was given; several entries may share one, the latest is meant.
-        label: what it is, in words.
+        name: name from the user. Of several entries with one name the latest is used.
+        label: description in words.
         base: identifier of the network that it was trained on from; empty for one that began at random.
-        data: where its recordings were, their digest, count and hours, and for a fleet its machines.
+        data: origin, hash, number and hours of its recordings; for a fleet also its machines.
         judge: errors of the network and of the best baseline by horizon, how they were judged and on what; empty where
             nobody judged it.
-        added: when it entered.
+        added: time of entry.
         edp: version that entered it.
 
     Raises:
@@ -93,7 +93,7 @@ def add_to_registry(registry: str | Path, source: str | Path, name: str) -> Regi
 
     Args:
         registry: folder; made where absent.
-        source: what is entered; its files are copied.
+        source: path of the entry, whose files are copied.
         name: letters, digits, dots, dashes and underscores.
 
     Returns:
@@ -280,7 +280,7 @@ def find_entry(registry: str | Path, asked: str) -> RegistryEntry:
     """Find an entry by its name, the latest of several, or by the start of its identifier.
 
     Raises:
-        ConfigError: none, or an identifier that begins several.
+        ConfigError: no entry has the name, or several identifiers begin with the text.
     """
     entries, _ = list_registry(registry)
     named = [entry for entry in entries if entry.name == asked]

@@ -26,7 +26,7 @@ class RowBounds:
     """Check of the rows of a source.
 
     Args:
-        channels: of a row.
+        channels: channels of a row.
     """
 
     def __init__(self, channels: Sequence[Channel]) -> None:

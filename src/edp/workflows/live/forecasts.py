@@ -27,7 +27,7 @@ def forecast_lines(run: str | Path, recording: Recording, horizon: int | None = 
 
     Args:
         run: run folder.
-        recording: from its first row on, since models remember.
+        recording: recording, used from its first row on, since models have memory.
         horizon: samples ahead; default: the furthest.
 
     Raises:

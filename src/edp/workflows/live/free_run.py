@@ -23,7 +23,7 @@ class LiveTwin(LivePart):
 
     Args:
         bundle: the twin.
-        channels: of the source.
+        channels: channels of the source.
         note: takes events.
         free_s: length of a run.
 

@@ -22,7 +22,7 @@ class LiveNetwork(LivePart):
 
     Args:
         bundle: the network.
-        channels: of the source.
+        channels: channels of the source.
         note: takes events.
 
     Raises:

@@ -43,10 +43,10 @@ class RerunMirror:
     """Rerun server in its own process, with a thread that sends a session's rows.
 
     Args:
-        session: what is shown.
+        session: session to display.
 
     Attributes:
-        address: of the page.
+        address: address of the page.
         skipped: rows that were left out because the source ran ahead.
 
     Raises:
@@ -132,7 +132,7 @@ def entities(layout: LiveLayout, escaped: Any = str) -> Mapping[str, tuple[int, 
     Predictions stand at the time for which they were made, below the same unit as what is measured.
 
     Args:
-        layout: of the session.
+        layout: layout of the session.
         escaped: a name as one part of a path; names are text, whatever is in them.
     """
     paths: dict[str, tuple[int, float, float, float]] = {}

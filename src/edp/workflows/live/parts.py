@@ -24,7 +24,7 @@ class LivePart(ABC):
     """Columns that are computed from the source's channels, a row at a time.
 
     Attributes:
-        width: how many columns.
+        width: number of columns.
     """
 
     width: int
@@ -34,7 +34,7 @@ class LivePart(ABC):
         """Return the columns of a tick, shape (width,), SI units, NaN without a value.
 
         Args:
-            row: of the source's channels.
+            row: row of the source's channels.
             missed: ticks that went by without a row before it.
         """
 
@@ -44,7 +44,7 @@ class LivePart(ABC):
         None where it would not be the same, or is not known: the rows are then taken one by one.
 
         Args:
-            rows: of the source's channels, shape (ticks, channels).
+            rows: rows of the source's channels, shape (ticks, channels).
         """
         return None
 
@@ -78,8 +78,8 @@ class LiveFront(LivePart):
     """Joint angles for the side view, from angles or from strokes.
 
     Args:
-        machine: whose geometry is drawn.
-        channels: of the source.
+        machine: machine whose geometry is displayed.
+        channels: channels of the source.
     """
 
     width = 3

@@ -22,9 +22,9 @@ class McapRecorder:
     """Writes rows as they come.
 
     Args:
-        path: of the file, which must not be there.
-        channels: of a row's first columns.
-        layout: of all columns.
+        path: path of the file, which must not exist.
+        channels: channels of the first columns of a row.
+        layout: layout of all columns.
 
     Raises:
         ConfigError: another ending, or foxglove-sdk is not installed.

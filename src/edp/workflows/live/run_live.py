@@ -38,7 +38,7 @@ class LiveOrder:
 
     Attributes:
         source: name of a registered source.
-        options: of the source.
+        options: options of the source.
         run: run folder of a network or twin; None shows what is measured alone.
         monitor: folder of the monitor that raises alarms.
         speed: factor on real time of a source that can be steered.
@@ -49,7 +49,7 @@ class LiveOrder:
         record: MCAP file to write.
         rerun: whether to show the session in Rerun besides.
         until_end: whether to end with the source; a session stays open for viewers otherwise.
-        history_bytes: of rows that can be looked back at.
+        history_bytes: maximum size of the stored rows in bytes.
     """
 
     source: str
@@ -80,7 +80,7 @@ class LiveResult:
         ticks: streamed.
         alarms: events of a monitor.
         ended: why no more came, in words.
-        late: how often the source fell behind real time.
+        late: number of times that the source fell behind real time.
         saved: page that was written; `recorded` likewise.
         recorded: see `saved`.
     """
@@ -97,14 +97,14 @@ class LiveRun:
     """A source with its models, and the session that they fill; usable without a server.
 
     Args:
-        order: what to show.
+        order: options of the session.
         on_event: called with kind and text of each event.
-        source: of the rows, in place of the order's.
+        source: source that replaces the one in `order`.
 
     Attributes:
-        source: of the rows.
-        session: that is filled.
-        pace: of the source.
+        source: source of the rows.
+        session: session to fill.
+        pace: clock of the source.
         failure: error that ended the source or a model; None while there is none.
 
     Raises:

@@ -27,10 +27,10 @@ def run_live(
     """Serve a session until Ctrl-C, a request to end, an error, or with `LiveOrder.until_end` the end of the source.
 
     Args:
-        order: what to show.
+        order: options of the session.
         on_ready: called once the page can be opened.
         on_event: called with kind and text of each event.
-        source: of the rows, in place of the order's.
+        source: source that replaces the one in `order`.
         on_mirror: called with the address of Rerun's page, where that is asked for.
 
     Raises:

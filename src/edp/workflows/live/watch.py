@@ -45,11 +45,11 @@ class LiveMonitor(LivePart):
     """Only source of alarms: a value outside its interval raises none.
 
     Args:
-        monitor: at work.
-        channels: of the source.
-        rate_hz: of the source.
+        monitor: running monitor.
+        channels: channels of the source.
+        rate_hz: rate of the source.
         note: takes events.
-        recording: that is played, whose machine and units are checked; None where there is none.
+        recording: played recording, whose machine and units are checked; None without one.
 
     Raises:
         EdpError: another rate, another machine, or none of the monitor's channels.

@@ -130,7 +130,7 @@ def build_dictionary(
         monitor: fitted.
         healthy: sessions that its networks were not fitted to.
         machine: name or file.
-        spec: how.
+        spec: settings of the dictionary.
         seed: root of every random choice.
         progress: receiver of the progress; its units are draws, divided into sessions.
         side_by_side: calls a function for each of some jobs, such as in processes; then all draws are made, whatever

@@ -22,8 +22,8 @@ def write_event_files(
     """Write every recording as MDF 4 with its alarms as stretches from onset to the detecting block.
 
     Args:
-        alarms: of these recordings, by their names.
-        recordings: with the channels that are written.
+        alarms: alarms by recording name.
+        recordings: recordings with the channels to write.
         folder: made when absent; files of the same names are replaced.
 
     Raises:

@@ -71,9 +71,9 @@ def export_monitor(
     Args:
         monitor: folder that edp monitor fit wrote.
         to: a name of `FORMS`.
-        folder: where to.
-        name: of the monitor in the files.
-        options: of the form.
+        folder: output folder.
+        name: name of the monitor in the files.
+        options: options of the form.
 
     Returns:
         The files, the one to read first in front.

@@ -29,10 +29,10 @@ class FaultSession:
     """One session of the dictionary.
 
     Attributes:
-        base: which of the sound sessions it is, but for its fault.
+        base: index of the sound session with the same random numbers.
         fault: place in the classes; -1 for the sound session itself.
-        size: of the fault in the unit of its class; `neutral` without sizes.
-        recording: from the start of the session on.
+        size: size of the fault in the unit of its class; `neutral` for faults without a size.
+        recording: recording from the start of the session.
     """
 
     base: int
@@ -91,11 +91,11 @@ def simulated(
     """Yield the sessions of one draw: sound ones, followed by one for each class and size.
 
     Args:
-        classes: of `fault_classes`.
+        classes: result of `fault_classes`.
         machine: name or file.
         seconds: until the onset, and after it.
-        seed: of the dictionary, and the number of the draw.
-        rate_hz: of the recordings.
+        seed: seed of the dictionary, and index of the draw.
+        rate_hz: sample rate of the recordings.
     """
     before, after = seconds
     cases = cases_of(classes)

@@ -58,7 +58,7 @@ class FittedMonitor:
         monitor: ready to run.
         doubtful: names of healthy sessions that were left out.
         seconds: processor time of this process.
-        folder: where it lies; None where it was not saved.
+        folder: folder of the monitor; None if it was not saved.
         sessions: blocks of those that set the limit.
         is_read: whether the folder held the finished monitor already.
         one_machine: it knows the machine of the logs so well that others of its series raise alarms.
@@ -343,7 +343,7 @@ def _sources(
     """Return the residuals of the settings that have channels to judge.
 
     Raises:
-        DataError: none does.
+        DataError: no residual of the settings has channels to evaluate.
     """
     jobs = []
     # Other processes cannot call what shows progress here.
@@ -376,8 +376,8 @@ def _check_hours(sessions: Sequence[Recording], rest: Sequence[Recording], exper
 
     Args:
         sessions: all of them.
-        rest: those that train nothing and set the limit.
-        experiment: with the promise.
+        rest: sessions that train nothing and set the limit.
+        experiment: experiment with the promised false-alarm rate.
     """
     hours = sum(session.duration_s for session in sessions) / 3600.0
     left = sum(session.duration_s for session in rest) / 3600.0

@@ -46,8 +46,8 @@ class UnitMap:
     Attributes:
         workers: who does them; nodes see the run folder under the same path.
         run: run folder.
-        key: of the run.
-        seconds: of units that other processes or an earlier command did.
+        key: key of the run.
+        seconds: processor time of units computed by other processes or an earlier command.
     """
 
     workers: Workers

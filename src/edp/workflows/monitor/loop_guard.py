@@ -37,7 +37,7 @@ class MonitorGuard:
     explain little of it, as where the machine is another one, or are strokes alone, the controller falls back.
 
     Args:
-        monitor: at work.
+        monitor: running monitor.
         hold_s: time for which an alarm holds.
     """
 
@@ -116,7 +116,7 @@ def suspected(alarm: MonitorAlarm, judged: Mapping[str, tuple[str, ...]]) -> tup
     residuals deviates: one that explains all, and has no residual that stays quiet, scores highest.
 
     Args:
-        alarm: with its evidence.
+        alarm: alarm with its evidence.
         judged: see `judged_by`.
     """
     squares: dict[str, float] = {}

@@ -33,7 +33,7 @@ def report_monitor(
     Args:
         run: folder that `edp monitor run --out` wrote.
         out: the page; ``report.html`` in the folder by default.
-        title: of the page; the folder's name by default.
+        title: title of the page; the folder name by default.
 
     Returns:
         The page, and what it says.

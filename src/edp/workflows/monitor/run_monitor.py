@@ -51,15 +51,15 @@ class MonitorRun:
     """Result of a monitor along logs.
 
     Attributes:
-        monitor: that ran.
-        alarms: of all recordings, in order.
-        hours: that it watched.
+        monitor: monitor of the run.
+        alarms: alarms of all recordings, in order.
+        hours: total length of the monitored recordings, h.
         recordings: names of them.
-        silent: by recording, channels that it lacks.
+        silent: missing channels, by recording.
         traces: statistics and levels of residual groups, block by block.
-        unlearned: by recording, sentences on residuals that are silent where healthy logs were never.
-        unlike: by recording, why it looks like one of another machine of the same kind.
-        outside: by recording without an alarm, which residual lies outside of its healthy range all the same.
+        unlearned: sentences on residuals without output outside the range of the healthy logs, by recording.
+        unlike: reason why a recording seems to be of another machine of the same type, by recording.
+        outside: residual outside its healthy range, by recording without an alarm.
     """
 
     monitor: Monitor
@@ -104,12 +104,12 @@ class WatchedRecording:
     """Findings of a monitor in one recording.
 
     Attributes:
-        alarms: in the order of time.
+        alarms: alarms in order of time.
         silent: channels that the recording lacks.
         unlearned: why residuals are silent.
         unlike: why the recording is not one of the machine of the monitor; empty if it is.
         outside: why a missing alarm says nothing; empty if it does.
-        trace: what the page shows.
+        trace: trace for the page.
     """
 
     alarms: tuple[MonitorAlarm, ...]
@@ -130,7 +130,7 @@ def run_monitor(
     """Watch logs.
 
     Args:
-        folder: of the monitor.
+        folder: folder of the monitor.
         source: the logs.
         out: run folder for the alarm log as JSON lines and as CSV, and for what `edp monitor report` shows.
         progress: receiver of the progress; its units are recordings.

@@ -37,8 +37,9 @@ class ParityCase:
     Attributes:
         bundle: the trained network.
         inputs: golden recording ``(tick, input)``, SI units.
-        expected: what PyTorch streams from it, ``(tick, number)``: predictions, then lower and upper bounds, SI units.
-        allowed: how far a form may be from that, ``(number,)``, or ``(tick, number)`` where trees are at thresholds.
+        expected: streaming results of PyTorch for the input, ``(tick, number)``: predictions, then lower and upper
+            bounds, SI units.
+        allowed: tolerance of a form, ``(number,)``, or ``(tick, number)`` for trees near their thresholds.
         interpreters: Python programs with another ONNX Runtime.
     """
 
@@ -74,9 +75,9 @@ class Ran:
 
     Attributes:
         numbers: its numbers ``(row, number)``, SI units.
-        seconds: for a tick; for a window where it computes windows.
-        expected: what they are compared with, where that is not PyTorch's stream.
-        allowed: how far they may be from it, ``(number,)`` or ``(row, number)``; the case's where it is None.
+        seconds: time per sample, or per window if the form computes windows.
+        expected: expected values, if they differ from PyTorch's stream.
+        allowed: tolerance, ``(number,)`` or ``(row, number)``; None for the tolerance of the case.
         note: a remark for the table.
     """
 
@@ -101,7 +102,7 @@ class Form(Protocol):
         Raises:
             ExportError: the network has no such form; the reason is shown.
             Missing: a program or package is not there.
-            Broken: what was exported does not build, or ended badly.
+            Broken: the exported files do not build, or the program failed.
         """
         ...
 
@@ -115,13 +116,13 @@ class Row:
 
     Attributes:
         form: name in the registry.
-        title: for people.
+        title: name of the form for readers.
         verdict: ``same``, ``different``, ``failed``, ``refused`` (no such form of this network) or ``not run``.
-        why: of the last three.
+        why: reason for the last three states.
         largest: difference, in what is allowed; of numbers that must be equal, how many differ.
         mean: difference, in the same.
         tolerance: `edp.export.golden.SHARE`, which `tolerance` explains, or ``bits``.
-        microseconds: for a tick (a window).
+        microseconds: time per sample (or window).
         note: a remark.
     """
 

@@ -32,7 +32,7 @@ def golden_case(bundle: Bundle, ticks: int | None = None, seed: int = 0) -> Pari
     Args:
         bundle: the network.
         ticks: length; by default `TICKS`, of a plant its prefix and `FREE_S`.
-        seed: of the inputs.
+        seed: seed of the inputs.
 
     Raises:
         DataError: fewer ticks than the window.

@@ -57,8 +57,8 @@ class LogsProposal:
         files: the texts to write, by name.
         targets: channels to predict.
         inputs: channels that command, where no kind tells it; `edp inspect` sees their coverage only if they are named.
-        repairs: what training would refuse unless it is repaired, as ``--repair`` takes it.
-        notes: what else a person should know.
+        repairs: repairs without which training would refuse the logs, in the notation of ``--repair``.
+        notes: other remarks for the user.
         recordings: number of recordings that the commands read.
     """
 

@@ -35,11 +35,11 @@ class TransferCase:
 
     Attributes:
         source: the network of another machine.
-        logs: where the recordings of the target are.
-        data: those, divided by time.
+        logs: source of the recordings of the target machine.
+        data: recordings of the target machine, divided by time.
         experiment: settings of the source with the target's split.
         spec: phases, rates and regularisers.
-        folder: of the method's run, or that run, opened.
+        folder: folder of the method's run, or the opened run.
         progress: receiver of the progress of its trainings.
     """
 
@@ -64,8 +64,8 @@ class TransferCase:
         """Train in the method's folder, or for a phase in a subfolder; a stopped training continues.
 
         Args:
-            name: what progress calls it.
-            training: how.
+            name: name in the progress.
+            training: settings of the training.
             strategy: makes what the training begins with; None begins at random.
             facts: plain values that decide the strategy beside the source.
             phase: name of a phase that a later one goes on from.
@@ -101,10 +101,10 @@ def tuned(
     """Return the settings of further training: small batches, light smoothness, early stopping (thesis 3.4.5).
 
     Args:
-        training: how the source was trained.
-        spec: what is set of the fine-tuning.
-        optimizer: by default SOAP with one rate for all that learns.
-        epochs: by default those of methods without phases.
+        training: settings of the source's training.
+        spec: settings of the fine-tuning.
+        optimizer: optimiser; SOAP with one rate for all parameters by default.
+        epochs: number of epochs; by default that of methods without phases.
     """
     # The source's own smoothness is replaced by that of the fine-tuning.
     terms = tuple(term for term in training.terms if not isinstance(term, Smoothness))

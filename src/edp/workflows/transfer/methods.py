@@ -46,7 +46,7 @@ class Made:
     Attributes:
         predict: predictions ``(time, horizon, target)``, SI units, on ``data.test`` of the target, or of the source,
             whose inputs are the same.
-        learned: how many parameters learned from the target.
+        learned: number of parameters trained on the target.
         network: the network; None where it is none.
     """
 

@@ -27,7 +27,7 @@ class MeasuredMethod:
     """Scores of a method on a test part.
 
     Attributes:
-        overall: by horizon and target in report units, with the skew of the errors and their mean square.
+        overall: scores by horizon and target in report units, with skewness and mean square of the errors.
         by_recording: mean absolute error over targets of each recording, by horizon.
     """
 
@@ -80,7 +80,7 @@ def distributions(errors: Mapping[str, Errors], targets: Sequence[str]) -> dict[
     """Share of ticks by error, on edges that all methods have in common.
 
     Args:
-        errors: of each method, see `errors_of`.
+        errors: errors of each method, see `errors_of`.
         targets: names.
 
     Returns:

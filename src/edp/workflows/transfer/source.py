@@ -72,7 +72,7 @@ def read_source(path: str | Path, recordings: bool = True) -> SourceModel:
     """Read the source of a run folder, of the run that holds a bundle, or of a bundle alone.
 
     Args:
-        path: of the folder.
+        path: path of the folder.
         recordings: read what it was trained on, too.
 
     Raises:

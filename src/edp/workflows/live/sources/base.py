@@ -41,7 +41,7 @@ class Sink(Protocol):
         """Take a row, shape (channels,), SI units, NaN if missing; returns when the next one is due.
 
         Args:
-            row: of the source's channels.
+            row: row of the source's channels.
             missed: ticks that went by without a row before this one.
             trusted: whether rows come at the models' rate; they predict nothing where they do not.
             more: whether a further row waits already, of a source that cannot be steered; both are then shown at once.
@@ -73,11 +73,11 @@ class SourceOptions:
     """Options of a source from the user.
 
     Attributes:
-        value: of the source's option: a path, a machine, a task, a port.
+        value: value of the source's option: a path, a machine, a task or a port.
         map_file: signal map.
         machine: name or file, where it is not that of the source.
-        seed: of what is drawn; None for the source's own.
-        rate_hz: of a source that does not know its own; None takes that of the model.
+        seed: random seed; None for the default of the source.
+        rate_hz: sample rate for a source without its own; None for the rate of the model.
         settings: further values by name, as a source's `of` explains.
     """
 
@@ -101,8 +101,8 @@ class Needs:
     """Channels and rate that models read.
 
     Attributes:
-        channels: of all models, each once.
-        rate_hz: that they were trained at; None without a model.
+        channels: channels of all models, without duplicates.
+        rate_hz: sample rate of their training; None without a model.
         twin: channels of a twin among them.
     """
 
@@ -116,15 +116,15 @@ class LiveSource(ABC):
 
     Attributes:
         steered: whether it can be paused and run at another speed.
-        options: of the command line that apply to this source, without dashes.
-        preparing: what happens before the first row, in words; empty where that takes no time.
-        channels: of a row, in order, SI units.
+        options: command-line options that apply to this source, without dashes.
+        preparing: description of the work before the first row; empty if it takes no time.
+        channels: channels of a row, in order, SI units.
         rate_hz: rows a second.
-        text: what it is, in words.
-        ticks: how many there will be, None where nobody knows.
+        text: description in words.
+        ticks: number of rows; None if unknown.
         machine: name or file of a machine for the side view, None without one.
-        recording: that is played, None where none is.
-        ending: what to say when no more rows come.
+        recording: played recording; None without one.
+        ending: message at the end of the rows.
     """
 
     steered: ClassVar[bool] = True

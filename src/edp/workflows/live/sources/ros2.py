@@ -31,8 +31,8 @@ class Ros2Source(LiveSource):
     """A row at each message of joints, with the pressures that came last.
 
     Args:
-        channels: that are taken, by their names.
-        rate_hz: of the messages of joints.
+        channels: channels to take, by name.
+        rate_hz: rate of the joint messages.
         joints: topic of the joints; `pressures` likewise.
         pressures: see `joints`.
 

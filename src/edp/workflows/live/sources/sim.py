@@ -29,7 +29,7 @@ class SimSource(LiveSource):
     Args:
         machine: name, or path of a machine file.
         rate_hz: ticks per second.
-        seed: of the first episode.
+        seed: random seed of the first episode.
         settings: ``excitation``, ``faults`` (texts, see `edp.sim.faults`) and ``material``, where they are given.
         further: names of channels that are shown besides, where the simulator knows them.
 

@@ -37,9 +37,9 @@ class UdpSource(LiveSource):
     """Datagrams on a port; each one is a row with its names.
 
     Args:
-        port: to listen on.
-        rate_hz: of the rows.
-        channels: that are taken; None takes those of the first row.
+        port: port to listen on.
+        rate_hz: rate of the rows.
+        channels: channels to take; None for those of the first row.
         signal_map: columns and units to channels; None takes names as channels in SI units.
         host: address to listen on.
 
