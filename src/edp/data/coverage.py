@@ -31,7 +31,7 @@ CELLS = 6
 BINS = 24
 """Bins of each side of a joint histogram."""
 TAIL = 5e-4
-"""Share of the samples at either end that lies outside a joint histogram."""
+"""Fraction of the samples at either end that a joint histogram omits."""
 QUANTILES = 32
 """Bins of equal content for the mutual information."""
 INFORMED = 200_000

@@ -9,9 +9,10 @@ from edp.data.spectrum import FLAT_DB
 from edp.wording import typed
 
 OCCUPANCY = 0.9
-"""Share of the cells of the strokes that should be visited."""
+"""Target for the fraction of visited stroke cells."""
 BEYOND = 0.1
-"""Share of the tests that may lie beyond 95 % of the training; 5 % where both are alike."""
+"""Maximum fraction of test samples farther from the training data than 95 % of the training data; 5 % if both are
+alike."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from edp.recording import Recording
 from edp.signals import Channel, Kind
 
 SUFFIX = "_velocity"
-"""Behind the name of a position, for its change per second."""
+"""Suffix for the name of a position to name its change per second."""
 RATE_OF = {integral: velocity for velocity, integral in INTEGRAL.items()}
 """Kind of the change per second of a position, by its kind."""
 

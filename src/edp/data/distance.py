@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 REFERENCES, QUERIES = 20_000, 4_000
 """Samples searched in and searched for: distances shrink with the references, so both sides get equally many."""
 MOST_STATES = 1 << 20
-"""Of which some are drawn; beyond, states are thinned evenly first."""
+"""Maximum number of states to draw from. Longer data are thinned evenly first."""
 EARLIER_S = 0.2
 """Commands are looked at now and this long ago: the delay of a hydraulic axis."""
 

@@ -13,9 +13,11 @@ from edp.recording import Recording
 from edp.wording import typed
 
 LEAST_OF_SHARE = 0.25
-"""Of what the share of a part stands for: of 300 s and 4 s a draw of whole recordings let the 4 s train."""
+"""Minimum weight of a part relative to its fraction of the data. Without it, a draw of whole recordings of 300 s and 4
+s trained on the 4 s."""
 MOVES = 0.5
-"""Of the root-mean-square change of a channel, from which a tick counts as motion: steps of an encoder are less."""
+"""Fraction of a channel's root-mean-square change above which a sample counts as motion. Steps of an encoder are
+smaller."""
 BLOCKS, LEAST_GAPS = 15, 8
 """Blocks of a recording, three of which test, and gaps that one is long at least."""
 EVERY = 5

@@ -17,7 +17,7 @@ from edp.recording import Recording
 from edp.settings.bounds import SEED, check_bounds, shown
 
 SECOND_TEST_SET = "second test sessions"
-"""What ledgers call the second sealed test set of a search."""
+"""Name of the second sealed test set of a search in ledgers."""
 SHARED_SHARE, SHARED_ROWS = 0.2, 50
 """A recording is a piece of another one where so large a share of its different rows, and so many, stand in both.
 Rows of a machine at rest repeat, but are few among the different ones; sensors that move never repeat all channels."""

@@ -16,7 +16,7 @@ LEAST_TICKS = 5
 TOLD = 0.9
 """Correlation from which the two say the same; below it noise, drift or another actuator may be the reason."""
 LOW, HIGH = 0.8, 1.25
-"""What the ratio may be: wide enough for sensors that are not calibrated, too narrow for any mistake of a unit."""
+"""Accepted range of the ratio: wide enough for uncalibrated sensors, too narrow for any mistake of a unit."""
 
 Rows = NDArray[np.floating]
 

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 MOST_LISTED = 1 << 24
 """Things whose order is a list of 8 bytes each, 128 MB; 46 hours of windows at 100 Hz."""
 ROUNDS = 6
-"""Of the network; four make it indistinguishable from chance for ideal functions (Luby and Rackoff, 1988)."""
+"""Number of rounds of the network. Four make it indistinguishable from random for ideal functions (Luby and Rackoff,
+1988)."""
 Numbers = NDArray[np.int64]
 
 

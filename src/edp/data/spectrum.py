@@ -12,9 +12,10 @@ LAGS = 50
 """Block rows of the Hankel matrix: the window of 50 samples that the thesis's networks read."""
 LAG_STEPS = (1, 2, 3, 5, 8, 12, 16, 20, 25, 30, 35, 40, 45, 50)
 FLAT_DB = 10.0
-"""How far below its maximum a spectrum still counts as flat."""
+"""Maximum attenuation below the maximum of a spectrum that counts as flat."""
 USED_HZ = 4.0
-"""Up to here an excavator's axes answer their commands; slower logs are judged up to 0.4 of their rate."""
+"""Frequency up to which the axes of an excavator follow their commands. Slower logs are evaluated up to 0.4 of their
+rate."""
 SEGMENT_S = 10.24
 """Length of Welch's segments: a tenth of a hertz at any rate."""
 

@@ -20,13 +20,13 @@ from edp.wording import setting_text, typed
 
 PARTS = ("train", "validation", "test")
 PART = below(0.0, 1.0)
-"""Share of a data set that is set apart; all of it would leave nothing to train on."""
+"""Fraction of a data set for test or validation. The whole data set would leave no training data."""
 MOST_BLOCK_S = 31_557_600.0  # a year
 MOST_MASS_T = 10_000.0  # the largest excavator weighs about a tenth of this
 FAMILY = "excitation"
-"""Where the meta of a simulated recording says how it was driven."""
+"""Key of the driving task in the metadata of a simulated recording."""
 MASS = "mass_t"
-"""Where the meta says the mass of the machine, where that is known."""
+"""Key of the machine's mass in the metadata, if known."""
 
 
 @dataclass(frozen=True)

@@ -27,9 +27,9 @@ class TargetMode(StrEnum):
 
 
 CHECKED_ROWS = 65_536
-"""Of a block whose values are checked at a time: what is kept of a recording on disk does not all come into memory."""
+"""Number of rows per block of checked values, so that recordings on disk need little memory."""
 MOST_RATE_HZ = 1e6
-"""Of any sensor of a machine; faster clocks count something else."""
+"""Maximum sample rate of a sensor. Faster clocks count something else."""
 
 
 class Ends(Protocol):

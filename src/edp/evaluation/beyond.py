@@ -15,7 +15,7 @@ from edp.evaluation.free_run_file import CommandExcess
 from edp.wording import figure
 
 MARGIN = 0.02
-"""Share of a command's range by which it may leave that range: noise of its sensor."""
+"""Fraction of a command's range by which the command may leave that range, for sensor noise."""
 RANGES = "command_ranges"
 """Key of the ranges in the provenance of a twin."""
 

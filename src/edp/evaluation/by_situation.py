@@ -21,13 +21,14 @@ from edp.stats.sketch import QuantileSketch
 Values = NDArray[np.float64]
 Ticks = NDArray[np.bool_]
 SITUATIONS = ("rest", "starting", "stopping", "reversing", "fast", "dead_band", "end_stop", "other")
-"""In the order of tables. All but `other`, which is none of them, may hold at the same tick."""
+"""Situations in the order of tables. A sample may belong to several of them; `other` is a sample without a
+situation."""
 FAST = 0.5
-"""Share of the fastest speed from which an axis is fast."""
+"""Fraction of the maximum speed above which an axis is fast."""
 NEAR_STOP = 0.05
-"""Share of a stroke: as near to an end as that is where cushions act (docs/simulator.md: 4 to 6 %)."""
+"""Fraction of a stroke: distance from its ends within which cushions act (docs/simulator.md: 4 to 6 %)."""
 DEAD_BAND = 0.15
-"""Share of the largest command: spools open at 12 to 17 % in the machine files, and begin slowly."""
+"""Fraction of the largest command: spools open at 12 to 17 % in the machine files, and slowly at first."""
 FASTEST = 0.995
 """Quantile of speeds that stands for the fastest: beyond it are single events."""
 

@@ -34,9 +34,9 @@ from edp.wording import figure
 
 Array = NDArray[np.float32]
 MOST_SECONDS = 86_400.0
-"""Of a free run: a day."""
+"""Maximum length of a free-run simulation: one day."""
 ASTRAY = 0.5
-"""Share of a stroke's range; a run whose stroke is further off than that counts as diverged."""
+"""Fraction of the stroke range; a run with a larger stroke error counts as diverged."""
 AT_FULL_SPEED_S = 1.0
 """Motion at the largest speed that counts as a range where no stroke is measured."""
 SHORTER = (2, 4, 8)

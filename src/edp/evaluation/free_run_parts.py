@@ -26,9 +26,9 @@ from edp.signals import KINDS, Channel
 
 Array = NDArray[np.float32]
 AT_STOP = 0.01
-"""Share of a stroke: as near to an end stop as that, an actuator is at it."""
+"""Fraction of a stroke: distance from an end stop within which an actuator is at the stop."""
 AT_REST = 0.01
-"""Share of the fastest velocity of a twin: an actuator that is slower, and at no end stop, stands still."""
+"""Fraction of a twin's maximum velocity below which an actuator stands still, unless it is at an end stop."""
 HORIZONS_A_DECADE = 6
 """Points of an error over the horizon: a line on a page with a logarithmic axis needs no more."""
 

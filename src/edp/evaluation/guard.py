@@ -32,16 +32,16 @@ NETWORK = "network"
 TWIN = "twin"
 TWIN_ADVICE = "take that floor by twin.kind, another formulation, or more recordings with more motion"
 MACHINE, GREY = "identified machine", "grey box"
-"""What an identification is judged as, and what it was made of."""
+"""Names of the result and of the reference of an identification."""
 MACHINE_ADVICE = "more rounds or starts of the fit (twin.fit), a nearer --machine, or more recordings with more motion"
 MEASURE = "rmse"
-"""By which models are compared: here, in headlines and in tables. Trainings minimise squares, the preset auto chooses
-and promises by them, published floors state them; and of a machine that mostly rests the mean absolute error is decided
-by ticks at rest, of which persistence is exactly right."""
+"""Metric for comparing models, here, in headlines and in tables. Trainings minimise squared errors, the preset auto
+selects and promises by them, and published references state them. The mean absolute error of a machine that mostly
+stands still depends on samples at rest, which persistence predicts exactly."""
 MEASURE_NAME = "RMSE"
 ADVICE = "train with the preset auto, or on more recordings"
 LEAST = 1e-3
-"""Share of error below which two models count as equal: rounding and threads make as much."""
+"""Relative difference of errors below which two models count as equal. Rounding and threads cause as much."""
 
 
 BEATEN = 6

@@ -39,7 +39,7 @@ from edp.storage.memory import check_setting
 Predictions = list[NDArray[np.float32]]
 B = TypeVar("B", bound=Baseline)
 KEPT_RECORDINGS, KEPT_TICKS = 6, 60_000
-"""Of which predictions are kept for pictures: ten minutes at 100 Hz are more than one can show."""
+"""Maximum number of recordings and samples whose predictions are stored for pictures: ten minutes at 100 Hz."""
 SHOWN_MODELS = ("network", "ridge_arx")
 MOST_VALIDATED = 1 << 20
 """Ticks of the validation part that baselines are judged on, about; three hours at 100 Hz."""

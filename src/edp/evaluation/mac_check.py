@@ -24,7 +24,7 @@ MATRIX = {"mm": 0, "bmm": 0, "mv": 0, "dot": 0, "addmm": 1, "baddbmm": 1, "addbm
 MOVES = {"cat", "stack", "index", "index_put", "copy", "gather"}
 """Operations on several tensors that only move numbers."""
 ARITHMETIC = {"mul", "div", "sqrt", "pow", "reciprocal", "exp", "sin", "cos"}
-"""What counts in a physics base, which is arithmetic only; sums and choices do not."""
+"""Operations counted in a physics base, which is arithmetic only. Sums and selections do not count."""
 
 
 class Trace(TorchDispatchMode):

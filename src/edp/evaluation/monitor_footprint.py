@@ -44,7 +44,7 @@ hand from the operations of the code, unlike those above."""
 DETECTOR = {"cusum": 2.0, "ewma": 2.5, "glr": 2.0, "separate_cusums": 2.5}
 """Products in double precision that take as long as a direction in a detector; of the likelihood ratio a length."""
 CENTRE, VERDICT, POINT = 0.5, 0.6, 4.0
-"""The same of a summary centred for a watch, a summary in a verdict, and a number of the operating point."""
+"""Cycles per summary centred for a watch, per summary in a verdict, and per value of the operating point."""
 CHAIN_PROGRAM_BYTES = 9_000
 """Code of the chain, its runtime and the double precision of the compiler's library on a Cortex-M4F."""
 

@@ -20,7 +20,7 @@ Metrics = Mapping[str, float | int | None]
 ByTarget = Mapping[str, Metrics]
 """Metrics of each target, and of `MEAN`."""
 ByHorizon = Mapping[str, ByTarget]
-"""By horizon in samples, as text."""
+"""Values by horizon in samples, as text."""
 Means = Mapping[str, float]
 """A value of each target, and of `MEAN`."""
 PREDICTIONS = "predictions.safetensors"

@@ -12,12 +12,12 @@ from edp.data.series import Series
 from edp.evaluation.scores_file import DataSituation, OutsideRange, TargetChange
 
 MARGIN = 0.01
-"""Of the range in training, by which a value must leave it: sensors are noisy."""
+"""Fraction of the training range by which a value must leave it, because sensors are noisy."""
 LEAST_SHARE = 0.05
-"""Of the ticks that lie outside of the range in training before it is said. The two of seven
-measured sets with 1 and 3 % of such ticks kept their promises as well as others."""
+"""Minimum fraction of samples outside the training range for a warning. Two of seven measured data sets have 1 and 3 %
+of such samples, and their expected errors were as accurate as the others."""
 LEAST_BEYOND = 0.005
-"""Of the changes that are larger than any in training before it is said: a few decide a root-mean-square error."""
+"""Minimum fraction of changes larger than any training change for a warning: a few decide a root-mean-square error."""
 LEAST_RATIO = 2.0
 """Times that targets change more, or less, than in training before it is said."""
 

@@ -14,7 +14,7 @@ from edp.networks.twin import Twin, even_starts
 from edp.signals import KINDS, Channel
 
 LENGTH_S = 2.0
-"""Of a response: a hydraulic axis has settled by then."""
+"""Length of a response, within which a hydraulic axis settles."""
 MOMENTS, MOST_STARTS = 24, 8
 """Steps of which the middle is shown, and of one recording."""
 POINTS, MOST_COMMANDS = 100, 12

@@ -13,7 +13,7 @@ from edp.storage.ledger import Ledger, Record, TrainingIdentity, TrainingStatus
 START = "start"
 # Two restarts tell bad luck from a fault of the training itself.
 RETRIES = 2
-"""How often a training whose process was killed starts again before it counts as lost."""
+"""Number of restarts of a training whose process was killed, before it counts as lost."""
 
 
 @dataclass(frozen=True)

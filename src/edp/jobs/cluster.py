@@ -36,7 +36,7 @@ HOUR_S = 3600.0
 # Five seconds: Ray itself tries for minutes where nothing answers (docs/findings.md).
 PROBE_S = 5.0
 _pool: dict[int, LocalPool] = {}
-"""Of a process of Ray, which does one training after the other: its worker stays warm between them."""
+"""Pool of a Ray process, which runs one training after the other. Its worker stays warm between them."""
 
 
 class RayPool(ClosedAtExit):

@@ -25,10 +25,10 @@ from edp.storage.ledger import (
 )
 
 CLAIM_WAIT_S = 10.0
-"""For how long a worker waits for the claim of another one, such as that of a pool that was killed a moment ago."""
+"""Maximum time for which a worker waits for the claim of another worker, such as that of a pool killed a moment ago."""
 SHOWN_TRACE = 4000
 BEGUN = b"begun"
-"""What a worker sends before the function of a job is called."""
+"""Message that a worker sends before the function of a job is called."""
 
 
 def perform(

@@ -38,7 +38,7 @@ TICK_S = 0.1
 """Interval of checks of the memory of a training; without a cap the pool sleeps until something happens."""
 # Five minutes: imports of torch on a busy machine take their time, and a cap must not end them.
 START_S = 300.0
-"""What a process may take until the function of its training is called."""
+"""Maximum time until a process calls the function of its training."""
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 SHOWN_OUTPUT = 2000
 PAGE = os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 4096

@@ -21,7 +21,7 @@ MOST_REQUEST = 256
 MOST_PAST = 12_000
 """Rows of one answer: two minutes at 100 Hz."""
 REQUESTS = {"past": ("first", "count"), "pause": ("value",), "speed": ("value",), "ahead": ("tick",)}
-"""What a page may ask for, with its numbers. Nothing here reaches a machine, a disk or a setting."""
+"""Requests of a page with the names of their numbers. None of them reaches a machine, a disk or a setting."""
 
 
 @dataclass(frozen=True)

@@ -28,12 +28,12 @@ from edp.live.session import LiveSession
 from edp.live.viewer import SEND_BUFFER, Viewer
 
 FLUSH_S = 0.04
-"""Between messages of rows: 25 pictures a second, and at most as much of the lag."""
+"""Time between messages of rows: 25 pictures per second, and at most this delay."""
 STATE_S = 1.0
 MOST_ROWS = 3000
-"""Of one message; a source that runs ahead leaves out what nobody could watch, which is counted and shown."""
+"""Maximum number of rows per message. A faster source omits rows; the page counts and shows them."""
 BACKLOG_S = 30.0
-"""Of rows that a new viewer gets at once."""
+"""Length of the rows that a new viewer receives at once."""
 MOST_AHEAD_S = 600.0
 MOST_VIEWERS = 32
 MOST_BREAKS = 50

@@ -15,7 +15,7 @@ from edp.live.layout import LiveLayout
 
 Rows = NDArray[np.float32]
 HISTORY_BYTES = 64 << 20
-"""Of rows that are kept: 46 minutes of 60 columns at 100 Hz."""
+"""Maximum size of the stored rows: 46 minutes of 60 columns at 100 Hz."""
 MOST_EVENTS, MOST_TEXT = 500, 400
 """Events that are kept, and characters of one."""
 KINDS = ("note", "warning", "alarm")

@@ -20,7 +20,7 @@ from edp.settings.bounds import above, shown
 from edp.signals import UNITS, VOCABULARY, Kind, SignalMap
 
 RATE = above(0.0, 1e9)
-"""Of samples in Hz: clocks of logs count nanoseconds."""
+"""Range of sample rates in Hz; clocks of logs count nanoseconds."""
 IN_MEMORY = "memory"
 """Source of a recording that came from no file."""
 

@@ -24,9 +24,9 @@ from edp.wording import typed
 _CACHED_ROWS = 4096
 """Rows written at a time: blocks of 1,000 to 4,000 are fastest, 500 or 8,000 take 1.5 to 2 times as long (findings)."""
 _MOST_EMPTY = 0.5
-"""Share of a log that may be left out since a channel has no value yet."""
+"""Maximum fraction of a log that is omitted because a channel has no value yet."""
 _TICK_BYTES = 25
-"""What the time rule takes a tick: its time, its row and whether it is missing."""
+"""Memory per sample for the time rule: time, row and gap flag."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,8 @@ from edp.wording import typed
 ADDRESS = re.compile(r"(s3|gs|az):/{1,2}([^/]+)(?:/(.*))?", re.DOTALL)
 """A path object leaves one of the two slashes."""
 CONNECT_S, ANSWER_S, STEP_S = 10.0, 30.0, 120.0
-"""To connect, for the answer to a request, and for a step (a listing, or a piece of an object) with its repetitions."""
+"""Time limits to connect, for the answer to a request, and for a step (a listing, or part of an object) with its
+retries."""
 ATTEMPTS = 3
 PIECE_BYTES = 8 * 2**20
 MOST_OBJECTS = 1_000_000
@@ -35,7 +36,7 @@ HELP = {
     "gs": "GOOGLE_APPLICATION_CREDENTIALS; STORAGE_EMULATOR_HOST for another server",
     "az": "AZURE_STORAGE_ACCOUNT and AZURE_STORAGE_KEY, or a login of az; AZURE_STORAGE_ENDPOINT for another server",
 }
-"""Where each service looks for credentials."""
+"""Locations of the credentials of each service."""
 Result = TypeVar("Result")
 
 
@@ -194,7 +195,7 @@ REFUSED = re.compile(
     r"ACCESS_?DENIED|PERMISSION_DENIED|FORBIDDEN|(?<![0-9A-Z:])40[13](?![0-9])|UNAUTHORIZED|AUTHORIZATION|"
     r"AUTHENTICATION|INVALID_?ACCESS_?KEY|SIGNATURE|CREDENTIALS"
 )
-"""What services call a refusal."""
+"""Codes of services for a refusal."""
 
 
 def _file_system(scheme: str, environment: Mapping[str, str] = os.environ) -> Any:

@@ -24,9 +24,9 @@ from edp.wording import typed
 TEXT = (".txt", ".dat")
 """Endings that logs share with other files: taken where a folder holds no logs of other endings."""
 _MOST_FILES = 10_000
-"""Of a folder without logs, files whose endings are looked at."""
+"""Maximum number of files in a folder without logs whose endings are examined."""
 RATE_TOLERANCE = 1e-3
-"""Share by which rates of logs of one data set may differ: loggers state the same rate with different digits."""
+"""Relative tolerance between the rates of logs in one data set. Loggers state one rate with different digits."""
 
 
 def read_recording(

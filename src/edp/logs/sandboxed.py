@@ -31,7 +31,7 @@ WORKER = "edp.logs.sandbox_worker"
 AHEAD = 2
 """Pieces asked for at a time: the next one is read while the last is worked on."""
 _NUMBER_BYTES = 8
-"""Most bytes of a number, in which answers are counted before they come."""
+"""Maximum size of a number in bytes, to predict the size of results."""
 _KINDS: Mapping[str, type[EdpError]] = {kind.__name__: kind for kind in (DataError, ConfigError, StorageError)}
 
 

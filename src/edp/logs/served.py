@@ -30,16 +30,16 @@ from edp.signals import ChannelMap, Kind, SignalMap
 from edp.storage.memory import announce
 
 MESSAGE_BYTES = 1 << 24
-"""Of the numbers of one message; larger pieces are sent in parts."""
+"""Maximum size of the numbers in one message. Larger parts are divided."""
 BAGS = ("mcap", "rosbag1", "rosbag2")
 """Formats whose library tells them by the suffix of the path."""
 _TEXT = 4000
 """Longest message about what is wrong; its end, which says what to change, is kept."""
 _END = 500
 _STAMP_BYTES = 128
-"""What a time stamp takes while it is collected, message by message."""
+"""Memory for a time stamp while it is collected message by message."""
 _KEPT_BYTES = 24
-"""What a wanted value takes where a format must keep whole columns, which it does up to `_KEPT_MOST`."""
+"""Memory for a selected value in formats that store whole columns, up to `_KEPT_MOST`."""
 _KEPT_MOST = 3 << 29
 
 

@@ -38,11 +38,11 @@ LATEST_SECONDS = 1e11
 SHORTEST_STEP_S = 1e-9
 """Clocks count nanoseconds."""
 _SAME_TICK = 1e-6
-"""Share of a tick by which a stamp may be late through rounding."""
+"""Fraction of a sample interval by which rounding may delay a stamp."""
 _EVEN = 1e-4
-"""Share of a step below which all distances from a line are rounding."""
+"""Fraction of a step below which distances from a line count as rounding."""
 _REPEATED = 0.3
-"""Share of rows that repeat a stamp, from which the clock is coarser than the rows."""
+"""Fraction of rows with repeated stamps above which the clock is coarser than the rows."""
 _MOST_REPEATS = 1000
 """Rows that one stamp may stand for."""
 _MIN_ROLLOVERS = 5

@@ -21,7 +21,7 @@ LANES = 48
 """Limits that one pass over the sessions tries; three passes place a limit to 1 in 1e5 of the range."""
 PASSES = 3
 LEAST_PART = 1e-6
-"""Of an alarm: parts below it are rounding of the division."""
+"""Minimum part of an alarm. Smaller parts are rounding of the division."""
 MOST_HOURS = above(0.0, 1e6)
 
 

@@ -13,15 +13,16 @@ from edp.errors import DataError
 
 Array = NDArray[np.float64]
 POINT_LIMIT = 3.0
-"""Of levels and sizes in healthy standard deviations: beyond it nothing was seen, and lines must not run on."""
+"""Limit of levels and sizes, in healthy standard deviations. Regression lines are constant beyond it."""
 RIDGE = 1e-3
-"""Share of the rows that is added below the regression: operating points that never vary alone."""
+"""Ridge penalty per row: operating points that never vary alone."""
 TRIMMED = 4.0
 """Residuals of the regression in robust deviations, beyond which a row does not count in the second round."""
 GROSS = 1e3
 """Largest size of a conditioned summary where gross deviations are to be told from large ones."""
 LEAST_WIDTH = 0.3
-"""Of the usual width: where the line for the width falls below this share, the share is taken."""
+"""Minimum width relative to the usual width, for operating points at which the regression for the width falls below
+it."""
 
 
 @dataclass(frozen=True, eq=False)

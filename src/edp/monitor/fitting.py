@@ -33,9 +33,9 @@ from edp.signals import Channel
 
 Array = NDArray[np.float64]
 LEAST_SESSIONS = 4
-"""For conditioning and limits."""
+"""Minimum number of sessions for conditioning and limits."""
 NO_FOLD = -1
-"""In place of the number of a fold: nothing is left out."""
+"""Index of a fold when no fold is left out."""
 
 
 def default_watches() -> tuple[WatchSpec, ...]:

@@ -22,12 +22,12 @@ Array = NDArray[np.float64]
 FIRST_S = 120.0
 """Start of a log whose means are compared with those of healthy sessions, s."""
 LEAST_THERE = 0.5
-"""Share of it in which a balance must be there."""
+"""Minimum fraction of the log in which a balance must be available."""
 OFF = 3.0
 """Healthy deviations of such a mean beyond which an axis is off. Of 65 healthy sessions the axis that is off least
 reaches 2.5, of sister machines within 1 % 2.9 to 15."""
 LEAST_AXES = 2
-"""Of one axis a fault says the same."""
+"""Minimum number of axes: one axis alone may have a fault."""
 
 
 def scatter_of(chain: MonitorChain, sessions: Sequence[SessionBlocks], block_s: float) -> Array:

@@ -35,7 +35,7 @@ OTHER_MACHINE = 6.0
 IMPOSSIBLE = 1e5
 """Healthy deviations beyond which a value is a broken number, as exported code takes it."""
 OTHER_SHARE = 0.25
-"""Of the channels: where more than these are beyond `OTHER_MACHINE`, the log is not of this machine."""
+"""Fraction of the channels beyond `OTHER_MACHINE` above which the log is of another machine."""
 
 
 @dataclass(frozen=True, eq=False)

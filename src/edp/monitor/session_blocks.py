@@ -22,7 +22,7 @@ LEVELS = (Kind.PRESSURE, Kind.TEMPERATURE, Kind.POSITION, Kind.ANGLE, Kind.RATIO
 MOST_POINT = 24
 """Channels of an operating point; of more, those that vary most between blocks are taken."""
 LEAST_TICKS = 10
-"""Of a block: spreads of fewer say nothing."""
+"""Minimum length of a block in samples. Spreads of fewer samples are meaningless."""
 
 
 @dataclass(frozen=True, eq=False)

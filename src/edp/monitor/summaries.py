@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 SUMMARIES = ("mean", "spread", "gain", "lag", "peak")
-"""Of each residual and block, in this order, and behind them one for each driver."""
+"""Summaries of each residual and block, in this order, followed by one for each driver."""
 MOST_DRIVERS = 8
 NEAR_ZERO = 0.05
 """Variance in healthy units that is added below `gain` and `lag`: a channel at rest tells neither."""

@@ -242,10 +242,11 @@ def scaled_alike(specs: Sequence[WatchSpec], watches: Sequence[Watch], sessions:
 
 
 ROWS_AT_ONCE = 64
-"""Of a view: their sums stay in the processor's cache."""
+"""Number of rows of a view at a time, so that their sums stay in the processor's cache."""
 LEAST_ROWS = 16
-"""Of averages that a covariance is taken of; the diagonal that is mixed in stands for what they do not tell."""
+"""Minimum number of averages for a covariance. A diagonal is added to represent what they do not determine."""
 LEAST_GROSS = 3.0
 """Healthy deviations: a summary that never strayed further is not gross before that."""
 EAGER = 3
-"""Of the largest statistics of healthy sessions, which one makes watches equal: near the limit, where tails differ."""
+"""Rank of the healthy session's statistic, from the largest, by which watches are scaled: near the limit, where tails
+differ."""

@@ -12,7 +12,7 @@ from edp.errors import DataError
 
 Array = NDArray[np.float64]
 LEAST_SHARE = 1e-9
-"""Of the largest variance: directions below it are rounding of residuals that follow from others."""
+"""Fraction of the largest variance below which a direction is rounding of linearly dependent residuals."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,7 +33,7 @@ class ActivationSpec(Protocol):
 
 ACTIVATIONS: Registry[type] = Registry("activation")
 AMPLITUDE = above(0.0, 1000.0)
-"""In standard deviations of the target: beyond a few tens tanh is a straight line over all that occurs."""
+"""Range in standard deviations of the target. Beyond a few tens tanh is linear over all values that occur."""
 
 
 @ACTIVATIONS.register("identity")

@@ -21,7 +21,7 @@ from edp.networks.running import mean_error
 from edp.networks.streaming import State
 
 JUDGED_TICKS = 200_000
-"""On about so many the format of the inputs is chosen: what a finer one clips is rare."""
+"""Approximate number of samples for choosing the input format. Values that a finer format would clip are rare."""
 
 
 class IntegerPredictor(Predictor):

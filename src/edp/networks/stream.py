@@ -29,7 +29,7 @@ class StreamStatus(IntEnum):
     OK = 0
     """A prediction from this tick's inputs."""
     WARMING = 1
-    """The same, from fewer ticks than a whole window since the last reset: less accurate."""
+    """Status after fewer samples than a whole window since the last reset: less accurate."""
     HELD = 2
     """Inputs were rejected or missed: a prediction from the last accepted ones."""
     RESTARTED = 3

@@ -14,7 +14,7 @@ from edp.ir.builder import indices
 from edp.networks.streaming import Cost, State, Streaming
 
 MOST_TREES = 2000
-"""For each predicted number; boosting at a rate of 0.05 ends far below."""
+"""Maximum number of trees per predicted value. Boosting at a rate of 0.05 ends far below."""
 MOST_DEPTH = 8
 """256 leaves a tree: 768 numbers, 2.5 KB of flash."""
 BLOCK = 2**20

@@ -34,11 +34,12 @@ RESERVED_BYTES = 4 << 30
 START_S = 5.0
 """Processor time for any request."""
 BYTES_PER_S = 1e6
-"""Of the file: well below the speed of a slow computer, since a refused sound log is worse than a late refusal."""
+"""Assumed reading speed: well below that of a slow computer, since refusing a valid log is worse than a late
+refusal."""
 WORK_PER_S = 2e6
 VALUES_PER_S = 1e6
 PART_S = 0.01
-"""Of an object that is walked: one of MAT v7.3 takes some 1.3 ms on a busy machine (findings)."""
+"""Time allowance per object of a file. An object of MAT v7.3 takes about 1.3 ms on a busy machine (findings)."""
 WALL = 12
 """Longest time by the clock, in allowed processor times: a process may also wait for ever."""
 MOST_S = 1e6

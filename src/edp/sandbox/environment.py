@@ -36,7 +36,7 @@ BUILD_NAMES = frozenset(
         "ROS_PYTHON_VERSION", "ROS_DOMAIN_ID", "OCTAVE_HOME", "OCTAVE_EXEC_HOME", "WINEPREFIX",
     )
 )  # fmt: skip
-"""What compilers, ROS 2 and Octave need in addition."""
+"""Additional variables for compilers, ROS 2 and Octave."""
 
 
 def reduced_environment(further: Iterable[str] = ()) -> Mapping[str, str]:

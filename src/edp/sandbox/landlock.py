@@ -22,9 +22,9 @@ _PATH_BENEATH = 1
 _NO_NEW_PRIVILEGES = 38
 _READ_FILE, _READ_DIR = 1 << 2, 1 << 3
 _FILE_RIGHTS = {1: 13, 2: 14, 3: 15, 5: 16}
-"""From which version on, how many rights on files there are; a kernel refuses bits that it does not know."""
+"""Number of file rights by the version that introduced them. A kernel refuses unknown bits."""
 _NET_FROM, _NET_RIGHTS = 4, 2
-"""To bind and to connect TCP sockets."""
+"""Version and number of the rights to bind and to connect TCP sockets."""
 _SCOPE_FROM, _SCOPES = 6, 3
 """Abstract sockets and signals of processes outside."""
 

@@ -34,7 +34,8 @@ _SYSTEM = (
     "/sys/devices/system/cpu", "/sys/devices/system/node", "/sys/fs/cgroup",
     "/sys/kernel/mm/transparent_hugepage",
 )  # fmt: skip
-"""What Python and its libraries read of the system: themselves, time zones, and how many processors there are."""
+"""Files and folders of the system that Python and its libraries read: libraries, time zones and the number of
+processors."""
 _LIBRARIES = {"site-packages", "dist-packages"}
 
 

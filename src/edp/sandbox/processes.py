@@ -11,7 +11,7 @@ import time
 
 PR_SET_PDEATHSIG = 1
 LOOK_S = 0.5
-"""Between checks of the parent, where the system does not tell of its end."""
+"""Time between checks of the parent process on systems that do not report its end."""
 
 
 def die_with_parent(parent: int) -> None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from edp.storage.reading import Table
 
 HEADER_BYTES = 1 << 28
-"""Of the JSON of one message: names and descriptions of all columns of a log."""
+"""Maximum size of the JSON in a message: names and descriptions of all columns of a log."""
 _LENGTH = struct.Struct("<Q")
 _NUMBERS = re.compile(r"[<>|]?(?:f[248]|[iu][1248]|b1)")
 """Plain numbers of at most eight bytes: no objects, which would be pickled, and no structures."""

@@ -31,9 +31,9 @@ PIPE_BYTES = 1 << 20
 SMALL_BYTES = 4096
 """A request that any pipe takes at once."""
 SLOW_S = 5.0
-"""After so long the watcher is informed what is being read."""
+"""Reading time after which the watcher is informed."""
 REPORT_S = 1
-"""At least so long between two words to the watcher."""
+"""Minimum time between two reports to the watcher."""
 # A fork of a process with threads may hang, so the worker's libraries get one each.
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 _SMALL_POOL = {"MIMALLOC_ARENA_RESERVE": "65536"}

@@ -26,11 +26,12 @@ from edp.sandbox.lockdown import note_libraries
 from edp.sandbox.processes import die_with_parent
 
 IDLE_S = 60.0
-"""After so long without a log the process ends; the next log starts another."""
+"""Idle time after which the process ends. The next log starts another process."""
 END_S = 5.0
 """Time for a process whose pipes are closed to end, before it is killed."""
 KEPT_CODES = 1024
-"""Of forks that nobody asks about: a data set of thousands of logs must not grow the list without end."""
+"""Maximum number of stored exit codes of forks, so that a data set of thousands of logs does not grow the list without
+end."""
 ORDER_BYTES = 1 << 16
 """Read at once; longer orders come in several pieces."""
 Serve = Callable[[int, int], None]

@@ -14,7 +14,7 @@ from edp.stats.checks import Array, Mask
 MOST_RUNS = 256
 """Trainings of one screening; the search for columns grows with the third power of the factors."""
 INTERACTION = 0.03
-"""Share of a run's variance that each interaction is taken to have when errors are weighed against aliases."""
+"""Assumed fraction of a run's variance per interaction, to weigh errors against aliases."""
 PASSES = 12
 """Rounds of exchanges; a design of 14 factors in 32 runs settles in fewer."""
 

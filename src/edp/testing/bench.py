@@ -13,7 +13,7 @@ from edp.networks.twin.greybox import GreyBox
 from edp.signals import Channel, Kind
 
 LOWEST, HIGHEST = (-0.5, 0.0, 0.0, 0.0, 1e6), (0.5, 1.0, 2e7, 2e7, 2e7)
-"""Of speed, stroke, chamber and pump pressures, SI units: what scales are taken from."""
+"""Ranges of speed, stroke, chamber and pump pressures, SI units, from which scales are taken."""
 
 
 def bench_channels(lever: str = "lever", description: str = "") -> TwinChannels:

@@ -21,7 +21,8 @@ from edp.training.twin_bundle import TwinBundle
 WAYS = ("combined", "isolated", "end_stops")
 SECONDS = 40.0
 PULL, CALM = 0.3, 0.2
-"""Of a recurrent twin that nobody trained: share of the way to its map in a tick, and what its memory adds."""
+"""Pull and memory of an untrained recurrent twin: fraction of the way to its map per sample, and contribution of its
+memory."""
 
 
 def sample_excavator_twin(machine: str = "M22", kind: str = "static") -> Twin:

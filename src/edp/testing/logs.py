@@ -20,7 +20,7 @@ from edp.testing.expectations import ContractError, expect
 # Whole, odd and slow rates, and one whose period no decimal fraction holds.
 RATES_HZ = (100.0, 50.0, 128.98, 0.25, 1000.0 / 3.0)
 HEAD_BYTES = 4096
-"""Of a file, by which `LogFormat.claims` tells its own."""
+"""Number of bytes of a file by which `LogFormat.claims` recognises its format."""
 
 
 def sample_recording(rate_hz: float = 100.0, ticks: int = 400) -> Recording:

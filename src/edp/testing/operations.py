@@ -32,7 +32,8 @@ ALLOWED = {
     "sin": {Operation.SINE},
     "cos": {Operation.SINE},
 }
-"""Which declarations allow an operation of PyTorch; double precision keeps recurrent layers off the fused kernels."""
+"""Declarations that permit an operation of PyTorch. In double precision, recurrent layers do not use the fused
+kernels."""
 FREE = {
     *("_reshape_alias", "_to_copy", "_unsafe_view", "alias", "cat", "clone", "constant_pad_nd", "copy", "detach"),
     *(

@@ -98,7 +98,7 @@ RUN_FORMS: Mapping[str, RunForm] = {
         follows=True,
     ),
 }
-"""By name; a further form of a run is one entry."""
+"""Forms of a run by name."""
 
 
 def all_forms() -> dict[str, str]:

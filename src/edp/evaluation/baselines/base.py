@@ -34,9 +34,9 @@ class Baseline(ABC):
     """
 
     label: ClassVar[str]
-    """How tables and pictures call it."""
+    """Name in tables and pictures."""
     effort: ClassVar[int] = 2
-    """How long it takes to fit, beside others: 0 for nothing; the judge begins with the least."""
+    """Relative fitting time; 0 for none. The evaluation begins with the fastest baseline."""
 
     def __init__(self, task: BaselineTask) -> None:
         self.task = task

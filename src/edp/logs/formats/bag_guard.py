@@ -63,7 +63,7 @@ def definitions_of(text: Any, message_type: str) -> Definitions | None:
 
 
 DISTRIBUTION = "ros2_humble"
-"""Whose message types stand in where a bag holds no definitions."""
+"""Set of message types for bags without definitions."""
 
 
 def open_reader(path: Path) -> Any:

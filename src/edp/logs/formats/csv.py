@@ -39,11 +39,11 @@ from edp.recording import Recording
 from edp.signals import TIME_UNITS, UNITS, SignalMap
 
 _HEAD_BYTES = (1 << 18, 1 << 22, 1 << 26)
-"""How much of a file is looked at for its header: more where comments or the header itself are longer."""
+"""Sizes of the examined head of a file. Longer comments or headers need the larger ones."""
 _MOST_CELLS_LOOKED = 200_000
 """Cells in which the layout is looked for; wide tables need fewer rows."""
 _DELIMITERS = (",", ";", "\t", "|")
-"""In the order in which a tie is decided."""
+"""Delimiters in the order in which a tie is decided."""
 _BLANKS = " "
 """Delimiter of columns that any number of blanks parts; only where no other one makes columns."""
 _NAME_UNIT = re.compile(r"^(?P<name>.*?)\s*(?:\[(?P<square>[^\]]*)\]|\((?P<round>[^)]*)\))$")

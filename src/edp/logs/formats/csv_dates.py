@@ -16,7 +16,7 @@ _AMERICAN = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})[ T]+(\d.*\d) ?([AP])M", re.
 _YEAR_FIRST = re.compile(r"(\d{4})[/.-](\d{1,2})[/.-](\d{1,2})(?:[ T]+(\d.*))?")
 """``2025/1/31 13:00:00.5``: who writes the year first writes the day last."""
 _MIDNIGHT = "1970-01-01"
-"""Of times of day without a date: only their differences count."""
+"""Date for times of day without a date, of which only differences count."""
 
 
 def dates_of(cells: Sequence[str | None]) -> NDArray[np.datetime64]:

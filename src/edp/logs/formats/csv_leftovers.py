@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import IO, Any
 
 _PIECE_BYTES = 1 << 20
-"""Of the text looked at or passed on at a time."""
+"""Size of the text examined or passed on at a time."""
 _TAIL_BYTES = 1 << 16
 """End of a file in which its last lines are looked for."""
 MOST_LAST_LINES = 10

@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 _SAME_WIDTH = 0.8
-"""Share of the later rows that must have one number of cells: else the file is no table, or a damaged one."""
+"""Minimum fraction of later rows with an equal number of cells. Otherwise the file is damaged, or is not a table."""
 _NUMBERS = 0.8
-"""Share of the filled cells of a column that are numbers, where it is one of numbers."""
+"""Minimum fraction of numbers among the filled cells of a numeric column."""
 _MOST_HEADER_ROWS = 4
 """Names, units and descriptions: what stands between the names and the numbers at most."""
 _MOST_REMARKS = 2

@@ -28,7 +28,7 @@ _END = "EOF"
 _WIDEST = 6
 """Bytes of memory a byte of text: numbers of eight bytes, and those of the parser beside them."""
 _SHARE = 0.5
-"""Of free memory, what a file may take."""
+"""Maximum fraction of free memory for a file."""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from edp.storage.memory import free_bytes
 WHOLE_BYTES = 1 << 30
 """Files up to this size are parsed once and kept; longer ones are parsed once to check them, then once a reading."""
 _WHOLE_SHARE = 0.25
-"""Of free memory, what a kept file may take."""
+"""Maximum fraction of free memory for a file in memory."""
 _WIDEST = 4
 """Bytes of memory a byte of text: a digit and a delimiter become a number of eight."""
 _TRIES = 8
@@ -31,11 +31,11 @@ _TRIES = 8
 NULLS = ["", "NaN", "nan", "NAN", "NA", "N/A", "#N/A", "null", "NULL", "-nan", "-nan(ind)", "1.#QNAN"]
 """Spellings of a missing value, those of Excel, pandas, MATLAB and C runtimes among them."""
 _SQUEEZED_BYTES = 1 << 20
-"""Of text with blanks between cells brought to one blank at a time."""
+"""Size of the text in which runs of blanks are reduced at a time."""
 _LONGEST_LINE = 1 << 26
 """Characters of a line before the table at most."""
 _BLOCK_BYTES = 1 << 24
-"""Of text parsed at a time."""
+"""Size of the text parsed at a time."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ _ON, _OFF = ("true", "on", "yes", "ein", "wahr"), ("false", "off", "no", "aus", 
 _PREFIXES = {"": 1.0, "p": 1e-12, "n": 1e-9, "u": 1e-6, "µ": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6, "G": 1e9}
 _WITH_PREFIX = r"^(?P<number>[-+]?[0-9]+(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?)(?P<prefix>[pnuµmkMG]?)$"
 _REMARKS, _FEW_REMARKS = 0.001, 10
-"""Share of rows that may end in a remark, or so many of few rows."""
+"""Maximum fraction of rows that end in a remark, or number of such rows in a short table."""
 _GROUPED = r"[-+]?[0-9]{1,3}(\.[0-9]{3})+(,[0-9]+)?"
 _GERMAN = rf"^({_GROUPED}|[-+]?[0-9]*,?[0-9]+([eE][-+]?[0-9]+)?)$"
 

@@ -45,7 +45,7 @@ LONGEST_LIST = 256
 _HEADER, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x01, 0x04, 0x05, 0x06, 0x0F
 _PREFIX = struct.Struct("<BQ")
 _HEAD = struct.Struct("<HIQQ")
-"""Of a message: channel, sequence, time of the log, time of publishing."""
+"""Head of a message: channel, sequence, log time, publishing time."""
 
 
 @dataclass

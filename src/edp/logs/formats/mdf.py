@@ -35,7 +35,7 @@ _FACTS = "edp_info.json"
 _FACTS_BYTES = 1 << 24
 """A thousand channels take 150 kB."""
 _PIECE_BYTES = 1 << 25
-"""Of records read at a time, so that wide groups take larger steps than `PIECE_ROWS`."""
+"""Size of the records read at a time, so that wide groups take larger steps than `PIECE_ROWS`."""
 _NUMBERS = range(6)
 """Data types of integers and floats; above are texts, bytes, dates and pictures."""
 _PLAIN_TYPES = (0, 2, 3, 6)

@@ -19,9 +19,9 @@ from edp.storage.unpacking import DEFLATE_RATIO, unpacked_size
 _HEAD = 24
 """Bytes of a block before its links: id 4, reserved 4, length 8, count of links 8."""
 _FIRST = 64
-"""Where the header block lies: behind the identification of the file."""
+"""Position of the header block, after the identification of the file."""
 _MAX_BLOCK = 1 << 31
-"""Of unpacked bytes; larger data are lists of blocks."""
+"""Maximum size of an unpacked block; larger data are lists of blocks."""
 _COPIES = 3
 """A packed block is in memory as it was unpacked, transposed and as columns."""
 _DEEPEST_CONVERSION = 8
@@ -33,7 +33,7 @@ _MOST_TEXT = 1 << 26
 _TEXT_RATIO = 8
 """Bytes of text that blocks may share, beyond `_MOST_TEXT`, for each byte of the file."""
 _PACKINGS = ("zlib", "zlib", "lz4", "lz4", "zstd", "zstd")
-"""By type of a packed block; each second one is transposed."""
+"""Compression by type of a packed block; every second one is transposed."""
 _DATA = {b"##DT", b"##DV", b"##DZ", b"##DL", b"##HL", b"##LD", b"##SD", b"##RD", b"##DI", b"##RV", b"##RI"}
 _NAMED = {b"##CN", b"##CG", b"##CC", b"##SI", b"##AT", b"##EV", b"##CH", b"##FH", b"##DG", b"##HD", b"##CA"}
 _PACKED_HEAD = 24

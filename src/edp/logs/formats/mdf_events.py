@@ -13,7 +13,7 @@ from edp.errors import DataError
 LONGEST_TEXT = 2_000
 """Characters of a name or comment; more is cut."""
 MOST_EVENTS = 100_000
-"""Of a file: a stretch takes two blocks of about 150 bytes and its texts."""
+"""Maximum number of events in a file: a segment takes two blocks of about 150 bytes and its texts."""
 _NS = 10**9
 _MARKER, _RECORDED_AFTERWARDS = 6, 1
 """Type of an event, and the flag of events that were found in what had been recorded."""

@@ -51,7 +51,7 @@ FUNCTIONS: Mapping[str, Callable[..., Any]] = {
     "tanh": np.tanh,
     "pow": np.power,
 }
-"""Of one argument, except `pow`."""
+"""Functions of one argument, except `pow`."""
 _TWO = frozenset({"pow"})
 
 

@@ -16,13 +16,13 @@ _ALIKE = 0.97
 """Correlation from which one column is a change, a copy or a reference of another; chance and common motion reach
 0.9 on logs of a machine that repeats one cycle."""
 _ROUNDED_ALIKE = 0.999
-"""Least correlation of copies that were rounded on their own."""
+"""Minimum correlation of copies that were rounded separately."""
 _MANY_COUNTS = 50
 """Last digits that the range of a rounded copy spans at least."""
 _LAGS = 25
 """Samples by which a reference may lead what follows it."""
 _HOLDS = 0.9
-"""Share of equal neighbours from which a column moves in steps."""
+"""Fraction of equal neighbours above which a column moves in steps."""
 _FEW = 12
 """Distinct values of a label at most."""
 _SLOW = 2e-3

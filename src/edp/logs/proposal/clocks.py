@@ -16,9 +16,10 @@ from edp.signals import TIME_UNITS, SignalMap
 from edp.wording import typed
 
 _SINCE_1970 = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 5e8}
-"""Least value of a stamp that counts from 1970 in a unit: 2,000 or so."""
+"""Minimum stamp of a clock that counts from 1970, by unit: about the year 2000."""
 _PRINTED, _MANY_STAMPS = 0.995, 50
-"""Share of rows that may repeat the stamp before, and stamps that differ: whole seconds of some minutes at 100 Hz."""
+"""Maximum fraction of rows that repeat the previous stamp, and minimum number of different stamps: whole seconds of
+some minutes at 100 Hz."""
 _FASTEST_HZ = 200.0
 """Rates above are brought down to one of `_PLAIN_HZ`: a machine moves slower, and a tick more costs on a controller."""
 _PLAIN_HZ = (100.0, 200.0, 500.0, 1000.0, 2000.0)

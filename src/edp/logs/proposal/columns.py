@@ -22,9 +22,10 @@ from edp.storage import write_bytes
 from edp.storage.paths import is_file_at, status_of
 
 TEXT_BYTES = 16_000_000
-"""Of a text file that is looked at, 15 min of 20 channels at 100 Hz; text has no index, so this is its beginning."""
+"""Size of the examined part of a text file: 15 min of 20 channels at 100 Hz. Text has no index, so this is its
+beginning."""
 _HEAD_BYTES = 1 << 20
-"""Of a text whose columns are compared with those of others."""
+"""Size of the examined part of a text when comparing columns with other files."""
 MOST_COLUMNS = 400
 """Columns that are looked at; the others are left out and counted."""
 _ROWS = 30_000
@@ -38,7 +39,7 @@ _PROBE_ROWS = 1000
 _MOST_TEXTS = 20
 """Columns of text that are tried as time."""
 _COVERED = 0.9
-"""Share of the longest span that signals with times of their own cover at least: one message is no signal."""
+"""Minimum fraction of the longest span that signals with their own times cover. A single message is not a signal."""
 _SLOWEST = 200.0
 """Steps of the fastest signal that one of a slower lasts at most."""
 _HELD_VALUES = 4 * _VALUES

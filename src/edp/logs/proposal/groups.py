@@ -17,7 +17,7 @@ _One = TypeVar("_One")
 MOST_LOGS = 12
 """Logs that are looked at of a group of files: the first ones, the last ones and some between."""
 _ALIKE = 0.7
-"""Share of columns that two logs must have in common to belong together."""
+"""Minimum fraction of common columns of two logs in one group."""
 
 
 @dataclass(frozen=True)

@@ -20,16 +20,16 @@ _RATES = {
     Kind.ANGLE: Kind.ANGULAR_VELOCITY,
     Kind.VELOCITY: Kind.ACCELERATION,
 }
-"""What the change of a kind measures."""
+"""Kind of the time derivative of each kind."""
 _TURNING = {
     Kind.POSITION: Kind.ANGLE,
     Kind.ANGLE: Kind.ANGLE,
     Kind.VELOCITY: Kind.ANGULAR_VELOCITY,
     Kind.ANGULAR_VELOCITY: Kind.ANGULAR_VELOCITY,
 }
-"""What words of motion mean of a joint."""
+"""Kinds of a joint's motion by the kinds of linear motion."""
 _NEAR = 0.1
-"""Share by which the ratio of a change may miss that of two units."""
+"""Relative tolerance between the ratio of a change and that of two units."""
 _SHORT_UNITS = ("t", "g")
 """Letters that mean something else as often: time or tonnes, grams or gravity."""
 

@@ -20,7 +20,7 @@ _ONE_RATE = 1.0005
 _LONG_S, _LONG_STEPS = 1.0, 20.0
 """A gap longer than both is a break in the session: held values would be motion that never was."""
 _MOST_KEPT = 0.8
-"""Share of the rows that must lie on one side of a break, for the rest to be cut away."""
+"""Minimum fraction of the rows on one side of a break, above which the rest is cut off."""
 
 
 @dataclass(frozen=True)

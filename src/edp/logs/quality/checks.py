@@ -23,18 +23,18 @@ _STUCK_SECONDS = 1.0
 """Shortest stay that is reported of a channel that may rest, and its least number of samples below."""
 _STUCK_SAMPLES = 50
 _FROZEN_SECONDS = 0.5
-"""The same of a channel whose last digit always moves."""
+"""Maximum constant time of a channel whose last digit always changes."""
 _FROZEN_SAMPLES = 10
 _CLIPPED_SAMPLES = 3
-"""Least stay at an end of the range: noise touches its own extreme in single samples."""
+"""Minimum number of consecutive samples at an end of the range. Noise touches its extreme in single samples."""
 _CLIPPED_SHARE = 1e-3
-"""Least share of the time at that end."""
+"""Minimum fraction of the time at that end."""
 _NOISY_RATIO = 2.0
 """Deviation over noise floor below which a channel is mostly noise."""
 _FEW_LEVELS = 64
-"""Most levels of a channel that is called coarse."""
+"""Maximum number of levels of a coarse channel."""
 _COARSE_STEP = 0.1
-"""Share of the deviation from which a step is coarse."""
+"""Fraction of the standard deviation above which a step is coarse."""
 _MANY_SPIKES = 3
 # A channel of these kinds whose largest value is below this part of the nominal size was hardly stored in SI.
 _TOO_SMALL = {Kind.PRESSURE: 1e-4, Kind.PILOT_PRESSURE: 1e-4}

@@ -10,7 +10,7 @@ from edp.logs.quality.measures import Values
 from edp.recording import Recording
 
 PIECE_BYTES = 32 * 2**20
-"""Of columns that are copied at once: rows lie side by side, so that a column alone touches as much memory as 16."""
+"""Size of the columns copied at once. Rows are contiguous, so that one column alone touches as much memory as 16."""
 
 
 def columns(recording: Recording) -> Iterator[Values]:

@@ -19,7 +19,7 @@ from edp.wording import typed
 _LEAST_RATIO = 9.0
 """Units nearer than this cannot be told from a recording that is merely livelier."""
 _NEAR_DECADES = 0.35
-"""How far size and noise may lie off the ratio of two units: a factor of 2.2."""
+"""Tolerance of size and noise relative to the ratio of two units, in decades: a factor of 2.2."""
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ _LEFT_OUT = {
     NAMES_AGAIN: "the names stand again within the table: the logger was restarted; such lines are left out",
     BEHIND_TABLE: "lines behind the table are left out",
 }
-"""What a text file has beside its rows, by the fact that tells its line."""
+"""Descriptions of lines in a text file that are not rows, by type."""
 _LENIENT = Repair(nan="keep", gaps="keep", duplicates="last", falling="sort")
 _MOST_NAMES = 2000
 """Columns that are compared with the vocabulary: each costs half a millisecond."""

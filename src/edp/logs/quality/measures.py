@@ -26,7 +26,7 @@ _BLOCK = 128
 _GAIN = 20.0
 _SPREAD = (2.0 * (1.0 + 2.0 * (0.75**2 + 0.3**2 + 0.05**2)) / _BLOCK) ** 0.5
 _QUARTILE = 0.6745
-"""Of the standard normal distribution: how far its quartiles lie from the mean."""
+"""Distance of the quartiles of the standard normal distribution from its mean."""
 _HELD = 10
 """Equal samples in a row from which a stay is a hold, not a chance of the last digit."""
 _BUSY_REPEATS = 0.05

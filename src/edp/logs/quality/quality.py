@@ -22,7 +22,7 @@ from edp.recording import Recording
 from edp.signals import KINDS
 
 VERDICTS = {"error": "unusable", "warning": "check", "note": "good"}
-"""What the worst finding makes of a channel or a recording; without any it is good."""
+"""Verdict on a channel or a recording by its worst finding; without a finding it is good."""
 
 
 @dataclass(frozen=True)

@@ -39,11 +39,11 @@ _LEAST_VOTES = 3
 _HOPELESS = 0.8
 """Correlation below which no fraction of a block makes two windows the same."""
 _LEAST_SHARE = 0.5
-"""Of the channels that move in a window more than this must agree: steps of two sessions look alike in one channel or
-another (correlations of 0.99 on a bench with two machines), but not in most of them."""
+"""Minimum fraction of the channels moving in a window that must agree. Steps of two sessions look alike in one channel
+or another (correlations of 0.99 on a bench with two machines), but not in most of them."""
 _LEAST_UNBROKEN = 2 / 3
-"""Of the windows in motion between the first and the last one that agree, so many must agree, too. Of one session all
-do but for noise; of two that are driven alike about half of them did."""
+"""Minimum fraction of the windows in motion between the first and the last agreeing one that must agree. Within one
+session all agree except for noise; of two similar sessions about half did."""
 _SHIFTS = (0.0, -0.25, 0.25, -0.5, 0.5)
 """Fractions of a block: two recordings began at different moments between the ticks of 10 Hz."""
 

@@ -14,7 +14,7 @@ from edp.recording import Recording
 SKETCH_HZ = 10.0
 """Rate of a sketch: fast enough for moves of a machine, and any logger reaches it."""
 MOST_BYTES = 256 * 2**20
-"""Of the sketches of a data set: 40 hours of 45 channels."""
+"""Maximum size of the sketches of a data set: 40 hours of 45 channels."""
 HASHED_ROWS = 65_536
 Floats = NDArray[np.float32]
 

@@ -14,9 +14,9 @@ Array = NDArray[np.float64]
 SHORT, LONG = 8, 40
 """Blocks of the windows over which the scatter of means is measured."""
 SHRUNK = 0.2
-"""Share of the identity in the correlations: there are fewer healthy sessions than summaries."""
+"""Weight of the identity in the correlations, because there are fewer healthy sessions than summaries."""
 LEAST_VARIANCE = 1e-6
-"""Of a feature in units of healthy blocks, below which it stands still."""
+"""Variance of a feature, in units of healthy blocks, below which the feature is constant."""
 LEAST_SESSIONS = 4
 ONSET = 6
 """Blocks from the onset on that are looked at apart: a step of a sensor shows in them only."""

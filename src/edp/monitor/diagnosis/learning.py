@@ -24,7 +24,7 @@ WINDOW = 40
 LEAST_CHANGE = 3.0
 """Size of a signature, in healthy standard deviations of such a mean, below which it would not have been found."""
 UNUSUAL = 0.98
-"""Share of left-out sessions that some fault must explain."""
+"""Fraction of left-out sessions that some fault must explain."""
 MOST_JUDGED = 240
 """Left-out sessions that numbers are chosen on."""
 

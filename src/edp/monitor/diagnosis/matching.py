@@ -28,7 +28,7 @@ its clip stays there."""
 MOST_STRANGE = 0.5
 """Probability of none of the ladders' faults, above which sizes beyond them are tried."""
 MOST_SHARE = 100.0
-"""Of what is measured in shares: there is no more to lose."""
+"""Maximum size of faults measured in percent."""
 LEAST_SIZE = 0.5
 """Smallest size that is tried, over the smallest of the ladder."""
 MOST_CAUSES = 8

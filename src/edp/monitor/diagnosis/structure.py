@@ -17,7 +17,7 @@ APART = 0.25
 MOST_PAIRS = 400
 LONGEST_NAME = 300
 LEAST_SESSIONS = 3
-"""Of each of two faults, without which nothing is said about them."""
+"""Minimum number of sessions of each of two faults for a statement on their confusion."""
 
 
 @dataclass(frozen=True)

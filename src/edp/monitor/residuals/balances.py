@@ -40,7 +40,7 @@ SLOW = (Kind.TEMPERATURE,)
 MATCH_S = 0.5
 """Time over which changes are compared to find which rate belongs to which level."""
 MOST_ROWS = 200_000
-"""For that comparison: half an hour at 100 Hz."""
+"""Maximum number of rows for that comparison: half an hour at 100 Hz."""
 
 
 class Balances(ResidualSource):

@@ -20,7 +20,7 @@ from edp.training.twin_bundle import TwinBundle
 
 Rows = NDArray[np.float32]
 MOST_RESIDUALS = 512
-"""Of one source: a machine with more channels is watched in parts."""
+"""Maximum number of residuals of a source. A machine with more channels is monitored in parts."""
 SISTERS = 11
 """Seeds of drawn machines are apart from all others."""
 

@@ -29,9 +29,9 @@ FOLDS = 2
 """Each member leaves out half of the rows, and stops where its error there is least."""
 BATCH = 512
 STEPS_PER_MINUTE, LEAST_STEPS, MOST_STEPS = 12_000, 200, 6_000
-"""On one core, about: the time of a fit is a wish and not a bound."""
+"""Training steps per minute on one core, and their range. The time of a fit is a target, not a bound."""
 VALIDATED_TICKS = 120_000
-"""For the choice among weights: twenty minutes at 100 Hz say as much as hours."""
+"""Number of samples for selecting among weights: twenty minutes at 100 Hz suffice."""
 
 
 @dataclass(frozen=True, kw_only=True)

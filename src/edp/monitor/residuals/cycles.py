@@ -33,11 +33,11 @@ PREFIX = "cycle:"
 LEAST_CYCLES = 3
 """Fewer tell no scatter."""
 MOST_TICKS = 1_000_000
-"""Of a cycle."""
+"""Maximum length of a cycle."""
 UNEVEN = 0.01
-"""Of a tick by which a cycle may miss a whole number of them: after a hundred cycles it is late by one."""
+"""Maximum deviation of a cycle from a whole number of samples; after a hundred cycles it is one sample."""
 NARROWEST = 1e-3
-"""Least scatter at a place of the cycle, over how widely the channel varies in all."""
+"""Minimum scatter at a position of the cycle, relative to the total variation of the channel."""
 
 
 class Cycles(ResidualSource):

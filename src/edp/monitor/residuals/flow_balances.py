@@ -48,7 +48,7 @@ from edp.wording import figure, percent
 PREFIX = "flow:"
 NUMBERS = ("values", "slopes", "lines", "doubts")
 MOST_CHAMBERS, MOST_DEAD = 64, 1_000
-"""Of a file: chambers, and ticks of dead time."""
+"""Maximum numbers in a file: chambers, and samples of dead time."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from scipy.signal import cont2discrete, lfilter
 Array = NDArray[np.float64]
 Singles = NDArray[np.float32]
 DAMPING = 0.95
-"""Of both stages: pilots and spools of valves ring hardly or not at all."""
+"""Damping of both stages: pilots and spools of valves hardly oscillate."""
 KNOTS = np.array([0.04, 0.08, 0.11, 0.14, 0.17, 0.21, 0.26, 0.33, 0.42, 0.54, 0.7, 0.85, 1.0], np.float32)
 """Shares of travel between which an opening is a straight line, nothing at the first one: close where it begins."""
 MEGA = np.float32(1e-6)
@@ -28,7 +28,7 @@ CAVITY = np.float32(0.1)
 EMPTY = np.float32(0.8)
 """MPa below which a chamber may be drawn empty."""
 BEGUN = 0.01
-"""Share of its largest opening at which a path counts as open."""
+"""Fraction of its largest opening above which a path counts as open."""
 DOUBTS = 8
 """Terms of the width; see `doubts_of`."""
 LINES = 9 + len(RELIEFS)

@@ -37,7 +37,7 @@ SECOND_LATER = 0.015
 LEAST, MOST = (0.0, 1.0, 0.0), (0.4, 40.0, 0.2)
 """Bounds of the search; frequencies end at a third of the rate, too."""
 SEARCHED_TICKS, SEARCHED_ROWS = 120_000, 16_000
-"""For the search: twenty minutes at 100 Hz, of which every so many ticks are compared."""
+"""Numbers of samples and of compared rows in the search: evenly spaced rows of twenty minutes at 100 Hz."""
 RIDGE = 1e-6
 GROSS = 8.0
 """Median sizes beyond which a tick does not count in the second round: at end stops nothing of this holds."""
@@ -49,7 +49,8 @@ COVERED = (0.01, 0.99)
 BEYOND_K = 5.0
 """Kelvin beyond the learned temperatures within which balances still hold."""
 LEAST_TANK = 0.005
-"""Share of all pressures below which that of the return line is taken: a chamber that is drawn empty stands there."""
+"""Fraction of all pressures below which the pressure of the return line is estimated, to which an emptied chamber
+falls."""
 
 
 def fit_chambers(

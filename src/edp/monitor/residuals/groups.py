@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from edp.signals import EXTRA_CHANNELS, FAULT_CHANNELS, GROUND_CHANNELS, MOTOR_CHANNELS, TABLE_A1, Channel, Kind
 
 SENSED = ("PumpPressure_1", "PumpPressure_2", "CylStroke_1", "CylStroke_2", "CylStroke_3", "OilTemperature")
-"""Of `EXTRA_CHANNELS`, those that a machine may have sensors for; the others only a simulation knows."""
+"""Channels of `EXTRA_CHANNELS` for which a machine may have sensors. Only a simulation knows the others."""
 MOTION = (Kind.VELOCITY, Kind.ACCELERATION, Kind.POSITION)
 TURNING = (Kind.ANGULAR_VELOCITY, Kind.ANGLE)
 MOST_SINGLE = 24

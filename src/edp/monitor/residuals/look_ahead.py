@@ -29,7 +29,7 @@ from edp.signals import Channel, Kind
 from edp.training.bundle import Bundle
 
 SMALLEST_WIDTH = 1e-9
-"""Of an interval, in SI units: one that has closed is no scale."""
+"""Minimum width of an interval, in SI units. A closed interval is not a scale."""
 
 
 class LookAhead(ResidualSource):
@@ -183,4 +183,4 @@ AHEAD = (Kind.VELOCITY, Kind.ANGULAR_VELOCITY, Kind.PRESSURE, Kind.FLOW, Kind.FO
 """Kinds that dynamics tell ahead; accelerations are mostly noise, positions follow from velocities."""
 MOST_TARGETS = 64
 MINUTES_SHARE = 0.2
-"""Of the time of all fits, for the one network that looks ahead."""
+"""Fraction of the time of all fits for the look-ahead network."""

@@ -18,7 +18,7 @@ from torch.autograd.function import once_differentiable
 EPSILON = 1e-5  # in the variance of layer norm
 
 Shares = tuple[Tensor, Tensor] | float
-"""Share of the new h and c that is taken: draws of 0 and 1, ``(time, batch, units)`` each, or one number."""
+"""Fraction of the new h and c: draws of 0 and 1, ``(time, batch, units)`` each, or one number."""
 
 Norm = tuple[Tensor, Tensor, Tensor]
 """Gain of the normalised ``U h``, gain and shift of the normalised c."""

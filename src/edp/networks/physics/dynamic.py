@@ -19,7 +19,8 @@ from edp.settings.bounds import check_bounds, span
 
 LOADS = ("none", "gravity", "all")
 MOST_FADE_S = 3600.0
-"""Of a fading that no horizon sees the end of; oil's stiffness takes up the force within hundredths of a second."""
+"""Maximum time constant of the fading, longer than any horizon. Oil stiffness takes up the force within hundredths of a
+second."""
 NEAR = 3e-3
 """Distance in m from the end of a stroke within which a piston stands at its stop: what sensors can tell."""
 

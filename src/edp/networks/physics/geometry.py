@@ -23,10 +23,11 @@ PLANT_NUMBERS = (
     "PIVOT_X", "PIVOT_Y", "PIN_X", "ROCKER", "LINK", "LUG_X", "LUG_Y", "CYLINDER_X", "CYLINDER_Y",
 )  # fmt: skip
 SIDES = ("ROCKER_SIDE", "LINK_SIDE")
-"""On which side of the line between the centres two circles meet, +1 or -1, where strokes give the bucket's pose."""
+"""Side of the line between the centres on which two circles intersect, +1 or -1, if strokes define the bucket's
+pose."""
 SMALL = 1e-12
 LEAST = 1e-6
-"""Least square of a lever arm that is divided by, m^2/rad^2: no cylinder works at a millimetre per radian."""
+"""Minimum squared lever arm in a denominator, m^2/rad^2. No cylinder works at a millimetre per radian."""
 TURN = 1e-2
 """Half of the angle in rad over which the change of a lever arm is taken; its error is some 1e-4 of the change."""
 GRID = 9

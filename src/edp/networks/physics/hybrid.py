@@ -15,7 +15,7 @@ from edp.networks.physics.dynamic import Dynamic, DynamicSpec
 from edp.networks.physics.geometry import AXES, Pose
 
 HELD = 1e3
-"""How many times its own inertia holds an axis that stands."""
+"""Factor of its own inertia that holds an axis at standstill."""
 
 
 @PHYSICS.register("hybrid")

@@ -34,17 +34,17 @@ from edp.wording import typed
 Array = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 STEP = 0.02
-"""Share by which a group grows to see its effect: large against rounding, small against curvature."""
+"""Relative step of a group to determine its effect: large compared with rounding, small compared with curvature."""
 CLIP = 3.0
 """Units beyond which an error teaches no more."""
 BOUND = 3.0
 """Groups are held within so many prior deviations."""
 LEAST = 1e-3
-"""Of errors, as a share of the velocities' spread: a perfect run must not teach without end."""
+"""Minimum error, as a fraction of the velocity spread, below which nothing is adapted."""
 LATELY = 30
 """Stretches over which errors are averaged."""
 HOTTEST_C = 150.0
-"""Of oil (degC); a thermometer that says more is broken."""
+"""Maximum oil temperature, degC. A thermometer that reads more is broken."""
 WARMER = 0.02
 """Change of a logarithm by temperature from which numbers are made anew: about a kelvin."""
 REST = 1e-3

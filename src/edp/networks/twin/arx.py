@@ -18,7 +18,7 @@ from edp.networks.twin.scales import Array, TwinScales
 from edp.settings.bounds import MOST_TICKS, check_bounds, integer
 
 PENALTY = 1e-6
-"""Of the regression, per row on standardised inputs: neighbouring lags are nearly copies of each other."""
+"""Ridge penalty per row on standardised inputs, because neighbouring lags are nearly equal."""
 
 
 @TWINS.register("arx")

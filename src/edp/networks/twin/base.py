@@ -23,7 +23,7 @@ TwinState = dict[str, Array]
 """All that a twin remembers, by name; the first dimension is the batch. ``answer`` is what its free ports read next."""
 PREFIX = integer(1, MOST_TICKS)
 BEYOND = 0.05
-"""Share of a stroke by which a measured start may lie beyond an end stop: noise and play, not another machine."""
+"""Fraction of a stroke by which a measured start may lie beyond an end stop, for noise and play."""
 
 
 class Twin(ABC):

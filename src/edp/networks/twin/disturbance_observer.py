@@ -9,13 +9,13 @@ from edp.networks.twin.base import TwinRunner, TwinState
 
 Array = NDArray[np.float64]
 PROBE_N = 1e4
-"""By which a force is changed to see its effect on the velocities a tick later."""
+"""Force step to determine the effect of a force on the velocities one sample later, N."""
 RENEWED_TICKS = 10
-"""After how many ticks that effect is asked for anew: it changes with pose and opening of the valves."""
+"""Interval of renewing this effect, in samples. It depends on the pose and on the valve openings."""
 LOG_SHARE = 0.3
-"""Of a new error, where forces along a log are wanted: nothing waits for them, so they may be rougher."""
+"""Fraction of a new error for forces along a log, which may be noisier than in a loop."""
 MOST_N = 5e5
-"""Of an estimate: about what a cylinder of a 22 t excavator can hold."""
+"""Maximum estimate, N: about the holding force of a cylinder of a 22 t excavator."""
 
 
 def force_slopes(

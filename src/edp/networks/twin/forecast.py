@@ -22,10 +22,9 @@ from edp.networks.twin.scales import Array
 from edp.settings.bounds import integer, span
 
 GAINS = (1.0, 0.3, 0.1)
-"""Of an observer, as shares of the way to the measurement in a tick: measured mode, and two that smooth noise.
-
-A grey box of a simulated M22 forecasts ten ticks ahead with 0.78, 0.72 and 0.71 mm/s; ARX needs 1, since it reads its
-own past answers as measurements."""
+"""Observer gains as fractions of the innovation per sample: measured mode, and two that smooth noise. A grey box of a
+simulated M22 predicts ten samples ahead with 0.78, 0.72 and 0.71 mm/s. ARX needs 1, since it reads its own past outputs
+as measurements."""
 CHOICE_LOGS, CHOICE_TICKS = 3, 1500
 """Stretches and ticks of each on which a gain is chosen: thousands of moments settle errors to a few per cent."""
 BLOCK, BLOCK_NUMBERS = 4096, 4_000_000

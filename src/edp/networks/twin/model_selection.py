@@ -16,7 +16,7 @@ BUDGET = span(0.0, 100_000.0)
 KINDS: Registry[type] = Registry("twin")
 """Every formulation, and the choice among several of them."""
 FOLDS = integer(1, MOST_MEMBERS)
-"""Of a choice: a recurrent twin has a member for each."""
+"""Number of folds of a selection; a recurrent twin has one member per fold."""
 for _name, _formulation in TWINS.items():
     KINDS.register(_name)(_formulation)
 

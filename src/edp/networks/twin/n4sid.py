@@ -29,7 +29,8 @@ from edp.settings.bounds import check_bounds, check_count, integer
 Doubles = NDArray[np.float64]
 MOST_ORDER, MOST_ROWS_BACK = 200, 100
 MOST_WINDOWS = 40_000
-"""Of long logs, evenly chosen: a factorisation of them takes seconds, and neighbouring windows say nearly the same."""
+"""Maximum number of windows, evenly selected from long logs. Their factorisation takes seconds, and neighbouring
+windows are nearly equal."""
 CHUNK = 4096
 """Windows that are factorised at once: bounds the memory."""
 SLOWEST = 0.999
@@ -43,11 +44,12 @@ JUDGED_S, JUDGED_EACH = 10.0, 4
 KEPT_BACK = 5
 """Every fifth recording is kept back from the models whose orders compete."""
 SMALL = 1e-9
-"""Share of the largest that a direction must have to be told from rounding."""
+"""Fraction of the largest direction below which a direction counts as rounding."""
 LEAST_SHARE = 1e-4
-"""Of the largest singular value: states below it are noise, and filters of them amplify rounding."""
+"""Fraction of the largest singular value below which a state counts as noise. Filters of such states amplify
+rounding."""
 LEAST_NOISE = 1e-2
-"""Of a sensor, in deviations: on exact data a filter would trust one sample more than the model."""
+"""Minimum sensor noise, in standard deviations. On exact data a filter would trust one sample more than the model."""
 
 
 @TWINS.register("n4sid")

@@ -27,7 +27,7 @@ from edp.networks.twin.lowering import MEASURED
 from edp.signals import Channel, Kind
 
 FLAG = "_measured"
-"""What the name of a flag ends with, behind that of its answer."""
+"""Suffix of the name of a flag, after the name of its output."""
 
 
 class TwinPlant(Predictor):

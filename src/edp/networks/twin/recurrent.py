@@ -26,10 +26,10 @@ from edp.settings.bounds import MOST_UNITS, check_bounds, integer
 PIECE = 256
 """Ticks that a run without gradients keeps at once: the loop writes what only a backward run would read."""
 MAP = "map_"
-"""Before the names of a static map's numbers, among those of the twin that it is part of."""
+"""Prefix of the names of a static map's parameters within the twin."""
 MOST_MEMBERS = 32
 MEMBER_SEED = 1000
-"""Between the seeds of members, so that few runs share one."""
+"""Seed increment between members, so that few runs share a seed."""
 
 
 @TWINS.register("recurrent")

@@ -17,7 +17,7 @@ from edp.networks.twin.scales import TwinScales
 from edp.networks.twin.static_map import StaticTwin
 
 AT_STOP = 0.002
-"""Share of a stroke within which visits to its end are visits to the same place: a few millimetres, as sensors show."""
+"""Fraction of a stroke within which two visits to a stroke end count as the same position: a few millimetres."""
 APART_S = 1.0
 """Time away from an end after which the next visit is another one."""
 VISITS = 2
@@ -25,7 +25,7 @@ VISITS = 2
 PUSHED_S = 1.0
 """Time at an outermost place with its own lever pushing on that makes it an end stop at the first visit."""
 PUSHED = 0.5
-"""Of the largest command: a lever that moves an actuator anywhere else."""
+"""Fraction of the largest command above which a lever would move an actuator anywhere but at its stop."""
 
 
 def scales_for(twin: RecurrentTwin, own: TwinScales, train: list[Series]) -> TwinScales:

@@ -20,7 +20,7 @@ from edp.settings.bounds import MOST_TICKS, check_bounds, check_count, integer
 from edp.wording import typed
 
 PENALTY = 1e-6
-"""Of the regression, per row on standardised features: knots that no command passed stay flat."""
+"""Ridge penalty per row on standardised features. Knots without data stay flat."""
 
 
 @TWINS.register("static")

@@ -24,13 +24,13 @@ class Aprbs(Excitation):
     by_hand = False
     HOLD_S = (0.15, 2.5)
     LEVELS = (0.92, 1.2, 1.9)
-    """Beside zero and `TOP`, as multiples of the dead band."""
+    """Levels in addition to zero and `TOP`, as multiples of the dead band."""
     TOP = (0.75, 0.65, 0.85)
     """Highest level of boom, arm and bucket."""
     CHIRP_HZ = (0.05, 5.0)
     CHIRP_S = (12.0, 25.0)
     CHIRP_SHARE = 0.35
-    """Share of the time; more of it made the commands no flatter (findings)."""
+    """Fraction of the time with chirps; more of it made the commands no flatter (findings)."""
     PIECE_S = 0.1
     """A chirp is given in such pieces, since its sign must turn soon after a cylinder nears an end."""
     TURN = (0.22, 0.78)

@@ -53,7 +53,7 @@ class Excitation:
 
 
 EXCITATIONS: Registry[type[Excitation]] = Registry("excitation")
-"""By name; made from a random generator, the command rate in Hz and the machine."""
+"""Excitations by name, built from a random generator, the command rate in Hz and the machine."""
 
 
 def extend_probability(stroke: float, pull: float = 1.1) -> float:

@@ -44,7 +44,7 @@ class Dig(Tracked):
     RELIEF_RATE = 0.12
     """m/s at which a stalled drag is raised."""
     FULL = 0.9
-    """Share of a struck bucket at which the drag ends."""
+    """Fraction of a struck bucket at which the drag ends."""
     TRIES = 60
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:

@@ -22,7 +22,8 @@ class Grading(Tracked):
     by_hand = False
     works_ground = True
     PROPORTIONAL, INTEGRAL = 4.0, 2.0
-    """Of gains 2 to 5 /s, 4 has the least errors; at 5 the levers change sign twice as often (findings)."""
+    """Controller gains per second and per second squared: of gains 2 to 5 /s, 4 has the least errors; at 5 the levers
+    change sign twice as often (findings)."""
     SPEED = (0.1, 0.5)
     LENGTH_M = (1.0, 4.5)
     SLOPE = 0.15

@@ -28,7 +28,7 @@ class SwingDig(Dig):
     CLOSE_RAD, NEAR_RAD = 0.06, 0.25
     """Angle left at which the swing is not moved any more, and at which the bucket is lowered or emptied."""
     TRAVELS = 0.3
-    """Share of cycles with travel."""
+    """Fraction of cycles with travel."""
     TRAVEL_S, TRAVEL_LEVEL = (0.6, 2.5), (0.4, 1.0)
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:

@@ -45,7 +45,7 @@ class Tracked(Excitation):
     PATIENCE_S = 1.5
     """A leg that is blocked for so long is given up: the boom is raised instead."""
     RESCUE = 0.15
-    """Share of the boom's stroke by which it is raised then."""
+    """Fraction of the boom's stroke by which it is then raised."""
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
         super().__init__(rng, rate_hz, machine)

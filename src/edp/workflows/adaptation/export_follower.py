@@ -15,7 +15,7 @@ from edp.training.twin_bundle import load_twin, plant_bundle
 from edp.workflows.adaptation.with_twin import correction_of, tuned_spec
 
 OPTIONS = tuple(one.name for one in fields(TunedSpec) if one.name != "groups")
-"""Of `TunedSpec`, that may be set."""
+"""Options of `TunedSpec` that the user may set."""
 
 
 def export_follower(

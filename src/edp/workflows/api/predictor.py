@@ -32,7 +32,7 @@ from edp.workflows.api.scores import JudgedScores
 BASELINES = ("persistence", "ridge_arx")
 """Baselines that take seconds; the others, `trees` and `mlp` among them, are asked for by name."""
 PROVENANCE = "provenance.json"
-"""What a run folder has and a bundle alone has not: which data it was trained on."""
+"""File that distinguishes a run folder from a bundle: the origin of the training data."""
 
 
 class TrainedPredictor:

@@ -13,7 +13,7 @@ from edp.training.compression.qat import RoundingSpec
 from edp.workflows.compression.bench import Bench, CompressionRequest
 
 THESIS = RoundingSpec(activation_bits=8, recurrent=False)
-"""What fake quantisation of the thesis covers: convolutions and linear layers, 8 bits."""
+"""Fake quantisation of the thesis: convolutions and linear layers with 8 bits."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,7 +34,7 @@ MOST: Mapping[str, int] = {"iterations": 100, "newton": 1_000}
 """Iterations a tick: of the solver, of which 5 to 20 were seen in loops; of a grey box's equations."""
 MOST_ITERATIONS = 100_000
 FARTHEST_M = 100.0
-"""Beyond it a stroke counts as missing: no cylinder is as long."""
+"""Stroke above which the measurement counts as missing; cylinders are shorter."""
 Array = NDArray[np.float64]
 
 

@@ -41,7 +41,7 @@ from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 KEPT, HEADER, MACHINE, TWIN = "controller", "controller.json", "machine.toml", "twin"
 SCHEMA = 1
 GOLDEN_TICKS = 150
-"""Of the loop that is kept: a second and a half, in which the machine begins to move."""
+"""Stored length of the loop: 1.5 s, in which the machine begins to move."""
 Array = NDArray[np.float64]
 
 

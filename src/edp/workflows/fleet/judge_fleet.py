@@ -49,7 +49,7 @@ RESULT, PAGE = "fleet_report.json", "report.html"
 BLOCK_S = 10.0
 """Blocks of which drift is told: longer than a network remembers what it misjudged."""
 LEAST_BLOCKS = 8
-"""In each half, for a spread to be known."""
+"""Minimum number of blocks in each half for a spread."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,9 +17,9 @@ from edp.workflows.live.sources import SourceOptions
 from edp.workflows.live.sources.log import LogSource
 
 MOST_LINES = 6
-"""Of one page; each is a chart of its own."""
+"""Maximum number of predictions on a page; each has a chart."""
 MOST_BYTES = 1 << 30
-"""Of rows: an hour of 700 columns at 100 Hz."""
+"""Maximum size of the rows: an hour of 700 columns at 100 Hz."""
 
 
 def forecast_lines(run: str | Path, recording: Recording, horizon: int | None = None) -> list[ForecastLine]:

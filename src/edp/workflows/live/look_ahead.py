@@ -14,7 +14,7 @@ from edp.training.bundle import Bundle
 from edp.workflows.live.parts import LivePart, Note, Row, columns_of
 
 MOST_HORIZONS = 6
-"""That a page can let one choose from; of more the first, the last and some between are shown."""
+"""Maximum number of horizons on a page. Of more horizons the first, the last and some between are shown."""
 
 
 class LiveNetwork(LivePart):

@@ -30,12 +30,12 @@ from edp.storage.paths import is_there
 
 LOOPBACK = "127.0.0.1"
 PIECE_S = 0.5
-"""Between pieces of rows: a piece costs the same for one row as for fifty."""
+"""Time between batches of rows. A batch costs the same for one row as for fifty."""
 MOST_ROWS = 6000
-"""Of one piece; what a source gives beyond it meanwhile is left out."""
+"""Maximum number of rows in a batch; further rows are omitted."""
 START_S, END_S = 30.0, 3.0
 MEMORY = "1GiB"
-"""That Rerun's server keeps for viewers that come later; the oldest rows go first."""
+"""Memory of Rerun's server for viewers that connect later. The oldest rows are removed first."""
 TIMELINE = "session"
 
 

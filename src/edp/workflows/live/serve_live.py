@@ -14,7 +14,7 @@ from edp.workflows.live.run_live import LiveOrder, LiveResult, LiveRun
 from edp.workflows.live.sources import LiveSource
 
 STOP_S = 5.0
-"""To wait for the thread of a source, which may be within a tick."""
+"""Maximum wait for the thread of a source, which may be computing a sample."""
 
 
 def run_live(

@@ -17,8 +17,8 @@ from edp.wording import typed
 from edp.workflows.live.parts import LivePart, Note, Row
 
 MOST_TICKS = 100
-"""That a monitor takes at once. Nothing is judged before the end of a block, and its networks cost as much for all
-ticks of one as for a single tick; of longer blocks a part is enough."""
+"""Maximum number of samples that a monitor processes at once. It evaluates nothing before the end of a block, and its
+networks cost as much for a block as for one sample. Parts of longer blocks suffice."""
 
 
 class _Chunks(MonitorStream):

@@ -37,7 +37,7 @@ from edp.workflows.monitor.fault_sessions import (
 
 Array = NDArray[np.float64]
 HEALTHY_SESSIONS = 30
-"""From which the scatter of healthy means is taken; more change little."""
+"""Number of sessions for the scatter of healthy means; more sessions change little."""
 QUIET = ("CylStroke_1", "CylStroke_2", "CylStroke_3", "PumpPressure_1", "PumpPressure_2", "OilTemperature")
 """Channels that the simulator shows without noise: theirs is taken from the healthy logs."""
 FURTHER = (

@@ -13,7 +13,7 @@ from edp.recording import Recording
 from edp.storage import make_folder
 
 LONGEST_NAME = 100
-"""Of a file, without its ending."""
+"""Maximum length of a file name without its ending."""
 
 
 def write_event_files(

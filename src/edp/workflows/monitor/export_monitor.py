@@ -50,9 +50,9 @@ from edp.workflows.monitor.export_flows import flow_part
 FORMS: Mapping[str, tuple[str, ...]] = {"c": (), "fmu": ("version", "binaries"), "ros2": ()}
 """Forms of a monitor with their options; they are forms of networks, too."""
 GOLDEN_TICKS = 120
-"""Of the self-test of residuals: more than a window, with ticks at which inputs are missing."""
+"""Length of the residuals' self-test: more than a window, with samples whose inputs are missing."""
 ROUNDING = 2.0**-22
-"""Share of a measured value by which its difference to a prediction may round."""
+"""Relative rounding error of the difference between a measured value and its prediction."""
 Rows = NDArray[np.float32]
 NO_CHAIN = GoldenChain(np.zeros((0, 0)), (), (), np.zeros(0))
 NO_RESIDUALS = GoldenResiduals(*(np.zeros((0, 0), np.float32),) * 2, np.zeros(0, np.float32))

@@ -15,7 +15,7 @@ from edp.sim.faults import FAULTS, FaultSpec, MachineFault, at_site
 from edp.sim.plan import DEFAULT_MIX
 
 SEGMENT_S = 20.0
-"""For which a session has one way of driving."""
+"""Time with one driving task within a session."""
 SOILS = ("", "", "sandy_loam", "clay")
 """Half of the sessions are in free air, as in the default mix of data sets about."""
 BASES = 12

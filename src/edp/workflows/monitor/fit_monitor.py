@@ -43,11 +43,11 @@ from edp.workflows.monitor.dictionary import build_dictionary, check_dictionary,
 from edp.workflows.monitor.fit_units import UnitMap
 
 LEAST_SESSIONS = 8
-"""Of healthy sessions: two to train on, one to choose by, and some for the rest."""
+"""Minimum number of healthy sessions: two for training, one for selection, and some for the limit."""
 CUT_S = 480.0
-"""Where there are too few sessions, longer ones are cut into pieces of this length."""
+"""Length of the segments into which sessions are cut if there are too few."""
 ROOM = 0.8
-"""Of the hours that set the limit, in advice: sessions that turn out doubtful are left out after the training."""
+"""Fraction of the hours that set the limit, for advice: doubtful sessions are omitted after the training."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ SURE = 0.5
 EXPLAINED = 0.5
 """Score of a channel from which on it is taken for a fault of its sensor alone."""
 ALIKE = 0.99
-"""Share of the best score from which on a channel is suspected as much as the best one."""
+"""Fraction of the highest score above which a channel is suspected as well."""
 
 
 class MonitorGuard:

@@ -37,13 +37,13 @@ from edp.storage.runs import Run, check_claimable, run_key
 
 ALARM_LOG = "alarms.jsonl"
 START = "start"
-"""Where the meta of a recording says when it began, as ISO 8601 text."""
+"""Key of the start time in the metadata of a recording, ISO 8601 text."""
 
 COLUMNS = (
     *("recording", "raised_s", "since_s", "severity", "sentence", "detector", "statistic", "limit"),
     *("component", "kind", "site", "size", "unit", "at_fault", "probability", "evidence"),
 )
-"""Of the CSV file; of the causes the most probable one."""
+"""Columns of the CSV file, with the most probable cause."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from edp.training.bundle import Bundle
 from edp.workflows.parity.base import FORMS, Broken, Missing, ParityCase, Row, compared
 
 TICKS = 400
-"""Of the golden recording of a network."""
+"""Length of the golden recording of a network."""
 FREE_S = 60.0
 """Length of the free run of a plant, behind its measured prefix."""
 

@@ -31,7 +31,7 @@ from edp.training.progress_steps import training_steps
 from edp.workflows.train_evaluate import StrategyFactory, prepare_data, train
 
 CARRIED_S = 60.0
-"""How long joint training carries a stream where the settings leave it open: what is to be identified takes time."""
+"""Default length of carried streams in joint training, because identification takes time."""
 
 
 @dataclass(frozen=True, kw_only=True)

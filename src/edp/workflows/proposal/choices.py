@@ -33,13 +33,14 @@ _TARGETS = (
     (Kind.FLOW,),
     (Kind.TEMPERATURE,),
 )
-"""What is predicted: the first of these kinds that is measured, or else all that is measured."""
+"""Kinds of proposed targets: the first of these that is measured, or otherwise all measured channels."""
 _LEAST_RECORDINGS = 5
 """Recordings from which whole ones test; of fewer a single one would decide the score."""
 _MOVES = 0.1
-"""Of its largest deviation in a log, what a column has at least in one in which it moves."""
+"""Minimum deviation of a moving column in a log, as a fraction of its largest deviation in any log."""
 _IN_MOST, _LEAST_TESTED = 0.7, 1.5
-"""Share of the logs in which a machine moves all that it moves; test logs in which a column should move on average."""
+"""Fraction of the logs in which a machine moves all axes, and mean number of test logs in which a column should
+move."""
 _LISTED = 3
 """Names in a sentence at most."""
 

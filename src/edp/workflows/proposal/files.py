@@ -19,7 +19,7 @@ from edp.storage.reading import Table
 MAP, SETTINGS, DATA = "map.toml", "settings.toml", "data.toml"
 MOST_FEATURES = 48
 _AHEAD_S = 0.1
-"""How far ahead a machine's motion is of use to a controller; two steps of a slow hydraulic valve."""
+"""Prediction horizon that is useful to a controller: two steps of a slow hydraulic valve."""
 _SLOW_TICKS = 5
 """Ticks ahead where a tick takes longer than half of that."""
 

@@ -65,7 +65,7 @@ class Method(Protocol):
     """A way from a source to a predictor of the target."""
 
     label: ClassVar[str]
-    """How tables and pictures call it."""
+    """Name in tables and pictures."""
     trains: ClassVar[bool] = True
     """Whether it leaves a run, which can be judged, reported and exported."""
     needs_source: ClassVar[bool] = False

@@ -23,7 +23,7 @@ _PACKED, _MATRIX = 15, 14
 _COPIES = 2
 """An array is in memory as it was unpacked and as a column."""
 _UNSTORED_BYTES = 1 << 20
-"""What an array may claim beyond that: HDF5 need not store what was never written."""
+"""Maximum size of an array beyond its stored bytes: HDF5 need not store values that were never written."""
 _MOST_OBJECTS = 1_000_000
 """Objects of a file; a Simulink log of 1,000 signals has some 30,000."""
 _LINKS = {
@@ -31,7 +31,7 @@ _LINKS = {
     h5py.h5l.TYPE_EXTERNAL: "a link to another file",
 }
 _FILTERS = frozenset((h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32))
-"""What MATLAB packs with; others may be code that the library loads from a folder."""
+"""Compression filters of MATLAB. Other filters may be code that the library loads from a folder."""
 _SHOWN = 80
 _ADVICE = "it may be damaged, or was made to exhaust memory; else save fewer variables, or Parquet or MDF, in a file"
 

@@ -22,9 +22,9 @@ Singles = NDArray[np.float32]
 BODY_NAMES = ("boom", "arm", "bucket")
 """Cylinders by what they turn, from the first joint on, as in machine files."""
 GIGA = 1e6
-"""From Gg to kg."""
+"""Factor from Gg to kg."""
 BEYOND = 0.03
-"""Share of the machine's stroke that recordings may lie beyond it: offsets of sensors, and stops that give way."""
+"""Fraction of the machine's stroke by which recordings may leave it, for sensor offsets and compliant stops."""
 ANGLE_STEP = 1e-5
 """rad by which a lever arm is differenced: half of the digits are left, 1e-10 of it."""
 MASS_WIDTH, CENTRE_WIDTH, INERTIA_WIDTH = 0.5, (0.15, 0.1), 0.6

@@ -21,8 +21,8 @@ from edp.networks.twin.grey.jit import inner
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BEYOND = 1.0
-"""Share of a stretch between knots by which the polynomials are followed beyond the first and last knot: the angle
-goes on in a straight line there, so that a run which leaves the stroke stays finite."""
+"""Fraction of a segment between knots by which the polynomials continue beyond the first and last knot. Beyond that the
+angle continues linearly, so that a run that leaves the stroke stays finite."""
 
 
 @inner

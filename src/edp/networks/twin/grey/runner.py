@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 Doubles = NDArray[np.float64]
 SINGLE_TICKS = 4
-"""Of a plan, that have steps of their own: behind them, where levers change block by block, a step takes two ticks."""
+"""Number of samples of a plan with single steps. Later steps take two samples, where levers change block by block."""
 LONGEST_S = 0.0205
-"""Of such a step: the fastest swing of a load still has ten of them."""
+"""Maximum length of such a step, s: ten steps per period of the fastest load oscillation."""
 
 
 def goes_twice(twin: GreyTwin) -> bool:

@@ -164,7 +164,7 @@ class LiveSource(ABC):
 
 
 SOURCES: Registry[type[LiveSource]] = Registry("live source")
-"""By the name of its option."""
+"""Sources by the name of their option."""
 
 
 def chosen_rate(options: SourceOptions, needs: Needs, what: str) -> float:

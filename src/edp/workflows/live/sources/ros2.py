@@ -20,7 +20,7 @@ FIELDS = {
     Kind.POSITION: "position",
     Kind.ANGLE: "position",
 }
-"""Where a channel of a kind stands in a JointState; any other is an effort."""
+"""Field of a JointState by kind of channel; any other kind is an effort."""
 SPIN_S = 0.1
 MAX_JOINTS = 4096
 """Joints of one message."""

@@ -22,13 +22,13 @@ from edp.workflows.live.sources.arrivals import Arrivals
 from edp.workflows.live.sources.base import SOURCES, LiveSource, Needs, Row, Sink, SourceOptions, chosen_rate
 
 MOST_BYTES = 16_384
-"""Of a datagram: 400 channels; a network's own limit is 65,507."""
+"""Maximum size of a datagram: 400 channels. The limit of a network is 65,507 bytes."""
 MOST_CHANNELS = 256
 BUFFER_BYTES = 1 << 20
-"""That the system keeps while the models are busy: some seconds of rows."""
+"""Receive buffer while the models are busy: some seconds of rows."""
 POLL_S = 0.1
 STARTUP_S = 30.0
-"""To wait for the first row, which says what channels there are, where no model says it."""
+"""Maximum wait for the first row, which defines the channels if no model does."""
 TIME = "t"
 
 
