@@ -103,11 +103,11 @@ class Table:
 
     def markdown(self) -> str:
         """Return the caption and the table as Markdown; marked rows are bold."""
-        heads = [_in_row(head) for head in self.heads()]
-        lines = [f"**{_in_row(self.caption)}**", "", _row(heads), _row(["---"] * len(heads))]
+        heads = [_escape_cell(head) for head in self.heads()]
+        lines = [f"**{_escape_cell(self.caption)}**", "", _row(heads), _row(["---"] * len(heads))]
         for row, cells in enumerate(self.texts()):
             bold = row in self.marked
-            lines.append(_row([f"**{_in_row(c)}**" if bold and c != MISSING else _in_row(c) for c in cells]))
+            lines.append(_row([f"**{_escape_cell(c)}**" if bold and c != MISSING else _escape_cell(c) for c in cells]))
         return "\n".join(lines) + "\n"
 
     def csv(self) -> str:
@@ -127,7 +127,7 @@ def _row(cells: list[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def _in_row(text: str) -> str:
+def _escape_cell(text: str) -> str:
     """Return a text that ends no cell, starts no element and stays on its line."""
     flat = text.replace("\\", "\\\\").replace("|", "\\|").replace("*", "\\*").replace("_", "\\_")
     return in_markdown(flat)

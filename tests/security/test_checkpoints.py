@@ -80,7 +80,7 @@ def test_one_without_a_checksum_is_refused(file):
 def test_a_hostile_header_with_the_right_checksum_is_refused(file, header):
     tensors = load(file.read_bytes())
     metadata = {"edp": header.replace("KEY", KEY), "blake2b": checkpoint.BLANK}
-    file.write_bytes(checkpoint._signed(save(tensors, metadata=metadata)))
+    file.write_bytes(checkpoint._insert_digest(save(tensors, metadata=metadata)))
     with pytest.raises(StorageError, match="is damaged"):
         load_checkpoint(file, KEY)
 

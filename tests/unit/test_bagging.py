@@ -232,13 +232,13 @@ def test_no_threshold_of_a_tree_lies_between_values_that_differ_by_rounding():
 def test_trees_see_no_row_that_they_are_judged_by(parts, monkeypatch):
     """Nor one beside it: each run of trees is grown on rows that every fold of its part trains on."""
     grown = []
-    kept = TreeLearner._grown
+    kept = TreeLearner._grow_trees
 
     def grow(self, rows, target, rounds, judged):
         grown.append((rows, judged))
         return kept(self, rows, target, rounds, judged)
 
-    monkeypatch.setattr(TreeLearner, "_grown", grow)
+    monkeypatch.setattr(TreeLearner, "_grow_trees", grow)
     outcome = fit_bagged(data_of(recording()), committee(activations=(), trees=1), spec(tree_folds=parts))
     folds = outcome.table.folds
     assert len(grown) == min(parts, folds.count) * outcome.table.targets.shape[1]

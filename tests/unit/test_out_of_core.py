@@ -368,7 +368,7 @@ def test_a_disk_that_fills_while_a_store_is_built_loses_nothing(logs, tmp_path, 
     from edp.logs.store import building
 
     monkeypatch.setattr(building, "BATCH_LOG_BYTES", 1)
-    real, written = building._stored, []
+    real, written = building._store_log, []
 
     def full(log, *rest):
         if len(written) == 3:
@@ -376,10 +376,10 @@ def test_a_disk_that_fills_while_a_store_is_built_loses_nothing(logs, tmp_path, 
         written.append(log)
         return real(log, *rest)
 
-    monkeypatch.setattr(building, "_stored", full)
+    monkeypatch.setattr(building, "_store_log", full)
     with pytest.raises(StorageError, match=r"No space left on device; free space"):
         DataSource.of(logs).store(tmp_path / "new")
-    monkeypatch.setattr(building, "_stored", real)
+    monkeypatch.setattr(building, "_store_log", real)
     reached = NotedProgress()
     DataSource.of(logs).store(tmp_path / "new", progress=reached)
     assert reached.steps[0] == 3

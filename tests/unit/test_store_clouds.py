@@ -124,5 +124,5 @@ def test_an_object_that_grew_is_refused(server, top, tmp_path):
     ],
 )
 def test_a_port_or_a_name_is_no_refusal(server, text, refused):
-    said = str(buckets.BucketReader(server.bucket)._in_words(OSError(text), "the address"))
+    said = str(buckets.BucketReader(server.bucket)._describe_error(OSError(text), "the address"))
     assert ("refuses to be read" in said) == refused

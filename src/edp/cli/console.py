@@ -72,10 +72,10 @@ class Terminal(Console):
 
     def print(self, *objects: Any, **options: Any) -> None:
         """Print text, or a renderable of this module."""
-        super().print(*(_shown(part) if isinstance(part, str) else part for part in objects), **options)
+        super().print(*(_to_text(part) if isinstance(part, str) else part for part in objects), **options)
 
 
-def _shown(text: str) -> Text:
+def _to_text(text: str) -> Text:
     return Text("\n".join(map(visible, KEPT_BREAK.split(text))))
 
 
@@ -128,12 +128,12 @@ def print_table(table: Table) -> None:
     Figures that do not fit beside each other stand below each other, each block with the first column.
     """
     table = table.without_empty_columns()
-    headings, rows = table.heads(), [[_shown(cell) for cell in row] for row in table.texts()]
+    headings, rows = table.heads(), [[_to_text(cell) for cell in row] for row in table.texts()]
     widths = _widths(headings, rows)
     has_words = any(column.is_text for column in table.columns[1:])
     for i, block in enumerate([list(range(len(widths)))] if has_words else _blocks(widths, out.width)):
         printed_table = RichTable(
-            title=_shown(table.caption) if table.caption and not i else None,
+            title=_to_text(table.caption) if table.caption and not i else None,
             title_justify="left",
             title_style="bold",
             header_style="bold",
@@ -146,7 +146,7 @@ def print_table(table: Table) -> None:
             wide = len(block) == 2 and sum(widths[other] + _GAP for other in block) > out.width
             folded = column == 0 or wide or table.columns[column].is_text
             printed_table.add_column(
-                _shown(headings[column]), justify="left" if folded else "right", overflow="fold", no_wrap=not folded
+                _to_text(headings[column]), justify="left" if folded else "right", overflow="fold", no_wrap=not folded
             )
         for row, cells in enumerate(rows):
             printed_table.add_row(
@@ -173,7 +173,7 @@ def _cell(value: Any) -> str:
 def _widths(headings: Sequence[str], rows: Sequence[Sequence[Text]]) -> list[int]:
     """Return the width of each column."""
     return [
-        max([_shown(heading).cell_len, *(row[i].cell_len for row in rows if i < len(row))])
+        max([_to_text(heading).cell_len, *(row[i].cell_len for row in rows if i < len(row))])
         for i, heading in enumerate(headings)
     ]
 
@@ -201,7 +201,7 @@ class Words(ProgressColumn):
 
     def render(self, task: Task) -> Text:
         """Return the present words."""
-        return _shown(self.of_task(task))
+        return _to_text(self.of_task(task))
 
 
 class BoundedProgress(Progress):

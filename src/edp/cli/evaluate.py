@@ -238,7 +238,7 @@ def score_table(scores: ScoresFile) -> None:
             figures = [figure(metric(s, key)) for key in (MEASURE, "mae", "p95", "p99", "composite")]
             rows.append((metric(s, MEASURE), [model.label, *figures, r2]))
         rows.sort(key=lambda row: row[0])
-        ahead = _ahead(scores, horizon)
+        ahead = _horizon_text(scores, horizon)
         heads = ["model", MEASURE_NAME, "MAE", "P95", "P99", "composite", "R2"]
         table(f"{ahead}, mean over outputs, {unit}", heads, [row for _, row in rows])
     interval_rows(scores, unit)
@@ -249,7 +249,7 @@ def score_table(scores: ScoresFile) -> None:
             )
 
 
-def _ahead(scores: ScoresFile, horizon: int) -> str:
+def _horizon_text(scores: ScoresFile, horizon: int) -> str:
     rate = scores.task.rate_hz
     return f"k = {horizon}" if rate is None else f"{number(1e3 * horizon / rate, 0)} ms ahead (k = {horizon})"
 
@@ -276,7 +276,7 @@ def _tables_by_output(scores: ScoresFile) -> None:
             model.label: [metric(model.overall[str(horizon)][t.name], MEASURE) for t in targets]
             for model in scores.models.values()
         }
-        ahead = _ahead(scores, horizon)
+        ahead = _horizon_text(scores, horizon)
         rows = [[label, *(figure(value) for value in values)] for label, values in errors.items()]
         table(f"{ahead}, {MEASURE_NAME} of each output", heads, rows)
     for name, model in scores.models.items():

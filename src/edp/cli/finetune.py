@@ -93,7 +93,9 @@ def finetune(
         return
     if not logs or delta_kb is not None:
         raise ConfigError("give LOGS of one machine, or --fleet with a store of many, to which --delta-kb belongs")
-    order = FinetuneRequest(spec=spec, method=method, baselines=_named(baselines, tuple(METHODS)), changes=others)
+    order = FinetuneRequest(
+        spec=spec, method=method, baselines=_parse_baselines(baselines, tuple(METHODS)), changes=others
+    )
     source = source_of(logs, signal_map, repair)
     with shown_progress("finetune", as_json) as progress:
         result = make(bundle, source, order, folder, progress, divided)
@@ -138,7 +140,7 @@ def _finetune_fleet(
     emit(as_json, content.to_table(), show)
 
 
-def _named(baselines: str, every: tuple[str, ...]) -> tuple[str, ...]:
+def _parse_baselines(baselines: str, every: tuple[str, ...]) -> tuple[str, ...]:
     """Names of methods from the text of ``--baselines``."""
     special = {"all": every, "none": ()}
     return (

@@ -102,7 +102,7 @@ def inspect(
         if coverage_facts is not None and page is not None:
             out.print(f"page: {full_path(page)}")
         out.print(verdict_text(quality))
-        if quality.proposed or (errors and signal_map is None and _undescribed(quality)):
+        if quality.proposed or (errors and signal_map is None and _lacks_map(quality)):
             out.print(
                 f"next: edp init {shlex.join(map(str, data))}, which writes a signal map and settings; then edp train "
                 "with both"
@@ -121,7 +121,7 @@ def inspect(
         raise typer.Exit(FAULTY)
 
 
-def _undescribed(quality: DataQuality) -> bool:
+def _lacks_map(quality: DataQuality) -> bool:
     """Whether no channel of a log was taken, which a signal map mends."""
     return any(not report.channels for report in quality.reports)
 

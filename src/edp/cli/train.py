@@ -117,7 +117,7 @@ def _train_auto(
         for note in result.choice.notes or ():
             out.print(note)
         _promise_table(result.choice)
-        _expected_table(result.choice)
+        _print_expected_errors(result.choice)
         out.print(f"bundle in {folder / 'bundle'}")
         out.print(f"next: edp evaluate {folder}")
 
@@ -135,7 +135,7 @@ def _promise_table(choice: AutoChoice) -> None:
     table(title, ["model", "parameters", "trained in", "error"], rows)
 
 
-def _expected_table(choice: AutoChoice) -> None:
+def _print_expected_errors(choice: AutoChoice) -> None:
     """Print the error to expect of each output at the longest horizon."""
     interval, skill = choice.interval, choice.skill
     if interval is None or skill is None:

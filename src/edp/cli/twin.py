@@ -217,9 +217,9 @@ def score_table(models: Mapping[str, FreeRunScores]) -> None:
         actuator_tables(models)
         return
     velocity, strokes = first.velocity_mae, first.stroke_error
-    rows = [[_with_unit("velocity", velocity), *(_number(one.velocity_mae.mean) for one in models.values())]]
+    rows = [[_add_unit("velocity", velocity), *(_number(one.velocity_mae.mean) for one in models.values())]]
     for k, row in enumerate(strokes):
-        name = _with_unit(f"stroke after {figure(row.at_s)} s", row)
+        name = _add_unit(f"stroke after {figure(row.at_s)} s", row)
         rows.append([name, *(_number(one.stroke_error[k].mean) for one in models.values())])
     rows.append(["pressure, deviations", *(_number(one.pressure_nrmse.mean) for one in models.values())])
     rows.append(["diverged runs", *(percent(one.diverged) for one in models.values())])
@@ -285,7 +285,7 @@ def situation_table(scores: FreeRunScores) -> None:
         strokes = None if row.stroke_error is None else row.stroke_error.mean
         cells = [percent(row.share), *map(_number, (row.velocity_mae.mean, strokes, row.pressure_nrmse.mean))]
         rows.append([name.replace("_", " "), *cells])
-    heads = ["", "share of the time", _with_unit("velocity", scores.velocity_mae), "stroke", "pressure (NRMSE)"]
+    heads = ["", "share of the time", _add_unit("velocity", scores.velocity_mae), "stroke", "pressure (NRMSE)"]
     table("errors by what the actuators did", heads, rows)
 
 
@@ -308,7 +308,7 @@ def ahead_table(scores: FreeRunScores) -> None:
             out.print(f"the predictor was trained on {len(beside.trained_on)} of these recordings: it is flattered")
 
 
-def _with_unit(text: str, row: ChannelErrors) -> str:
+def _add_unit(text: str, row: ChannelErrors) -> str:
     return text if row.unit is None else f"{text}, {row.unit}"
 
 

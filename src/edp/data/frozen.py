@@ -122,10 +122,10 @@ class ByFrozen:
             i for i, recording in enumerate(recordings) if recording.digest not in self.frozen and i not in validation
         ]
         if self.missing == "draw" or not validation:
-            return self._drawn(recordings, free, test, validation, gap)
+            return self._draw_parts(recordings, free, test, validation, gap)
         return _whole(recordings, {"train": free, "validation": validation, "test": test})
 
-    def _drawn(
+    def _draw_parts(
         self, recordings: Sequence[Recording], free: list[int], test: list[int], validation: list[int], gap: int
     ) -> Split:
         """Fill the parts that have no session by a random draw from the free sessions."""

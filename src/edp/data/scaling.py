@@ -127,10 +127,10 @@ def _moments(task: Task, train: Sequence[Series]) -> tuple[Moments, list[Moments
         targets = np.asarray(series.targets)
         for moments, horizon in zip(changes, task.horizons, strict=True):
             if series.samples > horizon:
-                moments.update(_encoded(task, targets, horizon))
+                moments.update(_encode_targets(task, targets, horizon))
     return features, changes
 
 
-def _encoded(task: Task, targets: NDArray[np.float32], horizon: int) -> NDArray[np.float32]:
+def _encode_targets(task: Task, targets: NDArray[np.float32], horizon: int) -> NDArray[np.float32]:
     future = targets[horizon:]
     return future - targets[: len(future)] if task.mode is TargetMode.DELTA else future

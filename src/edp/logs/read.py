@@ -55,7 +55,7 @@ def read_recording(
         DataError: the file, a column, a unit, a time stamp or a value cannot be used; the message says what to change.
     """
     signal_map, repair = signal_map or SignalMap(), repair or Repair()
-    raw, sources = _opened(path, signal_map)
+    raw, sources = _open_with_channels(path, signal_map)
     return assemble(raw, sources, signal_map, repair, name, rows)[0]
 
 
@@ -84,11 +84,11 @@ def read_parts(
     if samples < 1:
         raise DataError(f"parts of {samples} samples asked for; give at least 1")
     signal_map, repair = signal_map or SignalMap(), repair or Repair()
-    raw, sources = _opened(path, signal_map)
+    raw, sources = _open_with_channels(path, signal_map)
     yield from parts(prepare(raw, sources, signal_map, repair), samples, raw.name or name_of_file(raw.path))
 
 
-def _opened(path: str | Path, signal_map: SignalMap) -> tuple[RawLog, list[ChannelSource]]:
+def _open_with_channels(path: str | Path, signal_map: SignalMap) -> tuple[RawLog, list[ChannelSource]]:
     """Open the file and return the requested channels, all of which must exist."""
     raw = open_log(path, signal_map)
     sources, problems = resolve(raw, signal_map)
@@ -204,13 +204,13 @@ def alike(recordings: list[Recording], files: Sequence[Path], truth_asked: bool 
         DataError: mixed rates or channels.
     """
     if not truth_asked:
-        recordings = _without_partial_truth(recordings)
+        recordings = _drop_partial_truth(recordings)
     _check_same(recordings, files)
     rate = recordings[0].rate_hz
     return [recording if recording.rate_hz == rate else replace(recording, rate_hz=rate) for recording in recordings]
 
 
-def _without_partial_truth(recordings: list[Recording]) -> list[Recording]:
+def _drop_partial_truth(recordings: list[Recording]) -> list[Recording]:
     """Remove ground truth that only some recordings hold: ground heights exist in soil, not in free air."""
     if len({recording.channel_names for recording in recordings}) == 1:
         return recordings

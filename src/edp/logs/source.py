@@ -195,9 +195,9 @@ class DataSource:
         if self.stored:
             return []
         if self.path.suffix == ".toml":
-            return _listed(self.path, self.signal_map, self.repair)
+            return _read_data_set(self.path, self.signal_map, self.repair)
         if self.address:
-            return _in_bucket(self.address, self.signal_map, self.repair)
+            return _list_bucket(self.address, self.signal_map, self.repair)
         files = dict.fromkeys(file for path in self.paths for file in find_recordings(path))
         return [Log(path, self.signal_map, self.repair) for path in files]
 
@@ -298,7 +298,7 @@ class DataSource:
             for one in part.sketches:
                 if one is not None:
                     sketches.add(one)
-        return compare(reports, sketches, self._drawn_findings(recordings))
+        return compare(reports, sketches, self._note_selection(recordings))
 
     def _units_of_store(self, recordings: Sequence[Recording], are_at_hand: bool) -> list[WorkUnit]:
         """Parts of the recordings of a store; recordings at hand are not read again."""
@@ -315,7 +315,7 @@ class DataSource:
             units.append(WorkUnit(f"{__name__}:inspect_stored", part[0].name, arguments, digest, where, len(part)))
         return units
 
-    def _drawn_findings(self, recordings: Sequence[Recording]) -> tuple[Finding, ...]:
+    def _note_selection(self, recordings: Sequence[Recording]) -> tuple[Finding, ...]:
         """Return the note of an inspection if these recordings are only a part of the store."""
         whole = self.at_most_h is None
         return () if whole else findings_of_part(recordings, read_index(self.store_folder()).hours())
@@ -377,7 +377,7 @@ class Log:
         return replace(recording, meta={**recording.meta, MACHINE: self.machine}) if self.machine else recording
 
 
-def _in_bucket(address: str, signal_map: SignalMap | None, repair: Repair | None) -> list[Log]:
+def _list_bucket(address: str, signal_map: SignalMap | None, repair: Repair | None) -> list[Log]:
     """Return the logs below an address of a bucket, or the log at it, selected by file ending."""
     objects = BucketReader(address).objects(address)
     suffixes = known_suffixes()
@@ -425,7 +425,7 @@ def load_data_set(path: str | Path) -> DataSetSettings:
     return settings
 
 
-def _listed(path: Path, signal_map: SignalMap | None, repair: Repair | None) -> list[Log]:
+def _read_data_set(path: Path, signal_map: SignalMap | None, repair: Repair | None) -> list[Log]:
     """Return the logs of a data-set file with resolved paths; a map given here replaces the common map."""
     settings = load_data_set(path)
 
@@ -435,7 +435,7 @@ def _listed(path: Path, signal_map: SignalMap | None, repair: Repair | None) -> 
     shared = signal_map or resolved(settings.map)
     logs = []
     for entry in settings.recordings:
-        expanded = _expanded(entry.path, path)
+        expanded = _expand_variables(entry.path, path)
         address = bucket_address(expanded)
         remote = BucketReader(address).objects(address)[0] if address else None
         # An absolute path stands for itself, and so does an address.
@@ -457,7 +457,7 @@ def _check_listed(recordings: list[Recording], path: Path) -> None:
         raise DataError(f"'{path}': mixed rates: {shown}; set rate_hz in the signal map")
 
 
-def _expanded(entry: str, path: Path) -> str:
+def _expand_variables(entry: str, path: Path) -> str:
     """`entry` with environment variables put in, so that a data-set file can name logs on another disk."""
     full = os.path.expandvars(entry)
     if "$" in full:

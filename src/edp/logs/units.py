@@ -129,18 +129,18 @@ def mapped_channel(entry: ChannelMap) -> Channel:
 
 def with_kinds(signal_map: SignalMap) -> SignalMap:
     """Return a map whose entries state the kinds given by their units."""
-    return replace(signal_map, channels=tuple(map(_with_kind, signal_map.channels)))
+    return replace(signal_map, channels=tuple(map(_add_kind, signal_map.channels)))
 
 
 def without_derived_kinds(signal_map: SignalMap) -> SignalMap:
     """Return a map with the meaning of earlier versions, which read a channel without a kind as plain numbers."""
     entries = (
-        replace(entry, kind=Kind.GENERIC) if _with_kind(entry) != entry else entry for entry in signal_map.channels
+        replace(entry, kind=Kind.GENERIC) if _add_kind(entry) != entry else entry for entry in signal_map.channels
     )
     return replace(signal_map, channels=tuple(entries))
 
 
-def _with_kind(entry: ChannelMap) -> ChannelMap:
+def _add_kind(entry: ChannelMap) -> ChannelMap:
     kind = mapped_channel(entry).kind
     is_derived = entry.kind is None and entry.name not in VOCABULARY and kind is not Kind.GENERIC
     return replace(entry, kind=kind) if is_derived else entry

@@ -226,9 +226,9 @@ class Monitor:
 
     def conditioned_rows(self, recording: Recording) -> Array:
         """Conditioned summaries of each block, NaN where missing, shape (blocks, summaries); see `summary_names`."""
-        return self._conditioned(recording)[0]
+        return self._condition(recording)[0]
 
-    def _conditioned(self, recording: Recording) -> tuple[Array, Array]:
+    def _condition(self, recording: Recording) -> tuple[Array, Array]:
         """Return the conditioned rows with and without clipping."""
         self.check(recording)
         state, rows, out = self.initial_state(), rows_of(recording, self.inputs), []
@@ -244,7 +244,7 @@ class Monitor:
 
     def white_rows(self, recording: Recording) -> Array:
         """White rows as the detectors see them, shape (blocks, directions of all watches)."""
-        return self.chain.bank.white(*self._conditioned(recording))
+        return self.chain.bank.white(*self._condition(recording))
 
     def alarm(self, verdict: BlockVerdict, recording: str = "") -> MonitorAlarm:
         """Create the alarm of a block's verdict.

@@ -149,14 +149,14 @@ class DataSetSpec:
     def _soils(self, excitations: Sequence[str]) -> list[str]:
         """Return the material of each recording; empty for free air. Each family gets all materials in turn."""
         soils = [""] * len(excitations)
-        places = [i for i in _by_family(excitations) if EXCITATIONS[excitations[i]].works_ground]
+        places = [i for i in _sort_by_family(excitations) if EXCITATIONS[excitations[i]].works_ground]
         if self.materials:
             for recording_index, chosen in zip(places, hand_out(self.materials, len(places)), strict=True):
                 soils[recording_index] = "" if chosen == AIR else chosen
         return soils
 
 
-def _by_family(excitations: Sequence[str]) -> list[int]:
+def _sort_by_family(excitations: Sequence[str]) -> list[int]:
     """Return the recording indices sorted by family."""
     return sorted(range(len(excitations)), key=lambda i: excitations[i])
 
@@ -205,13 +205,15 @@ def over_family(
         raise ConfigError(f"family = {count} machines; at least one is needed")
     turns = {
         recording_index: turn % count
-        for turn, recording_index in enumerate(_by_family([s.excitation for s in scenarios]))
+        for turn, recording_index in enumerate(_sort_by_family([s.excitation for s in scenarios]))
     }
     names = [member_name(seed, turns[i], masses, scatter) for i in range(len(scenarios))]
-    return tuple(replace(s, machine=n, name=_named(s.name, n)) for s, n in zip(scenarios, names, strict=True))
+    return tuple(
+        replace(s, machine=n, name=_rename_recording(s.name, n)) for s, n in zip(scenarios, names, strict=True)
+    )
 
 
-def _named(name: str, machine: str) -> str:
+def _rename_recording(name: str, machine: str) -> str:
     return "_".join([machine, *name.split("_", 1)[1:]])
 
 

@@ -82,7 +82,7 @@ class Simulation:
         Raises:
             SimulationError: the state became non-finite.
         """
-        rows = self._moved(targets)
+        rows = self._advance(targets)
         self.samples += len(rows)
         # Asked once a block: what once is not finite stays so.
         if not self.plant.finite:
@@ -95,7 +95,7 @@ class Simulation:
         self._targets.append(targets)
         return rows
 
-    def _moved(self, targets: Array) -> Array:
+    def _advance(self, targets: Array) -> Array:
         """Advance the plant with parameters that follow the faults sample by sample."""
         run = self.plant.follow if self.operator.by_hand else self.plant.run
         if not self._course.faults:

@@ -120,14 +120,14 @@ def _run(path: Path) -> ListedRun:
     kind = _kind(path, identity, status)
     data = provenance.get("data")
     source = str(data.get("source", "")) if isinstance(data, dict) else ""
-    when = str(status.get("time") or provenance.get("created") or _touched(path))
+    when = str(status.get("time") or provenance.get("created") or _last_change(path))
     score = ""
     try:
         score = _score(scores)
     except (KeyError, TypeError, ValueError, AttributeError):
         damaged.append("scores.json")
     state = _state(path, kind, status)
-    damaged += _damaged_parts(path, kind if state == FINISHED else None)
+    damaged += _list_damaged(path, kind if state == FINISHED else None)
     return ListedRun(
         path, kind.name, "damaged" if damaged else state, when[:_LONGEST], source[:_LONGEST], score[:_LONGEST]
     )
@@ -157,7 +157,7 @@ def _study_state(path: Path, kind: RunKind) -> str:
     return str(_part(path / kind.result, []).get("state", ""))
 
 
-def _damaged_parts(path: Path, finished: RunKind | None) -> list[str]:
+def _list_damaged(path: Path, finished: RunKind | None) -> list[str]:
     """Return the settings and models of a run that are damaged, and the model that a finished run lacks."""
     damaged = []
     try:
@@ -190,7 +190,7 @@ def _part(file: Path, damaged: list[str]) -> Mapping[str, object]:
     return content
 
 
-def _touched(path: Path) -> str:
+def _last_change(path: Path) -> str:
     """Return the time of the last change of a folder, in the form of the files."""
     try:
         return time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(status_of(path).st_mtime))

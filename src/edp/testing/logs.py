@@ -87,10 +87,10 @@ def check_damage(form: LogFormat) -> None:
         # Nothing, less than a head, half, and all but an end that many formats need.
         for size in (0, 10, len(content) // 2, len(content) - 10):
             path.write_bytes(content[:size])
-            _refused(form, path, f"a file that is cut off after {size} of {len(content)} bytes")
+            _is_refused(form, path, f"a file that is cut off after {size} of {len(content)} bytes")
         # Random bytes of the same length: nothing in them must be taken for a log.
         path.write_bytes(np.random.default_rng(0).bytes(len(content)))
-        expect(_refused(form, path, "random bytes"), f"format '{form.name}' reads random bytes as a log")
+        expect(_is_refused(form, path, "random bytes"), f"format '{form.name}' reads random bytes as a log")
 
 
 def check_log_format(form: LogFormat) -> None:
@@ -113,7 +113,7 @@ def check_log_format(form: LogFormat) -> None:
     check_damage(form)
 
 
-def _refused(form: LogFormat, path: Path, what: str) -> bool:
+def _is_refused(form: LogFormat, path: Path, what: str) -> bool:
     try:
         read_log(form, path)
     except EdpError:

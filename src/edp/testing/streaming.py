@@ -235,7 +235,7 @@ def check_graph(predictor: Predictor) -> None:
         ExportError: a part has no form as layers.
     """
     graph = predictor.graph()
-    x, expected = _streamed(predictor)
+    x, expected = _stream_outputs(predictor)
     reference = Reference(graph)
     results = [reference.results(row) for row in x]
     expect(set(results[0]) == set(expected), f"the list gives {sorted(results[0])}; {sorted(expected)} must hold")
@@ -300,7 +300,7 @@ def _layout(state: State) -> list[tuple[torch.Size, torch.dtype]]:
     return layout
 
 
-def _streamed(predictor: Predictor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _stream_outputs(predictor: Predictor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return inputs ``(time, input)``, predictions and, if there are any, bounds, as streamed by PyTorch."""
     draw = torch.Generator().manual_seed(0)
     x = torch.randn(1, TICKS, predictor.front.inputs, generator=draw).double()

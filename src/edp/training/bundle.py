@@ -189,7 +189,7 @@ def load_bundle(folder: str | Path) -> Bundle:
         check_hash(header, path / HEADER)
         if unknown := unknown_parts(header["model"]):
             raise BundleError(f"bundle '{path}': {'; '.join(unknown)}")
-        return _assembled(header, path)
+        return _assemble(header, path)
 
 
 def with_plugins(header: Mapping[str, object]) -> dict[str, object]:
@@ -228,23 +228,23 @@ def upgrade_bundle(folder: str | Path) -> Path:
             raise BundleError(f"bundle '{path}' has schema {schema}; there is nothing to upgrade")
         if schema in REWORDED:
             check_hash(header, path / HEADER)
-        upgraded = _reworded(header) | {"schema": (UNHASHED | REWORDED)[schema]}
+        upgraded = _convert_keys(header) | {"schema": (UNHASHED | REWORDED)[schema]}
         # The content is assembled once, so that damage is not sealed under a new hash.
-        _assembled(upgraded, path)
+        _assemble(upgraded, path)
     write_json(path / HEADER, with_plugins(upgraded))
     return path
 
 
-def _reworded(header: Table) -> dict[str, object]:
+def _convert_keys(header: Table) -> dict[str, object]:
     """Convert the keys of an earlier header to this version."""
-    reworded = {**header, "provenance": _renamed(header["provenance"], "lesson", "strategy")}
+    reworded = {**header, "provenance": _rename_key(header["provenance"], "lesson", "strategy")}
     if "adaptation" in header:
         entry = header["adaptation"]
-        reworded["adaptation"] = {**entry, "spec": _renamed(entry["spec"], "rest", "dead_zone")}
+        reworded["adaptation"] = {**entry, "spec": _rename_key(entry["spec"], "rest", "dead_zone")}
     return reworded
 
 
-def _renamed(table: Mapping[str, object], old: str, new: str) -> dict[str, object]:
+def _rename_key(table: Mapping[str, object], old: str, new: str) -> dict[str, object]:
     return {new if key == old else key: value for key, value in table.items()}
 
 
@@ -284,7 +284,7 @@ def _read_header(path: Path) -> dict[str, object]:
     return header
 
 
-def _assembled(header: Table, path: Path) -> Bundle:
+def _assemble(header: Table, path: Path) -> Bundle:
     """Build the bundle from a header and its files."""
     spec, task = model_from_plain(header["model"]), task_from_plain(header["task"])
     inputs = tuple(Channel(_text(c["name"]), Kind(c["kind"]), _text(c["description"])) for c in header["inputs"])

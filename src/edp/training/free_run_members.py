@@ -83,7 +83,7 @@ def train_unit(identity: TrainingIdentity, where: Mapping[str, MemberTraining]) 
 
 def noted_progress(jobs: Sequence[MemberTraining]) -> FreeRunProgress | None:
     """Combine the latest progress of parallel trainings; None if there is none yet."""
-    noted = [_noted(job) for job in jobs]
+    noted = [_read_progress(job) for job in jobs]
     events = [event for event in noted if event is not None]
     if not events:
         return None
@@ -101,7 +101,7 @@ def noted_progress(jobs: Sequence[MemberTraining]) -> FreeRunProgress | None:
     )
 
 
-def _noted(job: MemberTraining) -> FreeRunProgress | None:
+def _read_progress(job: MemberTraining) -> FreeRunProgress | None:
     if job.folder is None or not is_file_at(note := job.folder[0] / NOTE):
         return None
     try:

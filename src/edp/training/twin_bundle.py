@@ -180,10 +180,10 @@ def load_twin(folder: str | Path) -> TwinBundle:
                 "install a newer one, or train again"
             )
         check_hash(header, path / HEADER)
-        return _assembled(header, path)
+        return _assemble(header, path)
 
 
-def _assembled(header: Table, path: Path) -> TwinBundle:
+def _assemble(header: Table, path: Path) -> TwinBundle:
     parts = {part: tuple(_channel(entry) for entry in header["channels"][part]) for part in PARTS}
     if not RATE.holds(header["rate_hz"]):
         raise ValueError(f"its rate_hz is {str(header['rate_hz'])[:40]}; {RATE.rule('rate_hz')} must hold")

@@ -42,7 +42,7 @@ def footprint_of(path: str | Path, budget: Budget | None = None) -> tuple[Footpr
     if budget is not None:
         alone = replace(predictor.spec, blocks=(), physics=None)
         # One unit without blocks is the smallest network of these inputs: if it is too large, all are.
-        check_possible(budget, footprint(_untrained(student(alone, units=1), predictor.task)))
+        check_possible(budget, footprint(_build_untrained(student(alone, units=1), predictor.task)))
     return footprint(predictor, adaptation), name
 
 
@@ -63,7 +63,7 @@ def _predictor_of(path: str | Path) -> tuple[Predictor, str, Adaptation | None]:
         experiment = load_experiment(source)
         # A settings file names no rate; counts do not depend on it, so the thesis's 100 Hz stands in.
         task = experiment.task.resolve(100.0, physics=experiment.model.physics)
-        return _untrained(experiment.model, task), source.stem, None
+        return _build_untrained(experiment.model, task), source.stem, None
     bundle = load_bundle(source)
     predictor = bundle.predictor
     # Integer networks have the counts of the network that they were quantised from.
@@ -132,5 +132,5 @@ def unheld_adaptation(path: str | Path, to: str) -> bool:
     return load_exported(path).adaptation is not None and not getattr(TARGETS[to], "adapts", False)
 
 
-def _untrained(model: ModelSpec, task: Any) -> Predictor:
+def _build_untrained(model: ModelSpec, task: Any) -> Predictor:
     return build_model(task, model, blank_scaler(task), seed=0)

@@ -200,7 +200,7 @@ def test_a_step_of_the_plan_is_the_solution_of_the_bounded_least_squares(env, mo
     rng = np.random.default_rng(1)
     jacobian, error = rng.normal(size=(30, 6)), 3.0 * rng.normal(size=30)
     none = np.zeros((0, 6)), np.zeros(0), np.zeros(0)
-    step, _ = controller._solved(jacobian.T @ jacobian, jacobian.T @ error, *none)
+    step, _ = controller._solve_step(jacobian.T @ jacobian, jacobian.T @ error, *none)
     low, high = np.tile(controller._valves.slowest, 2), np.tile(controller._valves.fastest, 2)
     expected = lsq_linear(jacobian, -error, bounds=(low, high), tol=1e-12)
     assert step == pytest.approx(expected.x, abs=1e-6)
@@ -210,7 +210,7 @@ def test_a_step_of_the_plan_is_the_solution_of_the_bounded_least_squares(env, mo
 def test_a_soft_limit_gives_way_where_it_cannot_be_met(env, models):
     controller = CONTROLLERS["nmpc"](blocks=(3,), trust_m_s=100.0).build(interface_of(env), LoopLimits(), models)
     row = np.ones((1, 3))
-    step, _ = controller._solved(np.eye(3), np.zeros(3), row, np.array([5.0]), np.array([6.0]))
+    step, _ = controller._solve_step(np.eye(3), np.zeros(3), row, np.array([5.0]), np.array([6.0]))
     assert step == pytest.approx(controller._valves.fastest, rel=1e-3)
 
 
@@ -236,7 +236,7 @@ def test_predictions_that_are_not_finite_are_a_fault(env, models):
     controller = CONTROLLERS["nmpc"]().build(interface_of(env), LoopLimits(), models)
     hessian = np.full((18, 18), np.nan)
     with pytest.raises(module.ControlFault, match="not finite"):
-        controller._solved(hessian, np.zeros(18), np.zeros((0, 18)), np.zeros(0), np.zeros(0))
+        controller._solve_step(hessian, np.zeros(18), np.zeros((0, 18)), np.zeros(0), np.zeros(0))
 
 
 @pytest.mark.long

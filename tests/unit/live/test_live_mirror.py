@@ -50,10 +50,10 @@ def test_a_server_that_does_not_start_is_one_error(monkeypatch, tmp_path: Path):
     program.chmod(0o755)
     monkeypatch.setattr(mirror, "_program", lambda: program)
     with pytest.raises(ConfigError, match="Rerun does not start: the port  is taken"):
-        mirror._started(tmp_path, *mirror._free_ports(2))
+        mirror._start_server(tmp_path, *mirror._free_ports(2))
     program.write_text("#!/bin/sh\necho no >&2\nexit 1\n")
     with pytest.raises(ConfigError, match="does not turn its telemetry off, and is not started: no"):
-        mirror._started(tmp_path, 1, 2)
+        mirror._start_server(tmp_path, 1, 2)
 
 
 def test_a_session_is_given_in_pieces_to_a_server_on_loopback(tmp_path: Path):

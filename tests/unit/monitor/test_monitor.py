@@ -11,7 +11,7 @@ import pytest
 from edp.config.monitor import load_monitor_experiment
 from edp.errors import BundleError, ConfigError, DataError, EdpError
 from edp.monitor.monitor_file import HEADER, load_monitor, save_monitor
-from edp.monitor.watches import _averaged, _averages
+from edp.monitor.watches import _average_blocks, _averages
 from edp.recording import Recording
 from edp.storage.seals import HASH, content_digest
 from edp.testing.monitor import rig_sessions
@@ -163,7 +163,7 @@ def test_what_no_monitor_can_be_made_from_is_refused_before_a_residual_is_fitted
 @pytest.mark.parametrize("blocks", [1, 2, 3, 7])
 def test_averages_are_counted_as_they_are_made(blocks):
     for length in range(40):
-        assert _averages(length, blocks) == len(_averaged(np.zeros((length, 2)), blocks))
+        assert _averages(length, blocks) == len(_average_blocks(np.zeros((length, 2)), blocks))
 
 
 def test_a_healthy_log_with_a_fault_is_named(healthy, fitted):

@@ -221,7 +221,7 @@ def test_bursts_of_a_logger_do_not_set_the_pace_of_a_bag(tmp_path):
     raw = RawLog(tmp_path / "a.bag", signals)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(looked, "open_log", lambda path, signal_map: raw)
-        look = looked._of_own_pace(raw.path, raw.path, "", SignalMap(others=True))
+        look = looked._look_at_signals(raw.path, raw.path, "", SignalMap(others=True))
     assert look is not None
     assert look.rows == COUNT
     assert look.step_s == pytest.approx(0.01)

@@ -98,7 +98,7 @@ def test_a_twin_that_goes_on_is_refused_at_once_too(logs, monkeypatch, tmp_path,
 @pytest.fixture
 def identifies_nothing(monkeypatch):
     module = sys.modules["edp.workflows.identify.identify"]
-    monkeypatch.setattr(module, "_fitted", lambda *args: pytest.fail("a grey box is fitted before the refusal"))
+    monkeypatch.setattr(module, "_fit_grey_box", lambda *args: pytest.fail("a grey box is fitted before the refusal"))
     return module
 
 

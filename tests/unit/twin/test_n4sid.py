@@ -9,7 +9,7 @@ from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, DataError
 from edp.ir.reference import Reference
 from edp.networks.twin import fit_scales
-from edp.networks.twin.n4sid import N4sid, _divided, _gain, _stable
+from edp.networks.twin.n4sid import N4sid, _divide, _gain, _stable
 from edp.signals import Channel, Kind
 
 RATE_HZ = 100.0
@@ -96,10 +96,10 @@ def test_unstable_and_slow_poles_become_stable():
 
 def test_every_fifth_recording_or_the_end_of_a_single_one_chooses_the_order():
     series = recordings(count=6, ticks=400)
-    fitted, judged = _divided(series, 100)
+    fitted, judged = _divide(series, 100)
     assert [part.name for part in judged] == ["run 4"]
     assert "run 4" not in [part.name for part in fitted]
-    fitted, judged = _divided(series[:1], 100)
+    fitted, judged = _divide(series[:1], 100)
     assert (fitted[0].samples, judged[0].samples) == (300, 100)
 
 

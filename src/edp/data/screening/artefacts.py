@@ -137,7 +137,7 @@ def broken_flags(
     flags = []
     for i in judged:
         sources = [j for j in trusted if j != i]
-        verdicts = [(_broken(relations[:, i, j], np.abs(slopes[:, i, j]), squares[:, [i, j]]), j) for j in sources]
+        verdicts = [(_find_break(relations[:, i, j], np.abs(slopes[:, i, j]), squares[:, [i, j]]), j) for j in sources]
         reported = [(*verdict, j) for verdict, j in verdicts if verdict is not None]
         if reported:
             value, text, j = max(reported)
@@ -146,7 +146,7 @@ def broken_flags(
     return flags
 
 
-def _broken(relation: Array, slope: Array, squares: Array) -> tuple[float, str] | None:
+def _find_break(relation: Array, slope: Array, squares: Array) -> tuple[float, str] | None:
     """Mean correlation where there is one, and in words how it breaks; None where it does not.
 
     Args:

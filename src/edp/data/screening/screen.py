@@ -115,7 +115,7 @@ def _screen(recordings: Sequence[Recording], spec: ScreeningSpec, clock: _Clock)
     used = [int(i) for i in live if table.names[i] not in flagged or i in table.targets]
     measured = _Measured(matrices, metrics, curves, stable)
     evidence = _evidence(table, lagged, spec, measured, used, clock)
-    return _concluded(recordings, table, spec, measured, flags, evidence, clock.seconds)
+    return _assemble_result(recordings, table, spec, measured, flags, evidence, clock.seconds)
 
 
 @dataclass(frozen=True)
@@ -149,10 +149,10 @@ def _matrices(table: CandidateTable, spec: ScreeningSpec, clock: _Clock) -> Matr
         informed = Information(sample, spec.neighbours, spec.seed).matrix(
             lambda share: tell("mutual information", share)
         )
-    return Matrices(table.names, *(_widened(table, m) for m in (pearson, spearman, kendall, informed)))
+    return Matrices(table.names, *(_expand_matrix(table, m) for m in (pearson, spearman, kendall, informed)))
 
 
-def _widened(table: CandidateTable, matrix: Array) -> Array:
+def _expand_matrix(table: CandidateTable, matrix: Array) -> Array:
     """Expand a matrix over live channels to all channels, NaN elsewhere."""
     live = np.flatnonzero(table.live)
     full = np.full((len(table.names), len(table.names)), np.nan)
@@ -230,7 +230,7 @@ def _evidence(
         )
         history = values.window_needed(lagged, among, targets.tolist(), spec.horizon, held_out)
     clusters = _clusters(table, spearman, columns, groups, relations.linear[np.searchsorted(lagged.live, columns)])
-    pieces = _at_best(lagged, targets, relations)
+    pieces = _select_best_lags(lagged, targets, relations)
     correlations = lagged.pooled()
     return ScreeningEvidence(
         table, lagged.live, correlations, relations, pieces, measured.curves, importance, worth, clusters, history
@@ -261,7 +261,7 @@ def _clusters(
     return clusters
 
 
-def _at_best(lagged: Lagged, targets: NDArray[np.int64], relations: stability.Relations) -> Array:
+def _select_best_lags(lagged: Lagged, targets: NDArray[np.int64], relations: stability.Relations) -> Array:
     """Return the correlation in each segment at the target and lag with the largest mean, ``(piece, channel)``."""
     pieces = lagged.by_piece(targets)[:, : lagged.reach + 1]
     target = np.abs(relations.linear).argmax(axis=1)
@@ -270,7 +270,7 @@ def _at_best(lagged: Lagged, targets: NDArray[np.int64], relations: stability.Re
     return np.asarray(chosen[:, lag, np.arange(pieces.shape[2])], dtype=np.float64)
 
 
-def _concluded(
+def _assemble_result(
     recordings: Sequence[Recording],
     table: CandidateTable,
     spec: ScreeningSpec,

@@ -210,7 +210,11 @@ class Model:
             (f"{upper}_AHEAD_{k} = {i},", f"{k} ticks, {1000 * k / task.rate_hz:g} ms")
             for i, k in enumerate(task.horizons)
         ]
-        return {"input_enum": _listed(inputs), "target_enum": _listed(targets), "horizon_enum": _listed(ahead)}
+        return {
+            "input_enum": _write_enumeration(inputs),
+            "target_enum": _write_enumeration(targets),
+            "horizon_enum": _write_enumeration(ahead),
+        }
 
     def _state(self) -> dict[str, str]:
         declared, cleared = remembered(self.graph)
@@ -312,7 +316,7 @@ def computed(graph: Graph, plan: MemoryPlan) -> tuple[list[str], list[str]]:
     return lines[1:], [*checks, "if (finite) {", *copies, "}", "return finite;"]
 
 
-def _listed(entries: Sequence[tuple[str, str]]) -> Code:
+def _write_enumeration(entries: Sequence[tuple[str, str]]) -> Code:
     """Lines of an enumeration with a comment each."""
     wide = max(len(entry) for entry, _ in entries)
     return Code("\n".join(f"    {entry:<{wide}} /* {c_comment(text)} */" for entry, text in entries))

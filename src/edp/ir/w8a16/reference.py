@@ -72,14 +72,14 @@ class Integers:
             if run is not None:
                 values[layer.name] = run(layer, self.memory[layer.name], *layer_inputs)
             elif isinstance(layer, quantised.Quantise):
-                values[layer.name] = self._quantised(layer, layer_inputs[0])
+                values[layer.name] = self._quantise(layer, layer_inputs[0])
             elif isinstance(layer, memory.Feed):
                 self.memory[layer.into]["last"] = layer_inputs[0][-1]
             else:
                 raise KeyError(type(layer))
         return values
 
-    def _quantised(self, layer: quantised.Quantise, x: NDArray[np.float32]) -> Fixed:
+    def _quantise(self, layer: quantised.Quantise, x: NDArray[np.float32]) -> Fixed:
         wide = x * np.float32(2.0**layer.frac)
         top = np.float32(LARGEST)
         self.clipped += int((~((wide >= -top) & (wide <= top))).sum())
@@ -140,7 +140,7 @@ def _dense(layer: quantised.QDense, m: Memory, x: Fixed) -> Fixed:
     return np.asarray(flat(saturated(scaled(sums, layer.multiplier, layer.shift))))
 
 
-def _grouped(layer: quantised.QGroupedDense, m: Memory, x: Fixed) -> Fixed:
+def _grouped_dense(layer: quantised.QGroupedDense, m: Memory, x: Fixed) -> Fixed:
     rows = split(x, len(layer.bias))
     sums = np.einsum("roi,tbri->tbro", layer.weight.astype(np.int64), rows) + layer.bias
     return np.asarray(flat(saturated(scaled(sums, layer.multiplier, layer.shift))))
@@ -260,7 +260,7 @@ INTEGER_STEPS: dict[type[Layer], Callable[..., Any]] = {
     quantised.QActivate: _activate,
     quantised.QGlu: _glu,
     quantised.QDense: _dense,
-    quantised.QGroupedDense: _grouped,
+    quantised.QGroupedDense: _grouped_dense,
     quantised.QTreeSums: _trees,
     quantised.QConvolution: _convolution,
     quantised.QLstm: _lstm,

@@ -93,7 +93,7 @@ def _gelu(x: Rows) -> Rows:
     return np.asarray(np.float32(0.5) * x * (ONE + erf))
 
 
-def _turned(x: Rows, quarters: int) -> Rows:
+def _sine_of_quadrant(x: Rows, quarters: int) -> Rows:
     """Return the runtime's sine of x plus a number of quarter turns."""
     f = np.float32
     # 8,192 rad: up to there n times the parts of pi/2 below stays exact.
@@ -120,8 +120,8 @@ FUNCTIONS: dict[Function, Callable[[Rows], Rows]] = {
     Function.SOFTPLUS: _softplus,
     Function.EXP: exp,
     Function.SQRT: np.sqrt,
-    Function.SINE: lambda x: _turned(x, 0),
-    Function.COSINE: lambda x: _turned(x, 1),
+    Function.SINE: lambda x: _sine_of_quadrant(x, 0),
+    Function.COSINE: lambda x: _sine_of_quadrant(x, 1),
     Function.LOG: _log,
     Function.POSITIVE: lambda x: (x > 0).astype(np.float32),
 }

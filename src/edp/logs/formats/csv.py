@@ -142,7 +142,7 @@ def _layout(path: Path, signal_map: SignalMap) -> TextLayout:
         decimal = ","
     if not signal_map.header:
         body = rows[table_place.first :]
-        names, units = _stated_columns(path, body, signal_map)
+        names, units = _read_mapped_columns(path, body, signal_map)
         used = table_place.first
     elif _holds_numbers_only(head, decimal):
         names, units, used = (
@@ -315,10 +315,10 @@ def _delimiter_of_numbers(path: Path, lines: list[str]) -> str:
         score = (round(sum(map(is_some_number, cells)) / len(cells), 2), width)
         if score > best_score:
             best, best_score = delimiter, score
-    return _BLANKS if best_score == (0.0, 0) and _parted_by_blanks(tail) else best
+    return _BLANKS if best_score == (0.0, 0) and _is_separated_by_blanks(tail) else best
 
 
-def _parted_by_blanks(lines: list[str]) -> bool:
+def _is_separated_by_blanks(lines: list[str]) -> bool:
     """Return whether each line has the same number of numeric cells, two or more, separated by blanks."""
     rows = [line.split() for line in lines]
     widths = {len(row) for row in rows}
@@ -358,7 +358,7 @@ def _is_unit_row(row: list[str]) -> bool:
     return any(is_unit) and not any(is_number(cell) or is_number(cell, ",") for cell in words)
 
 
-def _stated_columns(
+def _read_mapped_columns(
     path: Path, rows: list[list[str]], signal_map: SignalMap
 ) -> tuple[tuple[str, ...], tuple[str | None, ...]]:
     width = len(rows[0])

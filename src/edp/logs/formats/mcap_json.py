@@ -200,7 +200,7 @@ def _records(path: Path, view: memoryview) -> Iterator[tuple[int, memoryview]]:
         if kind == _DATA_END:
             return
         if kind == _CHUNK:
-            yield from _walk(memoryview(_unpacked(path, body)))
+            yield from _walk(memoryview(_unpack_chunk(path, body)))
         else:
             yield kind, body
 
@@ -216,7 +216,7 @@ def _walk(view: memoryview) -> Iterator[tuple[int, memoryview]]:
         at += length
 
 
-def _unpacked(path: Path, body: memoryview) -> bytes | memoryview:
+def _unpack_chunk(path: Path, body: memoryview) -> bytes | memoryview:
     """Return the records of a chunk, at most as many bytes as it announces (`mcap_check` has checked the size)."""
     size, _, named = struct.unpack_from("<QII", body, 16)
     packing = bytes(body[32 : 32 + named]).decode()

@@ -147,7 +147,7 @@ class _File:
         for attachment in self.log.attachments:
             if attachment.file_name == _FACTS:
                 where = f"'{self.path}', attachment '{_FACTS}'"
-                return parse_edp_metadata(_embedded(attachment, where).decode(errors="replace"), where)
+                return parse_edp_metadata(_read_embedded(attachment, where).decode(errors="replace"), where)
         return EdpMetadata()
 
     def group(self, number: int, edp_metadata: EdpMetadata, signal_map: SignalMap) -> list[tuple[str, RawSignal]]:
@@ -244,7 +244,7 @@ def _valid(signal: Any, values: NDArray[Any]) -> NDArray[Any]:
     return np.where(invalid, np.nan, values) if invalid.any() else values
 
 
-def _embedded(attachment: Any, where: str) -> bytes:
+def _read_embedded(attachment: Any, where: str) -> bytes:
     """Return the bytes of an attachment inside the file, unpacked up to `_FACTS_BYTES`; no other file is opened.
 
     Raises:

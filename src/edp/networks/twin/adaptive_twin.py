@@ -195,11 +195,11 @@ class AdaptiveTwin:
         self._ticks = 0
 
     def _renew(self, forces: Doubles) -> None:
-        self._runner = self._with(self.logs).runner()
+        self._runner = self._apply_factors(self.logs).runner()
         self._load = DisturbanceObserver(self._runner, self._speeds, self.spec.load_share)
         self._runner.resistance = forces.copy()
 
-    def _with(self, logs: Doubles) -> GreyTwin:
+    def _apply_factors(self, logs: Doubles) -> GreyTwin:
         return self.twin.with_numbers(self.twin.numbers * np.exp(self.moves @ (self.by_oil + logs)))
 
     @property
@@ -281,7 +281,7 @@ class AdaptiveTwin:
         if self._begin is None:
             raise ValueError("no stretch has begun")
         state, row, forces = self._begin
-        runner = self._with(logs).runner()
+        runner = self._apply_factors(logs).runner()
         runner.resistance = forces
         commands = np.array(self._commands, np.float32)[None]
         answers = runner.branches(commands, state, row, np.zeros(1, np.int64))[0][:, self._speeds]

@@ -228,7 +228,7 @@ class Twin(ABC):
                     "measured value: begin where all channels are measured"
                 )
         for lane in np.flatnonzero(~self.within_stops(start)):
-            beyond = self._beyond(start[lane : lane + 1])[0]
+            beyond = self._measure_excess(start[lane : lane + 1])[0]
             which = int(np.argmax(beyond))
             stroke = self.channels.strokes[which]
             low, high = (ends[len(self.channels.velocities) + which] for ends in (self.scales.low, self.scales.high))
@@ -242,10 +242,10 @@ class Twin(ABC):
 
     def within_stops(self, start: Array) -> NDArray[np.bool_]:
         """Return whether a twin can start at ``(batch, answer)``: no stroke is far beyond an end stop."""
-        return np.asarray((self._beyond(start) <= BEYOND).all(axis=1))
+        return np.asarray((self._measure_excess(start) <= BEYOND).all(axis=1))
 
-    def _beyond(self, start: Array) -> Array:
-        return _beyond(self.channels, self.scales, start)
+    def _measure_excess(self, start: Array) -> Array:
+        return _measure_excess(self.channels, self.scales, start)
 
 
 class TwinRunner:
@@ -318,7 +318,7 @@ def solved_columns(channels: TwinChannels) -> list[int]:
     return [i for i in range(len(channels.answers)) if not velocities <= i < velocities + strokes]
 
 
-def _beyond(channels: TwinChannels, scales: TwinScales, start: Array) -> Array:
+def _measure_excess(channels: TwinChannels, scales: TwinScales, start: Array) -> Array:
     """Return the distance of strokes beyond the end stops, as a fraction of the range ``(batch, stroke)``."""
     count, strokes = len(channels.velocities), len(channels.strokes)
     ends = slice(count, count + strokes)
@@ -350,7 +350,11 @@ def starts_within(
         if part.samples >= length
         for at in np.unique(np.linspace(0, part.samples - length, each).astype(np.int64))
     ]
-    usable = [(part, at) for part, at in runs if (_beyond(channels, scales, part.targets[at : at + 1]) <= BEYOND).all()]
+    usable = [
+        (part, at)
+        for part, at in runs
+        if (_measure_excess(channels, scales, part.targets[at : at + 1]) <= BEYOND).all()
+    ]
     if not usable:
         raise DataError(
             f"all {len(runs)} starts lie beyond an end stop of the twin, and its end stops are the ends of the strokes "

@@ -87,12 +87,12 @@ def stopped_strokes(build: Builder, twin: Twin, fed: str, velocity: str, columns
     moved = build.add(ScaleShift, "moved", both, gain=gain, shift=zero)
     ends = [count + column for column in columns]
     stroke = build.combine("stroke", ADD, build.pick("stroke_before", fed, ends), moved)
-    velocity = _stopped(build, "open", stroke, velocity, high[ends], high[columns], 1.0)
-    velocity = _stopped(build, "closed", stroke, velocity, low[ends], low[columns], -1.0)
+    velocity = _stop_at_ends(build, "open", stroke, velocity, high[ends], high[columns], 1.0)
+    velocity = _stop_at_ends(build, "closed", stroke, velocity, low[ends], low[columns], -1.0)
     return velocity, build.add(Clip, "held", stroke, low=low[ends], high=high[ends])
 
 
-def _stopped(build: Builder, name: str, stroke: str, velocity: str, stop: Array, most: Array, side: float) -> str:
+def _stop_at_ends(build: Builder, name: str, stroke: str, velocity: str, stop: Array, most: Array, side: float) -> str:
     """Velocities that do not go into an end stop: their bound is zero where a stroke is beyond it."""
     one = np.ones(len(stop))
     past = build.add(ScaleShift, f"past_{name}", stroke, gain=side * one, shift=-side * stop)

@@ -153,7 +153,7 @@ class RecurrentTwin(Twin):
         """Return the scaled commands; with a static map, followed by its scaled outputs."""
         if self.static is None:
             return self.scaled_commands(commands)
-        return np.concatenate([self.scaled_commands(commands), self._scaled_map(self.static.along(commands))], axis=1)
+        return np.concatenate([self.scaled_commands(commands), self._scale_map(self.static.along(commands))], axis=1)
 
     def free_run(self, commands: Tensor, measured: Tensor, port: Tensor) -> Tensor:
         """Simulate scaled outputs ``(time, batch, answer)`` from measured starts, with gradients by the weights.
@@ -185,7 +185,7 @@ class RecurrentTwin(Twin):
             mapped = np.zeros((0, 0, 0), np.float32)
             if self.static is not None:
                 solved, after["commands"] = self.static.mapped(piece, after["commands"])
-                mapped = np.ascontiguousarray(self._scaled_map(solved).swapaxes(0, 1))
+                mapped = np.ascontiguousarray(self._scale_map(solved).swapaxes(0, 1))
             inputs = (projected, np.nan_to_num(read), port, mapped)
             run_forward(inputs, weights, bounds.arrays, bounds.velocities, (after["answer"], after["h"]), saved)
             pieces.append(saved[0].swapaxes(0, 1))
@@ -210,9 +210,9 @@ class RecurrentTwin(Twin):
             return np.zeros((0, 0, 0), np.float32), np.zeros((0, 0, 0), np.float32)
         lanes = np.ascontiguousarray(commands.swapaxes(0, 1))
         solved, memory = self.static.mapped(lanes, np.repeat(state["commands"], len(lanes), axis=0))
-        return np.ascontiguousarray(self._scaled_map(solved).swapaxes(0, 1)), memory[:1]
+        return np.ascontiguousarray(self._scale_map(solved).swapaxes(0, 1)), memory[:1]
 
-    def _scaled_map(self, solved: Array) -> Array:
+    def _scale_map(self, solved: Array) -> Array:
         """Scale map outputs ``(..., all but strokes)`` to ``(..., answer)``, zero for strokes."""
         columns, scales = solved_columns(self.channels), self.scales
         answers = np.zeros((*solved.shape[:-1], len(self.channels.answers)), np.float32)
@@ -223,7 +223,7 @@ class RecurrentTwin(Twin):
         network, solved = self.network, solved_columns(self.channels)
         arrays = {name: weight.detach().numpy() for name, weight in network.named_parameters()}
         read = build.join("read", commands, fed)
-        h = build.join("memories", *(self._lowered(build, read, rows) for rows in self.member_rows()))
+        h = build.join("memories", *(self._add_memory(build, read, rows) for rows in self.member_rows()))
         unit = self.bounds.change[solved]
         weight, bias = unit[:, None] * arrays["out_weight"].T[solved], unit * arrays["out_bias"][solved]
         change = build.add(Dense, "change", h, weight=weight, bias=bias)
@@ -238,7 +238,7 @@ class RecurrentTwin(Twin):
             before = build.combine("pulled_before", BinaryOperation.ADD, rest, near)
         return build.combine("proposed", BinaryOperation.ADD, before, change)
 
-    def _lowered(self, build: Builder, read: str, rows: slice) -> str:
+    def _add_memory(self, build: Builder, read: str, rows: slice) -> str:
         """Add the memory of a member with these rows of h."""
         network = self.network
         arrays = {name: weight.detach().numpy() for name, weight in network.named_parameters()}

@@ -99,7 +99,7 @@ def _visits(there: np.ndarray, apart: int) -> int:
 
 def with_scales(twin: RecurrentTwin, scales: TwinScales) -> RecurrentTwin:
     """Return a copy of the twin with other bounds."""
-    network = _copied(twin.network)
+    network = _copy_network(twin.network)
     static = twin.static and StaticTwin(twin.channels, scales, twin.prefix_ticks, twin.static.numbers)
     return RecurrentTwin(twin.channels, scales, twin.prefix_ticks, network, static, twin.members)
 
@@ -133,7 +133,7 @@ def _member(twin: RecurrentTwin, rows: slice) -> RecurrentTwin:
     return RecurrentTwin(twin.channels, twin.scales, twin.prefix_ticks, network, static)
 
 
-def _copied(network: TwinNetwork) -> TwinNetwork:
+def _copy_network(network: TwinNetwork) -> TwinNetwork:
     """Return a copy of a network."""
     pulled = 0 if network.pull is None else len(network.pull)
     answers = network.out_bias.shape[0]

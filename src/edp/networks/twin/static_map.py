@@ -64,7 +64,7 @@ class StaticMap:
         judged = [s for s in rows if s.samples > delays[-1] + 1]
         best = int(np.argmin([_error(solution, judged, i, delay) for i, delay in enumerate(delays)]))
         arrays = {"corners": corners, "delay": np.array([delays[best]], dtype=np.float32)}
-        return self.build(channels, scales, arrays | _solved(solution, best))
+        return self.build(channels, scales, arrays | _solve_delay(solution, best))
 
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
         """Return the shapes of corners, rises of each output between corners, intercepts, and the delay."""
@@ -99,7 +99,7 @@ class StaticTwin(Twin):
         corners = self.numbers["corners"]
         rows = [Series(s.name, polygon(s.inputs, corners), s.targets[:, solved]) for s in train]
         solution = ridge_solution(rows, LagTask((self.delay + 1,), (None,) * len(solved), 1), penalties=(PENALTY,))
-        numbers = self.numbers | _solved(solution, 0)
+        numbers = self.numbers | _solve_delay(solution, 0)
         return StaticTwin(self.channels, self.scales, self.prefix_ticks, numbers)
 
     @staticmethod
@@ -196,7 +196,7 @@ def polygon(commands: Array, corners: Array) -> Array:
     return np.asarray(past.reshape(len(commands), -1), dtype=np.float32)
 
 
-def _solved(solution: RidgeSolution, which: int) -> dict[str, Array]:
+def _solve_delay(solution: RidgeSolution, which: int) -> dict[str, Array]:
     """Rises and intercepts of one delay."""
     rise = np.ascontiguousarray(solution.weights[0, :, which], dtype=np.float32)
     return {"rise": rise, "intercept": solution.intercept[which].astype(np.float32)}

@@ -77,7 +77,7 @@ def situation_line(scores: ScoresFile) -> str:
         f"{row.channel} is outside of its range in training in {percent(row.share)} of the ticks"
         for row in situation.outside
     ]
-    parts += [_changed(row) for row in changes.values()]
+    parts += [_describe_change(row) for row in changes.values()]
     if not parts:
         return ""
     more = f" and {len(parts) - SHOWN} more" if len(parts) > SHOWN else ""
@@ -87,7 +87,7 @@ def situation_line(scores: ScoresFile) -> str:
     )
 
 
-def _changed(row: TargetChange) -> str:
+def _describe_change(row: TargetChange) -> str:
     """Describe a target whose changes differ from those in training."""
     ahead = f"{row.target} in {count_of(row.horizon, 'tick')}"
     if 1 / NOTED <= row.ratio <= NOTED:

@@ -122,7 +122,7 @@ def build_study_page(study: StudyFile, tables: Mapping[str, Table]) -> Page:
     return Page(
         title=study.title,
         kind="model search",
-        about=["model search", _about(study)],
+        about=["model search", _describe_study(study)],
         headline=words.headline(study),
         verdict=words.verdict(study),
         tiles=words.tiles(study),
@@ -235,14 +235,14 @@ def _settings(study: StudyFile) -> list[tuple[str, str]]:
     ]
 
 
-def _about(study: StudyFile) -> str:
+def _describe_study(study: StudyFile) -> str:
     hours = number(study.data.hours, 1)
     return f"{study.mode} mode · preset {study.preset} · {study.data.sessions} sessions, {hours} h · {study.state}"
 
 
 def study_text(study: StudyFile, tables: Mapping[str, Table]) -> str:
     """Return the report as Markdown: result, decisions with reasons, limits of the evidence, tables."""
-    lines = [f"# Model search on {in_markdown(study.title)}", "", f"{in_markdown(_about(study))}.", ""]
+    lines = [f"# Model search on {in_markdown(study.title)}", "", f"{in_markdown(_describe_study(study))}.", ""]
     lines += [in_markdown(words.headline(study)), "", in_markdown(" ".join(words.verdict(study))), ""]
     lines += ["## What was decided, and why", ""]
     for heading, sentences in words.decided(study):

@@ -180,13 +180,13 @@ def holdout_table(study: StudyFile, facts: SynthesisFacts) -> Table | None:
     sizes, work = ([one[name] for one in costs] for name in ("parameters", "macs_tick"))
     rows: list[tuple[Value, ...]] = [
         ("Active modules", *(", ".join(short.get(name, name) for name in own) or "none" for own in modules)),
-        ("Parameters", *(_against(size, sizes[0], count_text) for size in sizes)),
+        ("Parameters", *(_compare_with(size, sizes[0], count_text) for size in sizes)),
         ("FP32 (MB)", *(number(4e-6 * size, 4) for size in sizes)),
-        ("MACs per tick", *(_against(value, work[0], count_text) for value in work)),
+        ("MACs per tick", *(_compare_with(value, work[0], count_text) for value in work)),
     ]
     for key, name in {"composite": "Composite", "mae": "MAE", "rmse": "RMSE", "p95": "P95", "p99": "P99"}.items():
         values = [facts.test[arm][key] for arm in ("baseline", "synthesis")]
-        cells = [None if v is None else _against(v, values[0], lambda x: number(x, 3)) for v in values]
+        cells = [None if v is None else _compare_with(v, values[0], lambda x: number(x, 3)) for v in values]
         rows.append((with_unit(f"{name} on test sessions", study.unit), *cells, *([None] * (free is not None))))
     if free is not None:
         fresh = [free.fresh[arm] for arm in ("synthesis", "exploration")]
@@ -200,7 +200,7 @@ def holdout_table(study: StudyFile, facts: SynthesisFacts) -> Table | None:
     )
 
 
-def _against(value: float, reference: float | None, show: Callable[[float], str]) -> str:
+def _compare_with(value: float, reference: float | None, show: Callable[[float], str]) -> str:
     """Return a value with its change against a different reference."""
     if reference is None or value == reference or reference == 0:
         return show(value)

@@ -63,7 +63,7 @@ def verdict(study: StudyFile) -> list[str]:
         _how_sure(study),
         _features(study),
         _baseline(study),
-        _confirmed(study),
+        _describe_confirmed(study),
         _teacher(study),
         chosen_words(study),
     ]
@@ -102,9 +102,9 @@ def _baseline(study: StudyFile, facts: CalibrationFacts) -> str:
 
 
 @of_phase(ConfirmationFacts, "")
-def _confirmed(study: StudyFile, facts: ConfirmationFacts) -> str:
+def _describe_confirmed(study: StudyFile, facts: ConfirmationFacts) -> str:
     names = [study.module(name) for name in facts.confirmed]
-    registered = len(_registered(study))
+    registered = len(_list_registered(study))
     if not names:
         return f"None of {registered} modules is confirmed."
     which = f": {listed(names)}" if len(names) <= 6 else ""
@@ -112,7 +112,7 @@ def _confirmed(study: StudyFile, facts: ConfirmationFacts) -> str:
 
 
 @of_phase(ScreeningFacts, ())
-def _registered(study: StudyFile, facts: ScreeningFacts) -> tuple[str, ...]:
+def _list_registered(study: StudyFile, facts: ScreeningFacts) -> tuple[str, ...]:
     return facts.registered
 
 
@@ -138,7 +138,7 @@ def tiles(study: StudyFile) -> list[tuple[str, str, str]]:
     confirmation = study.facts(ConfirmationFacts)
     if confirmation is not None:
         confirmed = count_text(len(confirmation.confirmed))
-        tiles.append((confirmed, "", f"of {len(_registered(study))} modules confirmed"))
+        tiles.append((confirmed, "", f"of {len(_list_registered(study))} modules confirmed"))
     openings = len(study.openings)
     sealed = count_of(len(study.sessions.test) + len(study.sessions.second), "session")
     tiles.append((count_text(openings), "", f"opening{'s' * (openings != 1)} of {sealed} set apart"))
@@ -221,11 +221,11 @@ def decided(study: StudyFile) -> list[tuple[str, tuple[str, ...]]]:
         if lines is None:
             count = sum(training.phase == phase.name for training in study.ended)
             lines = (f"Under way: {count_of(count, 'training')} done." if phase.began else "Has not begun.",)
-        decisions.append((phase.heading, _grouped(lines)))
+        decisions.append((phase.heading, _merge_sentences(lines)))
     return decisions
 
 
-def _grouped(lines: Sequence[str]) -> tuple[str, ...]:
+def _merge_sentences(lines: Sequence[str]) -> tuple[str, ...]:
     """Merge sentences that say the same of several names; minus signs become true ones."""
     names: dict[str, list[str]] = {}
     for line in lines:

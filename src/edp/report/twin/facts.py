@@ -237,8 +237,8 @@ def free_run_tables(facts: FreeRunFacts) -> dict[str, Table]:
         _situation_table(twin),
         *([candidate_table(facts.candidates)] if facts.candidates else []),
         *([] if twin.intervals is None else [_coverage_table(twin.intervals)]),
-        *([] if twin.ahead is None else [_ahead_table(facts, twin.ahead)]),
-        *([] if twin.beside is None else [_beside_table(twin.beside)]),
+        *([] if twin.ahead is None else [_tabulate_ahead(facts, twin.ahead)]),
+        *([] if twin.beside is None else [_tabulate_comparison(twin.beside)]),
     ]
     return {table.name: table for table in tables if table.rows}
 
@@ -313,7 +313,7 @@ def _coverage_table(intervals: IntervalCoverage) -> Table:
     return Table(caption, tuple(heads), tuple(rows), name="intervals")
 
 
-def _ahead_table(facts: FreeRunFacts, first: AheadErrors) -> Table:
+def _tabulate_ahead(facts: FreeRunFacts, first: AheadErrors) -> Table:
     caption = f"{figure(first.seconds)} s ahead of measured ports, told the commands in between"
     if mixed_units(facts.twin):
         return ahead_by_actuator(facts.models, caption)
@@ -328,7 +328,7 @@ def _ahead_table(facts: FreeRunFacts, first: AheadErrors) -> Table:
     return Table(caption, (Column("Model"), *shown), tuple(rows), frozenset({0}), name="ahead")
 
 
-def _beside_table(beside: PredictorComparison) -> Table:
+def _tabulate_comparison(beside: PredictorComparison) -> Table:
     rows: list[tuple[Value, ...]] = [
         (part, row.twin.unit, row.twin.mean, row.predictor.mean) for part, row in beside.errors.items()
     ]
@@ -357,7 +357,7 @@ def actuator_table(models: Mapping[str, FreeRunScores]) -> Table:
         ]
         for name, one in models.items()
     }
-    return _by_actuator("actuators", "The twin and its floors, each actuator in its units", columns)
+    return _tabulate_actuators("actuators", "The twin and its floors, each actuator in its units", columns)
 
 
 def ahead_by_actuator(models: Mapping[str, FreeRunScores], caption: str) -> Table:
@@ -367,10 +367,10 @@ def ahead_by_actuator(models: Mapping[str, FreeRunScores], caption: str) -> Tabl
         for name, one in models.items()
         if one.ahead is not None
     }
-    return _by_actuator("ahead", caption, columns)
+    return _tabulate_actuators("ahead", caption, columns)
 
 
-def _by_actuator(name: str, caption: str, columns: Mapping[str, Sequence[tuple[str, ChannelErrors]]]) -> Table:
+def _tabulate_actuators(name: str, caption: str, columns: Mapping[str, Sequence[tuple[str, ChannelErrors]]]) -> Table:
     """Rows by actuator, then model; of each model titles and rows of errors, each by channel."""
     first = next(iter(columns.values()))
     rows: list[tuple[Value, ...]] = []

@@ -51,9 +51,9 @@ def episode_start(spec: EnvironmentSpec, seed: int, options: Table | None) -> tu
     if overrides:
         spec = replace(spec, **overrides)
     scenario = spec.scenario(seed)
-    machine = _drawn(spec, seed) if spec.randomise is not False else scenario.load()
+    machine = _draw_machine(spec, seed) if spec.randomise is not False else scenario.load()
     if "oil_temperature" in options:
-        machine = _warmed(machine, options["oil_temperature"])
+        machine = _set_oil_temperature(machine, options["oil_temperature"])
     start = EpisodeStart(
         scenario, machine, spec.hand, spec.loop_latency, spec.lost_frames, _strokes(options.get("strokes"))
     )
@@ -94,7 +94,7 @@ def checked_seed(seed: Any) -> int | None:
     return int(seed)
 
 
-def _drawn(spec: EnvironmentSpec, seed: int) -> Machine:
+def _draw_machine(spec: EnvironmentSpec, seed: int) -> Machine:
     """Return the random machine of the family for this seed."""
     low, high = spec.masses_t
     # A family of its own for each seed, so that its first member has any mass.
@@ -102,7 +102,7 @@ def _drawn(spec: EnvironmentSpec, seed: int) -> Machine:
     return family_member(family, 0, low, high, spec.spread)
 
 
-def _warmed(machine: Machine, celsius: Any) -> Machine:
+def _set_oil_temperature(machine: Machine, celsius: Any) -> Machine:
     try:
         warmed = replace(machine, oil=replace(machine.oil, temperature=float(celsius)))
     except (TypeError, ValueError) as error:

@@ -48,7 +48,7 @@ def load_machine(name: str) -> Machine:
             ) from error
         # Resolved, since a relative name means another file once the current folder has changed.
         return _from_file(full_path(path), changed)
-    return _built_in(name.upper())
+    return _load_built_in(name.upper())
 
 
 @cache
@@ -58,7 +58,7 @@ def _from_file(path: Path, changed: int) -> Machine:
 
 
 @cache
-def _built_in(name: str) -> Machine:
+def _load_built_in(name: str) -> Machine:
     member = _member(name)
     if member is not None:
         return family_member(*member)
@@ -106,7 +106,7 @@ def family_member(
     draws = Draws(np.random.default_rng([seed, 1 + index]), scatter)
     mass = member_mass(seed, index, low_t, high_t)
     name = member_name(seed, index, (low_t, high_t), scatter)
-    machine = scaled_machine(_built_in("M22"), mass, draws, name)
+    machine = scaled_machine(_load_built_in("M22"), mass, draws, name)
     check_machine(machine, name)
     return machine
 

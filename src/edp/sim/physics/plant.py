@@ -249,7 +249,7 @@ class Plant:
         every = np.concatenate([self._demands, demands])
         # In place, since a snapshot restores arrays in place.
         self._demands[:] = every[len(every) - self._past :]
-        return self._moved(every)
+        return self._advance_samples(every)
 
     def rest_at(self, demands: Array) -> None:
         """Set pilots and spools to the steady state of these demands, shape (6,)."""
@@ -292,12 +292,12 @@ class Plant:
         front = np.ascontiguousarray(levers[:, : at.AXES])
         shape_commands(front, self.hand, hand_s, self._demands, setup, demands, self._held)
         if self.motors is None:
-            return self._moved(demands)
+            return self._advance_samples(demands)
         others = np.zeros((len(levers), at.MOTORS))
         others[:, : levers.shape[1] - at.AXES] = levers[:, at.AXES :]
-        return self._moved(demands, self.motors.demands_of(others, hand_s))
+        return self._advance_samples(demands, self.motors.demands_of(others, hand_s))
 
-    def _moved(self, demands: Array, motor_demands: Array | None = None) -> Array:
+    def _advance_samples(self, demands: Array, motor_demands: Array | None = None) -> Array:
         """Run with demands appended to the past ones; without motor demands swing and travel stand still."""
         setup = (self.axes, self.plant, self.work, self._ground)
         samples = len(demands) - self._past

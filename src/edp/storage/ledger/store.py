@@ -31,10 +31,10 @@ class Damage:
 def read_records(folder: str | Path) -> tuple[dict[str, Record], list[Damage]]:
     """Return all records of a ledger and the damaged files, regardless of its holder. Nothing is changed."""
     whole, damaged = _read(Path(folder, "records"))
-    return {key: _taken_apart(Path(folder, "records", f"{key}.json"), whole[key]) for key in whole}, damaged
+    return {key: _parse_record(Path(folder, "records", f"{key}.json"), whole[key]) for key in whole}, damaged
 
 
-def _taken_apart(file: Path, data: bytes) -> Record:
+def _parse_record(file: Path, data: bytes) -> Record:
     try:
         return Record.from_bytes(data)
     except (ValueError, StorageError) as error:
@@ -172,7 +172,7 @@ class Ledger:
     def get(self, key: str) -> Record | None:
         """Return the record of a training, including lost ones."""
         if key in self._unread:
-            self._records[key] = _taken_apart(self.path / "records" / f"{key}.json", self._unread.pop(key))
+            self._records[key] = _parse_record(self.path / "records" / f"{key}.json", self._unread.pop(key))
         return self._records.get(key)
 
     def finished(self, key: str) -> Record | None:

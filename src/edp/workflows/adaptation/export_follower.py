@@ -40,7 +40,7 @@ def export_follower(
     if bundle.adaptation is None:
         raise BundleError(f"'{run}' has no adaptation; edp adapt {run} --out FOLDER makes a run that has one")
     grey = load_twin(twin)
-    spec = _with_options(tuned_spec(grey), options or {})
+    spec = _apply_options(tuned_spec(grey), options or {})
     correction = correction_of(grey.twin, bundle.adaptation, bundle.task, spec)
     if not isinstance(grey.twin, GreyTwin):  # refused by the line above; this tells the type
         raise ConfigError("only a grey box can follow the machine")
@@ -55,7 +55,7 @@ def export_follower(
     return write_follower(parts, plant_bundle(grey), name, Path(folder))
 
 
-def _with_options(spec: TunedSpec, options: Mapping[str, str]) -> TunedSpec:
+def _apply_options(spec: TunedSpec, options: Mapping[str, str]) -> TunedSpec:
     changed: dict[str, float] = {}
     for option, text in options.items():
         if option not in OPTIONS:

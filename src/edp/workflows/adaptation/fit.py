@@ -103,7 +103,7 @@ def fit_adaptation(predictor: Predictor, data: Prepared, spec: AdaptationSpec) -
     # Velocities rest at zero by nature; the median of other targets is where the machine usually is.
     middle = np.where([kind is Kind.VELOCITY for kind in data.target_kinds], 0.0, np.median(present, axis=0))
     # Units come from the validation part: errors on training data are too small.
-    change, unit = _of_predictions(predictor, data.validation)
+    change, unit = _measure_spread(predictor, data.validation)
     arrays = {
         "offset": offset,
         "scale": scale,
@@ -141,7 +141,7 @@ def _directions(scaled: Rows, columns: Sequence[int], rank: int) -> Rows:
     return np.asarray((axes * signs).T)
 
 
-def _of_predictions(predictor: Predictor, parts: Sequence[Series]) -> tuple[Rows, Rows]:
+def _measure_spread(predictor: Predictor, parts: Sequence[Series]) -> tuple[Rows, Rows]:
     """Spread of predicted changes and of errors ``(horizon, target)``."""
     skip, horizons = predictor.spec.window, predictor.task.horizons
     changes: list[list[Rows]] = [[] for _ in horizons]

@@ -117,7 +117,7 @@ class TrainedPredictor:
         """
         recordings = None if test is None else as_recordings(test)
         if not is_file_at(self.folder / PROVENANCE):
-            return self._judged_alone(recordings, baselines)
+            return self._evaluate_bundle(recordings, baselines)
         source = None if recordings is None else recordings.source or _memory(recordings)
         names = BASELINES if baselines is None else tuple(baselines)
         return JudgedScores(read_facts(train_evaluate.evaluate(self.folder, source, names)))
@@ -184,7 +184,7 @@ class TrainedPredictor:
             return AdaptedStream(self._bundle.predictor, adaptation)
         return Stream(self._bundle.predictor)
 
-    def _judged_alone(self, recordings: Recordings | None, baselines: Sequence[str] | None) -> JudgedScores:
+    def _evaluate_bundle(self, recordings: Recordings | None, baselines: Sequence[str] | None) -> JudgedScores:
         """Evaluate a bundle that has no run folder."""
         if recordings is None:
             raise ConfigError(f"'{self.folder}' is a bundle without its run folder; give the recordings to judge it on")

@@ -159,17 +159,17 @@ def _table(settings: Mapping[str, object] | str | Path | None) -> Table:
     if settings is None:
         return {}
     if isinstance(settings, Mapping):
-        return with_set_file(_nested(settings), Path())
+        return with_set_file(_nest_keys(settings), Path())
     return with_set_file(read_toml(settings), Path(settings).parent)
 
 
-def _nested(settings: Mapping[str, object]) -> Table:
+def _nest_keys(settings: Mapping[str, object]) -> Table:
     """Dotted keys as tables, in the order given."""
     table: Table = {}
     for key, value in settings.items():
         # Keys are built up from the innermost part.
         first, *others = reversed(str(key).split("."))
-        change: Table = {first: _nested(value) if isinstance(value, Mapping) else _plain(value)}
+        change: Table = {first: _nest_keys(value) if isinstance(value, Mapping) else _plain(value)}
         for part in others:
             change = {part: change}
         table = merged(table, change)
@@ -179,7 +179,7 @@ def _nested(settings: Mapping[str, object]) -> Table:
 def _plain(value: Any) -> Any:
     """Convert tuples to lists and mappings to dictionaries, as TOML would give them."""
     if isinstance(value, list | tuple):
-        return [_nested(entry) if isinstance(entry, Mapping) else _plain(entry) for entry in value]
+        return [_nest_keys(entry) if isinstance(entry, Mapping) else _plain(entry) for entry in value]
     return value
 
 

@@ -103,7 +103,7 @@ def train_auto(
         foundation.check_task(data)
     begun = {} if foundation is None else {"foundation": foundation.facts}
     key = run_key({"auto": plain_tree(settings), **begun}, data.digest)
-    finished = _finished(Path(out), key)
+    finished = _read_finished(Path(out), key)
     if finished is not None:
         return finished
     check_moving(data)
@@ -136,7 +136,9 @@ def _write_choice(
         raise ConfigError(f"automatic choice: every candidate diverged: {'; '.join(failed.values())}")
     choice = choose({name: one.promise for name, one in trained.items()})
     stated = replace(
-        _stated(choice, trained, failed, data, settings, amount), key=run.key, notes=(*notes, *portfolio.notes)
+        _make_choice_file(choice, trained, failed, data, settings, amount),
+        key=run.key,
+        notes=(*notes, *portfolio.notes),
     )
     winner, floor = trained[choice.name], trained.get(FLOOR)
     stated.write(run.path)
@@ -148,7 +150,7 @@ def _write_choice(
     return AutoResult(bundle, stated)
 
 
-def _finished(folder: Path, key: str) -> AutoResult | None:
+def _read_finished(folder: Path, key: str) -> AutoResult | None:
     """Return the result of a finished run with this key; None without one."""
     # The key stands in the choice, too: earlier versions wrote the winner's key into the identity of the run.
     choice = read_choice(folder)
@@ -157,7 +159,7 @@ def _finished(folder: Path, key: str) -> AutoResult | None:
     return AutoResult(load_bundle(folder), choice)
 
 
-def _stated(
+def _make_choice_file(
     choice: PortfolioChoice,
     trained: dict[str, TrainedCandidate],
     failed: dict[str, str],

@@ -111,7 +111,7 @@ def distil(
         raise ConfigError(f"a student of {spec.units} units is the teacher itself; take fewer units or levels")
     teachers = [teacher, *(load_bundle(path).predictor for path in request.teachers)]
     frozen = frozen_sessions(run, experiment)
-    series, digests = _unlabelled(teacher, request.further, frozen)
+    series, digests = _read_unlabelled(teacher, request.further, frozen)
     facts = order_facts(order) | {"teachers": [weights_digest(net) for net in teachers], "further": digests}
 
     def strategy(data: Prepared) -> TrainingStrategy | DirectFit:
@@ -200,7 +200,7 @@ def _loss(spec: DistillationSpec) -> Any:
     return {"kind": name} | {key: plain_tree(value) for key, value in vars(spec.soft).items()}
 
 
-def _unlabelled(
+def _read_unlabelled(
     teacher: Predictor, source: DataSource | None, frozen: dict[str, str]
 ) -> tuple[list[Series], list[str]]:
     recordings = [] if source is None else source.read()

@@ -94,9 +94,9 @@ class ControlBench:
         longest = (max(task.reference.ticks for task in self.tasks) + 1) / rate
         self._env = plant_of(experiment.machine, longest, rate, sources.plant, sources.trusted)
         self.plant = interface_of(self._env)
-        self.models = models or self._commissioned(probe, sources)
+        self.models = models or self._prepare_models(probe, sources)
 
-    def _commissioned(self, probe: Any, sources: ControlSources) -> ControlModels:
+    def _prepare_models(self, probe: Any, sources: ControlSources) -> ControlModels:
         """Models of the sources, and a valve map where one is needed: measured before the loops, on the plant."""
         valve_map: ValveMap | None = None
         if "valve_map" in self.experiment.controller.needs:

@@ -140,7 +140,7 @@ def load_kept(run: str | Path) -> KeptController:
         check_hash(header, folder / HEADER)
         channels = tuple(_channel(entry) for entry in header["channels"])
         arrays = load_arrays(read_arrays(folder, header["arrays"]))
-        valve_map = _checked(arrays, len(channels))
+        valve_map = _check_arrays(arrays, len(channels))
         rate = above(0.0, 1e6)
         if not rate.holds(header["rate_hz"]):
             raise ValueError(f"its rate_hz is {str(header['rate_hz'])[:40]}; {rate.rule('rate_hz')} must hold")
@@ -162,7 +162,7 @@ def _channel(entry: Table) -> Channel:
     return Channel(entry["name"], Kind(entry["kind"]), entry["description"])
 
 
-def _checked(arrays: Mapping[str, Array], channels: int) -> ValveMap | None:
+def _check_arrays(arrays: Mapping[str, Array], channels: int) -> ValveMap | None:
     """Return the valve map if present, after a check of shapes and values of all arrays."""
     ticks, rows = len(arrays["observed"]), len(arrays["strokes"])
     shapes = {"observed": (ticks, channels), "levers": (ticks, AXES), "strokes": (rows, AXES), "tip": (rows, AXES)}

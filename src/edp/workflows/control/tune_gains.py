@@ -115,7 +115,7 @@ def tune_gains(
         study = Study(
             {name: Real(*ends) for name, ends in space.items()}, chosen.seed, SamplerSpec(kind=chosen.sampler)
         )
-        study.suggest({name: _within(getattr(experiment.controller, name), ends) for name, ends in space.items()})
+        study.suggest({name: _clip(getattr(experiment.controller, name), ends) for name, ends in space.items()})
         rows: list[TuningTrial] = []
         units = run.file(UNITS)
         tuned = DividedLoops(staying, units, f"{key} tuned on")
@@ -154,5 +154,5 @@ def with_gains(spec: ControllerSpec, gains: Mapping[str, Any]) -> ControllerSpec
     return cast(ControllerSpec, replace(cast(Any, spec), **values))
 
 
-def _within(value: float, ends: tuple[float, float]) -> float:
+def _clip(value: float, ends: tuple[float, float]) -> float:
     return float(min(max(value, ends[0]), ends[1]))

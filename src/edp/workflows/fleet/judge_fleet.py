@@ -108,7 +108,7 @@ def report_fleet(
             ReportedTarget(name, KINDS[kind].report_unit)
             for name, kind in zip(task.targets, bundle.target_kinds, strict=True)
         ),
-        machines=tuple(_reported(machine, result) for machine, result in zip(machines, results, strict=True)),
+        machines=tuple(_make_report(machine, result) for machine, result in zip(machines, results, strict=True)),
     )
     write_json(folder / RESULT, report.to_json())
     facts = fleet_facts(report, full_path(Path(question.store)).name)
@@ -117,7 +117,7 @@ def report_fleet(
     return facts
 
 
-def _reported(machine: StoredMachine, result: UnitResult) -> ReportedMachine:
+def _make_report(machine: StoredMachine, result: UnitResult) -> ReportedMachine:
     if result.content is None:
         return ReportedMachine(machine.name, machine.minutes, failed=str(result.values["failed"]))
     return ReportedMachine(machine.name, machine.minutes, unpack(result.content, MachineErrors))

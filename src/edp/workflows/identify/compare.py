@@ -70,7 +70,7 @@ class MeasuredRuns:
         """Answers of a machine of the simulator: placed at each measured tick of the prefix, then on its own."""
         answers = np.empty((len(self.names), self.commands.shape[1] - self.prefix, self.truth.shape[2]), np.float32)
         for run, (commands, truth) in enumerate(zip(self.commands, self.truth, strict=True)):
-            answers[run] = _driven(machine, front, commands, truth, self.prefix)
+            answers[run] = _simulate(machine, front, commands, truth, self.prefix)
         return answers
 
 
@@ -124,7 +124,7 @@ class FrontChannels:
         return np.where(places >= 0, row[places], np.nan).astype(np.float64)
 
 
-def _driven(
+def _simulate(
     machine: Machine, front: FrontChannels, commands: NDArray[np.float32], truth: NDArray[np.float32], prefix: int
 ) -> NDArray[np.float32]:
     """Return answers ``(tick, answer)`` after the prefix."""

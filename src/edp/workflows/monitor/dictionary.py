@@ -222,7 +222,7 @@ def _draw(
     done, sessions = 0, progress.stage("session", total)
     for session in simulated(classes, plan.machine, plan.seconds, (plan.seed, draw), monitor.rate_hz):
         noisy = with_noise(session.recording, plan.added, [plan.seed, draw, session.base])
-        seen = _after(monitor, noisy, before), _shown(session, further, before)
+        seen = _average_blocks(monitor, noisy, before), _summarise_channels(session, further, before)
         if session.fault < 0:
             sound[session.base] = seen
             continue
@@ -232,18 +232,18 @@ def _draw(
         faults.append(SimulatedFault(draw, session.fault, session.size, change, shown))
         done += 1
         if session.fault in mirrored:
-            faults.append(SimulatedFault(draw, mirrored[session.fault], -session.size, _mirrored(change), shown))
+            faults.append(SimulatedFault(draw, mirrored[session.fault], -session.size, _mirror(change), shown))
         sessions.step(done)
-    return _standardised(faults, sound)
+    return _standardise(faults, sound)
 
 
-def _mirrored(change: Array) -> Array:
+def _mirror(change: Array) -> Array:
     """Return the change by a fault of the other sign: means change sign, sizes do not."""
     means, sizes = np.split(change, 2, axis=1)
     return np.concatenate([-means, sizes], axis=1)
 
 
-def _after(monitor: Monitor, recording: Recording, onset_s: float) -> Array:
+def _average_blocks(monitor: Monitor, recording: Recording, onset_s: float) -> Array:
     """Mean features of the blocks at an onset and of those after it, shape (2, features)."""
     rows = monitor.conditioned_rows(recording)
     at, after = parts_of(rows[int(onset_s / monitor.block_s) :])
@@ -252,7 +252,7 @@ def _after(monitor: Monitor, recording: Recording, onset_s: float) -> Array:
     return np.stack([mean_features(at), mean_features(after)])
 
 
-def _shown(session: FaultSession, names: Sequence[str], onset_s: float) -> dict[str, Array]:
+def _summarise_channels(session: FaultSession, names: Sequence[str], onset_s: float) -> dict[str, Array]:
     """Return level, width and rate of change of further channels after an onset."""
     shown = {}
     first = round(onset_s * session.recording.rate_hz)
@@ -262,7 +262,7 @@ def _shown(session: FaultSession, names: Sequence[str], onset_s: float) -> dict[
     return shown
 
 
-def _standardised(
+def _standardise(
     faults: Sequence[SimulatedFault], sound: dict[int, tuple[Array, dict[str, Array]]]
 ) -> list[SimulatedFault]:
     """Return changes of further channels relative to their scatter between sound sessions."""

@@ -202,7 +202,7 @@ def fit_to_recordings(
             better = fit_to_recordings(left, experiment, bundles, progress, True, side_by_side)
             seconds = time.process_time() - began
             return replace(better, doubtful=(*trained, *better.doubtful), seconds=seconds)
-    monitor = _assembled(material, sources, fitted, sessions, rest)
+    monitor = _assemble_monitor(material, sources, fitted, sessions, rest)
     # Validation sessions set no limit.
     minutes = 60.0 * float(monitor.provenance["hours"])
     fit_s = time.process_time() - began + (side_by_side.seconds if isinstance(side_by_side, UnitMap) else 0.0)
@@ -211,12 +211,12 @@ def fit_to_recordings(
     measured["healthy_range"] = healthy_range(fitted)
     healthy = [session for session in rest if session.name not in fitted.doubtful]
     provenance = dict(monitor.provenance) | measured | {"seconds": time.process_time() - began}
-    monitor = _with_dictionary(replace(monitor, provenance=provenance), healthy, experiment, progress, side_by_side)
+    monitor = _add_dictionary(replace(monitor, provenance=provenance), healthy, experiment, progress, side_by_side)
     alone = _fits_one_machine(experiment, sources)
     return FittedMonitor(monitor, fitted.doubtful, time.process_time() - began, None, fitted.sessions, alone)
 
 
-def _assembled(
+def _assemble_monitor(
     material: FitMaterial,
     sources: tuple[ResidualSource, ...],
     fitted: FittedChain,
@@ -241,7 +241,7 @@ def _assembled(
     )
 
 
-def _with_dictionary(
+def _add_dictionary(
     monitor: Monitor,
     healthy: Sequence[Recording],
     experiment: MonitorExperiment,

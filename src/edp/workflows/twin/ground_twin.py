@@ -67,7 +67,7 @@ def ground_twin(
         progress.note(f"fitting the ground '{experiment.ground}' to forces along the logs")
         twin = check_grounded(base.bundle.twin)
         fitted = fit_ground(experiment.ground, twin, data.train, data.validation, linkage)
-        rows = [*_known_rows(base.folder), *fitted.law.rows()]
+        rows = [*_read_datasheet_rows(base.folder), *fitted.law.rows()]
         basis = f"{BASIS}; {GROUND_BASIS}"
         write_json(run.file(f"{DATASHEET}.json"), {"schema": 1, "basis": basis, "numbers": rows})
         write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(rows, basis).encode())
@@ -102,7 +102,7 @@ def _base(start: str | Path | None) -> tuple[BaseTwin, str]:
     return BaseTwin(Path(start), bundle, twin_hash(start)), bundle.spec.linkage
 
 
-def _known_rows(run: Path) -> list[dict[str, object]]:
+def _read_datasheet_rows(run: Path) -> list[dict[str, object]]:
     """Return the datasheet rows of a run; none without a datasheet."""
     file = run / f"{DATASHEET}.json"
     if not is_file_at(file):

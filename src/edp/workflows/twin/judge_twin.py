@@ -73,7 +73,7 @@ def judge_twin(
     runs = free_runs(twin, data.test, spec.seconds, spec.starts)
     beyond = commands_beyond(bundle.provenance.more.get(RANGES), twin.channels, [part.inputs for part in data.test])
     own = free_run_scores(runs, spec, bundle.intervals, labels)
-    scores = {TWIN: replace(own, ahead=_ahead(twin, data, spec), beyond=beyond)}
+    scores = {TWIN: replace(own, ahead=_score_ahead(twin, data, spec), beyond=beyond)}
     for name in spec.floors:
         progress.note(f"free runs of {name}")
         floor_spec: TwinSpec = replace(TWINS[name](), prefix_ticks=experiment.twin.prefix_ticks)
@@ -85,7 +85,7 @@ def judge_twin(
             # What such a log is too short for is no rival on it, and no reason to have no twin.
             progress.note(f"the floor {name} is left out: {problem}")
             continue
-        scores[name] = replace(free_run_scores(floor_runs, spec, None, labels), ahead=_ahead(floor, data, spec))
+        scores[name] = replace(free_run_scores(floor_runs, spec, None, labels), ahead=_score_ahead(floor, data, spec))
     return scores, runs
 
 
@@ -134,7 +134,7 @@ def shown_runs(runs: FreeRuns, intervals: FreeRunIntervals | None) -> dict[str, 
     return arrays
 
 
-def _ahead(twin: Twin, data: Prepared, spec: FreeRunJudgeSpec) -> AheadErrors | None:
+def _score_ahead(twin: Twin, data: Prepared, spec: FreeRunJudgeSpec) -> AheadErrors | None:
     """Scores a few ticks ahead; None where no recording is long enough."""
     longest = max(part.samples for part in data.test)
     if longest < twin.prefix_ticks + spec.ahead_ticks + 1:
@@ -212,7 +212,7 @@ def beside_predictor(
     by_recording = {recording.name: recording for recording in recordings}
     pieces = [task.series(*_rows(part.name, by_recording), part.name) for part in test]
     ahead = look_ahead(twin, test, ticks, predictor.spec.window)
-    predicted = _at_moments(predictor, pieces, ahead)
+    predicted = _predict_at_moments(predictor, pieces, ahead)
     columns = {name: predicted[:, task.targets.index(name)] for name in names}
     # A recording that trained the predictor flatters it: a reader must know.
     trained = bundle.provenance.recording_names("train")
@@ -237,7 +237,7 @@ def _rows(name: str, recordings: Mapping[str, Recording]) -> tuple[Recording, in
     return recordings[whole], int(start), int(stop)
 
 
-def _at_moments(predictor: Predictor, series: Sequence[Series], ahead: Ahead) -> NDArray[np.float32]:
+def _predict_at_moments(predictor: Predictor, series: Sequence[Series], ahead: Ahead) -> NDArray[np.float32]:
     """Predictions that far ahead at the moments ``(moment, target)``, SI units."""
     which = predictor.task.horizons.index(ahead.ticks)
     predictions = stream_predictions(predictor, series)

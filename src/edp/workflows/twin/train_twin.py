@@ -111,7 +111,7 @@ def train_twin(
             bundle = load_twin(run.path)
             return TrainedTwin(bundle, read_models(bundle.scores, f"'{run.path}'"), True)
         fit = TwinFit(channels, fit_scales(channels, data.train), data, experiment, progress, staying)
-        result = _chosen(fit, KeyedRun(run, key), base)
+        result = _train_or_choose(fit, KeyedRun(run, key), base)
         fitted = result.fitted
         run.write_history(fitted.history)
         if result.datasheet:
@@ -167,7 +167,7 @@ def _linkage(experiment: TwinExperiment) -> dict[str, object]:
     return {"linkage": asdict(load_machine(spec.linkage))}
 
 
-def _chosen(fit: TwinFit, run: KeyedRun, base: BaseTwin | None) -> FittedFormulation:
+def _train_or_choose(fit: TwinFit, run: KeyedRun, base: BaseTwin | None) -> FittedFormulation:
     """Return the twin of the settings, or the further trained one; a choice is kept in ``candidates.json``."""
     spec = fit.experiment.twin
     if base is not None:

@@ -162,7 +162,7 @@ def _tanks(tick: _Tick) -> list[tuple[str, list[int]]]:
         build.start_from(slots, twin.starting_levels(twin.numbers))
         values.append(hidden)
     before = build.pick("in_order", build.join("levels", *values), [order.index(tank.name) for tank in tanks])
-    risen = _risen(tick, before)
+    risen = _add_level_changes(tick, before)
     if hidden:
         own = [i for i, tank in enumerate(tanks) if not tank.level]
         left = tick.both("left", ADD, build.pick("before", before, own), build.pick("rise", risen, own))
@@ -182,7 +182,7 @@ def _tanks(tick: _Tick) -> list[tuple[str, list[int]]]:
     return [(tick.bounded("stroke", stroke, columns), columns), (tick.bounded("bounded", speed, speeds), speeds)]
 
 
-def _risen(tick: _Tick, before: str) -> str:
+def _add_level_changes(tick: _Tick, before: str) -> str:
     """Add the changes of all levels in a sample, by the midpoint rule."""
     twin, build, tanks = tick.twin, tick.build, tick.twin.elements.tanks
     step, inflow = 1.0 / (twin.channels.rate_hz * twin.spec.steps), tick.numbers([t.name for t in tanks], "inflow")

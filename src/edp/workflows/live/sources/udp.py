@@ -95,7 +95,7 @@ class UdpSource(LiveSource):
             sink.note("warning", f"rows are taken from {self._bind.reach}, whoever sends them")
         arrivals = Arrivals(sink, self.rate_hz)
         while not sink.stopped:
-            message = self._received(sink)
+            message = self._receive(sink)
             if message is None:
                 arrivals.wait()
             else:
@@ -112,7 +112,7 @@ class UdpSource(LiveSource):
         except (OSError, ValueError):  # closed meanwhile
             return False
 
-    def _received(self, sink: Sink) -> Mapping[str, float] | None:
+    def _receive(self, sink: Sink) -> Mapping[str, float] | None:
         try:
             data = self._socket.recv(MOST_BYTES + 1)
         except TimeoutError:
