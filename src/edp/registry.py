@@ -121,7 +121,7 @@ class Registry(Mapping[str, T], Generic[T]):
             self._parts.pop(name, None)
             self._modules.pop(name, None)
 
-    def added_since(self, names: Mapping[str, str]) -> dict[str, str]:
+    def list_added_since(self, names: Mapping[str, str]) -> dict[str, str]:
         """Return the parts of plug-ins that are not among `names`, with their modules."""
         return {name: module for name, module in self._modules.items() if name not in names}
 
@@ -166,7 +166,7 @@ class _Plugins:
         except (Exception, SystemExit) as error:
             # What it had registered goes: half a plug-in would fail later, with another message.
             for registry in self.registries:
-                registry.forget(registry.added_since(before.get(registry, {})))
+                registry.forget(registry.list_added_since(before.get(registry, {})))
             kind = "" if isinstance(error, ConfigError) else f"{type(error).__name__}: "
             self.failures.append(f"{where} cannot be loaded and is left out: {kind}{brief(error)}")
 

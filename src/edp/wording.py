@@ -218,7 +218,7 @@ def _around(name: str, start: int, most: int) -> str:
     return f"{name[:ends]}…{name[start : start + most - 2 * ends - 2]}…{name[-ends:]}"
 
 
-def in_cell(text: str) -> str:
+def escape_csv(text: str) -> str:
     """Return text for a CSV cell: text that a spreadsheet would run as a formula gets a leading apostrophe."""
     # Numbers with a sign stay numbers; only text can be a formula.
     try:
@@ -228,7 +228,7 @@ def in_cell(text: str) -> str:
     return text
 
 
-def in_markdown(text: str) -> str:
+def escape_markdown(text: str) -> str:
     """Escape a sentence for Markdown, so that names in it cannot start an element, a link or a line."""
     flat = printable(re.sub(r"[ \t\r\n\f\v]+", " ", text).strip())
     return flat.replace("<", "&lt;").replace("](", "]\\(").replace("][", "]\\[")

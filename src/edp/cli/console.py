@@ -22,7 +22,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from edp.cli.options import check_belonging, setting_of
-from edp.cli.process import memory_message, out_of_memory, stopped_code
+from edp.cli.process import exit_code_of_stop, memory_message, out_of_memory
 from edp.errors import ConfigError, EdpError
 from edp.table import Column, Table
 
@@ -127,7 +127,7 @@ def print_table(table: Table) -> None:
 
     Figures that do not fit beside each other stand below each other, each block with the first column.
     """
-    table = table.without_empty_columns()
+    table = table.drop_empty_columns()
     headings, rows = table.heads(), [[_to_text(cell) for cell in row] for row in table.texts()]
     widths = _widths(headings, rows)
     has_words = any(column.is_text for column in table.columns[1:])
@@ -228,10 +228,10 @@ class TimeLeft(ProgressColumn):
         """Return the time now."""
         if task.finished:
             return Text("" if task.finished_time is None else duration(task.finished_time))
-        return Text("" if task.time_remaining is None else left_text(task.time_remaining).removeprefix(", "))
+        return Text("" if task.time_remaining is None else format_time_left(task.time_remaining).removeprefix(", "))
 
 
-def left_text(seconds: float) -> str:
+def format_time_left(seconds: float) -> str:
     """Return ``, 5 s left`` for a line of progress; empty where the estimate is used up or not finite.
 
     Args:
@@ -341,7 +341,7 @@ def run_app(app: typer.Typer | Callable[..., Any]) -> int:
         return done.exit_code
     except (KeyboardInterrupt, typer.Abort):
         err.print("stopped; what was finished is on disk: give the same command again to go on")
-        return stopped_code(INTERRUPTED)
+        return exit_code_of_stop(INTERRUPTED)
     except OSError as error:
         return _say_system(error)
     except Exception as error:

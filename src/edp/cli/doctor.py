@@ -19,7 +19,7 @@ import typer
 
 from edp import __version__
 from edp.cli.console import JsonFlag, emit, listing, out
-from edp.cli.progress import shown_progress
+from edp.cli.progress import show_progress
 from edp.errors import EdpError, count_of
 from edp.storage.paths import is_folder_at
 from edp.wording import figure, number
@@ -93,7 +93,7 @@ def doctor(
     if ahead:
         from edp.workflows.compile_ahead import compile_ahead
 
-        with shown_progress("doctor", as_json) as progress:
+        with show_progress("doctor", as_json) as progress:
             compile_ahead(progress)
     checks = [*packages(), *machine(folder), reading(), *sandbox_layers(), *extras(), *programs()]
     broken = [check for check in checks if check.state == "broken"]
@@ -196,9 +196,9 @@ def sandbox_layers() -> list[InstallationCheck]:
 
     Looks at nothing by itself: `reading` reads a log.
     """
-    from edp.sandbox.layers import LAYERS, seen_layers
+    from edp.sandbox.layers import LAYERS, get_seen_layers
 
-    seen = seen_layers()
+    seen = get_seen_layers()
     checks = []
     for layer in LAYERS:
         reason = "not tried: no log was read" if seen is None else seen[layer.name]

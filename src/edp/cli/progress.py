@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from edp.cli.console import Steps, count_text, duration, left_text, progress
+from edp.cli.console import Steps, count_text, duration, format_time_left, progress
 from edp.wording import figure, number
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ class StageDisplay:
         line = not self.text and (bool(values) or done != self.done)
         self.text, self.done, self.values = "", done, values
         self.share = values.get("share", done / max(1, self.total or 1))
-        left = left_text(values["seconds_left"]) if "seconds_left" in values else self._estimate_time_left()
+        left = format_time_left(values["seconds_left"]) if "seconds_left" in values else self._estimate_time_left()
         if left and self.outer is not None and self.outer.total is not None:
             left = f"{left} of it"
         # The end of an epoch has a line of its own.
@@ -116,7 +116,7 @@ class StageDisplay:
         """Return the time left, estimated from the complete units; an empty text before the first one."""
         if not self.display.counted or not self.done or self.total is None:
             return ""
-        return left_text((time.monotonic() - self.began) / self.done * (self.total - self.done))
+        return format_time_left((time.monotonic() - self.began) / self.done * (self.total - self.done))
 
     def _clear_outer(self) -> None:
         """Remove the notes of stages around this one that do not count units."""
@@ -160,7 +160,7 @@ def _figure(name: str, value: float) -> str:
 
 
 @contextmanager
-def shown_progress(command: str, quiet: bool, counted: str = "", timed: bool = False) -> Iterator[StageDisplay]:
+def show_progress(command: str, quiet: bool, counted: str = "", timed: bool = False) -> Iterator[StageDisplay]:
     """Show the progress of a command; see `Display`.
 
     Args:

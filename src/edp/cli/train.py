@@ -21,7 +21,7 @@ from edp.cli.options import (
     source_of,
     workers_of,
 )
-from edp.cli.progress import shown_progress
+from edp.cli.progress import show_progress
 from edp.wording import figure, number, percent
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def _train_auto(
     if not quiet:
         limit = f"{figure(settings.auto.minutes)} min"
         err.print(f"train: reads the logs, then trains for at most about {limit} of processor time (--minutes)")
-    with shown_progress("train", quiet) as progress:
+    with show_progress("train", quiet) as progress:
         result = train_auto(source, settings, folder, progress, workers)
     facts = {"run": str(folder), "bundle": str(folder / "bundle"), **result.choice.to_table()}
 
@@ -172,6 +172,6 @@ def run(
     from edp.workflows.train_evaluate import train as run_training
 
     experiment = load_experiment(config, preset, changes)
-    with shown_progress("train", quiet) as progress:
+    with show_progress("train", quiet) as progress:
         bundle = run_training(source or DataSource.of(data), experiment, folder, training_steps(progress))
     return bundle, progress.display.measured("validation_mae")

@@ -250,7 +250,7 @@ class ControllerSpec(Protocol):
         ...
 
 
-def unused_models(needs: Sequence[str], available: Collection[str]) -> list[str]:
+def list_unused_models(needs: Sequence[str], available: Collection[str]) -> list[str]:
     """Return the available models that a controller does not use.
 
     Args:

@@ -163,7 +163,7 @@ class ByFrozen:
         )
 
 
-def frozen_of(split: SplitSpec) -> dict[str, str]:
+def list_frozen(split: SplitSpec) -> dict[str, str]:
     """Return the names of the frozen sessions by digest; empty for a split without frozen sessions."""
     return split.frozen if isinstance(split, ByFrozen) else {}
 
@@ -193,7 +193,7 @@ def keep_frozen(before: SplitSpec, after: SplitSpec) -> None:
     Raises:
         ConfigError: it does.
     """
-    lost = set(frozen_of(before)) - set(frozen_of(after))
+    lost = set(list_frozen(before)) - set(list_frozen(after))
     if lost:
         raise ConfigError(
             f"the run comes from a search, and --set split lets go of {len(lost)} of its frozen sessions; they stay "

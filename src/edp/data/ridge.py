@@ -103,7 +103,7 @@ def ridge_solution(
     return _physical(weights, fitted, standard, task, penalty, history)
 
 
-def crossed_solution(
+def cross_validate_ridge(
     parts: Sequence[Series],
     task: LagTask,
     folds: int = 5,

@@ -42,7 +42,7 @@ class Axis:
     stroke: str = ""
     conflux: tuple[str, ...] = ()
 
-    def signed_command(self, recording: Recording) -> Array:
+    def read_signed_command(self, recording: Recording) -> Array:
         """Command, extension positive, shape ``(time,)``."""
         return signed(recording, self.command)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.data.features import STARTING, derive
-from edp.data.gathered import LastMade, made_when_read, some_columns
+from edp.data.gathered import LastMade, make_lazy_array, some_columns
 from edp.data.moments import Moments
 from edp.data.series import Series
 from edp.data.task import TargetMode, Task
@@ -81,7 +81,7 @@ def feature_columns(task: Task, series: Series, places: Sequence[int], slot: Las
     if max(places, default=0) < len(task.features.channels):
         return some_columns(series.inputs, places)
     shape = (series.samples, len(places))
-    return made_when_read(shape, lambda: feature_matrix(task, series)[:, list(places)], slot)
+    return make_lazy_array(shape, lambda: feature_matrix(task, series)[:, list(places)], slot)
 
 
 def fit_scaler(task: Task, train: Sequence[Series], kinds: Sequence[Kind]) -> Scaler:

@@ -278,7 +278,7 @@ class LostOutput:
     horizon: int
 
 
-def lost_outputs(scores: ScoresFile) -> list[LostOutput]:
+def find_lost_outputs(scores: ScoresFile) -> list[LostOutput]:
     """Return the outputs on which a baseline has a lower RMSE at some horizon, the worst first.
 
     Args:

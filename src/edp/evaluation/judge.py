@@ -146,7 +146,7 @@ def judge(
     progress.note("network")
     models = {"network": bench.network(label, seconds)}
     start, left_out = time.perf_counter(), []
-    for name in by_effort(spec.baselines):
+    for name in sort_by_effort(spec.baselines):
         if minutes is not None and time.perf_counter() - start > 60 * minutes:
             left_out.append(name)
             continue
@@ -155,7 +155,7 @@ def judge(
     return bench.together(models, left_out)
 
 
-def by_effort(names: Sequence[str]) -> list[str]:
+def sort_by_effort(names: Sequence[str]) -> list[str]:
     """Names of baselines, the cheapest first."""
     return sorted(names, key=lambda name: BASELINES[name].effort)
 
@@ -252,13 +252,13 @@ class ModelBench:
         measured, within = self.ruler.gathered(predictions).state(), None
         if coverages:
             bounds = pictures.bounds(streamed(net, net.intervals, test, groups=groups), nearest_to_shown(coverages))
-            within = self.ruler.gathered_intervals(bounds, coverages).state()
+            within = self.ruler.gather_intervals(bounds, coverages).state()
         return JudgedPart(measured, within, pictures.tensors)
 
     def network_of(self, parts: Iterable[JudgedPart], label: str, seconds: float) -> JudgedModel:
         """Return the network's entry from its parts, in order; label and training time appear in reports."""
         coverages = self.predictor.spec.output.coverages
-        measured, within = self.ruler.unmeasured(), self.ruler.unmeasured_intervals(coverages)
+        measured, within = self.ruler.unmeasured(), self.ruler.new_interval_metrics(coverages)
         tensors: dict[str, NDArray[np.float32]] = {}
         for part in parts:
             measured.add(part.measured)

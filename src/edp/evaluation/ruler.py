@@ -24,7 +24,7 @@ from edp.evaluation.scores_file import (
     ScoresFile,
 )
 from edp.evaluation.situation import situation_of
-from edp.evaluation.tally import Values, named_scores
+from edp.evaluation.tally import Values, name_scores
 from edp.signals import KINDS
 from edp.stats.metrics import interval_score, interval_scores, score, spread
 from edp.stats.sketch import QuantileSketch
@@ -144,13 +144,13 @@ class Ruler:
             },
         )
 
-    def unmeasured_intervals(self, coverages: Sequence[float]) -> MeasuredIntervals:
+    def new_interval_metrics(self, coverages: Sequence[float]) -> MeasuredIntervals:
         """Return empty accumulators of interval metrics."""
         return MeasuredIntervals((len(self.task.horizons), len(coverages), len(self.task.targets)))
 
-    def gathered_intervals(self, bounds: Numbered, coverages: Sequence[float]) -> MeasuredIntervals:
+    def gather_intervals(self, bounds: Numbered, coverages: Sequence[float]) -> MeasuredIntervals:
         """Return the metrics of intervals of all recordings, or of a part."""
-        measured = self.unmeasured_intervals(coverages)
+        measured = self.new_interval_metrics(coverages)
         for number, pairs in bounds:
             truth = self.truth(number)[self.skip :]
             if not len(truth):
@@ -208,7 +208,7 @@ class Ruler:
 
     def _score_recording(self, predicted: NDArray[Any], truth: NDArray[Any]) -> ByTarget:
         """Return all scores of the mean over outputs; of each output errors alone, since runs have many recordings."""
-        scores = named_scores(
+        scores = name_scores(
             self.task.targets, [score(predicted[:, i], truth[:, i]) for i in range(len(self.task.targets))]
         )
         measures = ("mae", "rmse")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edp.ir import layers as plain
 from edp.ir import memory
 from edp.ir.base import INPUT, Graph, Layer
-from edp.ir.descent import reached_leaves, summed
+from edp.ir.descent import find_leaves, summed
 
 Values = NDArray[np.floating]
 Memory = dict[str, Values]
@@ -195,7 +195,7 @@ def _grouped_dense(layer: Any, w: Weights, m: Memory, x: Values) -> Values:
 
 @_step(plain.TreeSums)
 def _trees(layer: plain.TreeSums, w: Weights, m: Memory, x: Values) -> Values:
-    return summed(reached_leaves(layer.feature, w["threshold"], w["leaf"], x))
+    return summed(find_leaves(layer.feature, w["threshold"], w["leaf"], x))
 
 
 def _normalise(x: Values, epsilon: float) -> Values:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from edp.errors import DataError
 from edp.logs.assemble import assemble, parts, prepare
-from edp.logs.detect import BAG_MARK, export_advice, format_for, is_text_log, known_suffixes, open_log
+from edp.logs.detect import BAG_MARK, export_advice, format_for, is_text_log, list_suffixes, open_log
 from edp.logs.formats.base import TRUTH, RawLog, holds_truth_apart, is_truth
 from edp.logs.formats.names import name_of_file
 from edp.logs.repair import Repair
@@ -40,7 +40,7 @@ def read_recording(
     """Read a log file as a uniformly sampled recording in SI units.
 
     Args:
-        path: a log of any known format (`edp.logs.known_suffixes`), or the folder of a ROS 2 bag.
+        path: a log of any known format (`edp.logs.list_suffixes`), or the folder of a ROS 2 bag.
         signal_map: assignment of columns to channels. An empty map uses the names of the vocabulary and the units
             stated in the file (SI units if none is stated).
         name: the recording's name; default: as the file says, else the file's stem.
@@ -132,7 +132,7 @@ def find_recordings(path: str | Path) -> tuple[Path, ...]:
         raise DataError(f"'{source}' does not exist; give a log file or a folder of log files")
     there = list(files_below(source))
     bags = {entry.parent for entry in there if entry.name == BAG_MARK}
-    suffixes = known_suffixes()
+    suffixes = list_suffixes()
     files = [
         entry
         for entry in there

@@ -25,7 +25,7 @@ from edp.monitor.session_blocks import (
     summarised,
 )
 from edp.monitor.summaries import BlockSummaries
-from edp.monitor.watches import BankSpec, Watch, WatchSpec, check_rows, fit_watch, scaled_alike
+from edp.monitor.watches import BankSpec, Watch, WatchSpec, check_rows, fit_watch, scale_watches
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.settings.bounds import above, below, check_bounds, check_count, integer, span
@@ -166,7 +166,7 @@ def check_healthy_sessions(spec: ChainSpec, channels: Sequence[Channel], session
     _check_sessions(spec, len(sessions))
     block = block_ticks(spec.block_s, sessions)
     points = operating_numbers(channels, sessions, block)
-    lengths = watched_blocks(spec, sessions)
+    lengths = count_watched_blocks(spec, sessions)
     folds = min(spec.folds, len(sessions))
     for fold in (NO_FOLD, *range(folds)):
         left_out = set(_list_left_out(fold, len(sessions), folds))
@@ -176,7 +176,7 @@ def check_healthy_sessions(spec: ChainSpec, channels: Sequence[Channel], session
             check_rows(watch, others, sessions[0].rate_hz / block)
 
 
-def watched_blocks(spec: ChainSpec, sessions: Sequence[Recording]) -> list[int]:
+def count_watched_blocks(spec: ChainSpec, sessions: Sequence[Recording]) -> list[int]:
     """Return the number of blocks of each session that are watched, those at the start left out."""
     block = block_ticks(spec.block_s, sessions)
     settle = _settle_blocks(spec, sessions, block)
@@ -227,7 +227,7 @@ def fit_from_blocks(
         for index, part in zip(job.left_out, fitted.rows, strict=True):
             white[index] = _extend_rows(part, [watch.directions for watch in watches])
     # On sessions that a view was not fitted to: on its own ones one of many directions looks far too calm.
-    bank = BankSpec(scaled_alike(spec.watches, watches, white))
+    bank = BankSpec(scale_watches(spec.watches, watches, white))
     limit = calibrated(bank, white, blocks_per_s, promised_hours)
     quiet = _quiet(bank, white)
     chain = MonitorChain(summaries, conditioning, drift, bank.watches, limit.limit, quiet, settle)

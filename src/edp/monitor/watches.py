@@ -220,7 +220,7 @@ class BankSpec(DetectorSpec):
         return np.concatenate([watch(gross if watch.own else rows) for watch in self.watches], axis=1)
 
 
-def scaled_alike(specs: Sequence[WatchSpec], watches: Sequence[Watch], sessions: Sequence[Array]) -> tuple[Watch, ...]:
+def scale_watches(specs: Sequence[WatchSpec], watches: Sequence[Watch], sessions: Sequence[Array]) -> tuple[Watch, ...]:
     """Return the watches scaled to equal sensitivity: by the third largest statistic of all healthy sessions.
 
     Args:

@@ -52,7 +52,7 @@ class IntegerPredictor(Predictor):
         self.integers: Graph = integers
         self.eval()
 
-    def in_float(self) -> Predictor:
+    def to_float_network(self) -> Predictor:
         """Return the network in single precision from which it was quantised, for counting or further training."""
         offset, width = (part.double().numpy() for part in (self.front.offset, self.front.width))
         zero, unit = (part.double().numpy() for part in (self.code.offset, self.code.width))

@@ -128,7 +128,7 @@ class Streaming(nn.Module, ABC):
         return result
 
 
-def fixed_parameters(model: nn.Module) -> set[str]:
+def list_fixed_parameters(model: nn.Module) -> set[str]:
     """Full names of the parameters that parts of a model declare as `Streaming.fixed`."""
     return _list_declared(model, "fixed")
 

@@ -39,7 +39,7 @@ BUILD_NAMES = frozenset(
 """Additional variables for compilers, ROS 2 and Octave."""
 
 
-def reduced_environment(further: Iterable[str] = ()) -> Mapping[str, str]:
+def reduce_environment(further: Iterable[str] = ()) -> Mapping[str, str]:
     """Return the variables of this process that a process for hostile input may have.
 
     Args:

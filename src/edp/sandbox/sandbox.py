@@ -23,7 +23,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from edp.errors import DataError
-from edp.sandbox.environment import reduced_environment
+from edp.sandbox.environment import reduce_environment
 from edp.sandbox.protocol import Header, packed, reader, receive
 
 PIPE_BYTES = 1 << 20
@@ -126,7 +126,7 @@ def _forget() -> None:
 
 def _environment() -> dict[str, str]:
     places = os.pathsep.join(entry for entry in sys.path if entry)
-    return {**reduced_environment(), **dict.fromkeys(_THREADS, "1"), **_SMALL_POOL, "PYTHONPATH": places}
+    return {**reduce_environment(), **dict.fromkeys(_THREADS, "1"), **_SMALL_POOL, "PYTHONPATH": places}
 
 
 def _start(worker: str, arguments: Sequence[str], **pipes: Any) -> subprocess.Popen[bytes]:

@@ -144,7 +144,7 @@ class DataSetSpec:
             )
             for i in range(self.recordings)
         )
-        return over_family(plan, self.family, self.seed, self.masses, self.scatter) if self.family else plan
+        return distribute_over_family(plan, self.family, self.seed, self.masses, self.scatter) if self.family else plan
 
     def _soils(self, excitations: Sequence[str]) -> list[str]:
         """Return the material of each recording; empty for free air. Each family gets all materials in turn."""
@@ -189,7 +189,7 @@ def plan_data_set(
     return spec.scenarios()
 
 
-def over_family(
+def distribute_over_family(
     scenarios: Sequence[Scenario],
     count: int,
     seed: int,

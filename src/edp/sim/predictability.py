@@ -164,7 +164,7 @@ def _futures(
 def _measure_outputs(simulation: Simulation, log: Array, seed: np.random.SeedSequence) -> Array:
     scenario = simulation.scenario
     rng = np.random.default_rng(seed) if scenario.sensor_noise else None
-    signals = sensors.measured_signals(log, simulation.machine, scenario.rate_hz, rng, log[:, at.LOG_OIL] + 273.15)
+    signals = sensors.measure_signals(log, simulation.machine, scenario.rate_hz, rng, log[:, at.LOG_OIL] + 273.15)
     return signals[:, : len(TARGETS)]
 
 

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from edp.errors import DataError
-from edp.stats.checks import finite, tested_cells
+from edp.stats.checks import check_tested_cells, finite
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ def paired_variance(differences: ArrayLike, tested: ArrayLike | None = None) -> 
     Raises:
         DataError: the cells cannot tell the variances apart, or hold values that are not finite.
     """
-    array, mask = tested_cells(differences, tested)
+    array, mask = check_tested_cells(differences, tested)
     if array.ndim != 2:
         raise DataError(f"the differences have shape {array.shape}; give (run, session)")
     per_run, per_session, cells = mask.sum(axis=1), mask.sum(axis=0), int(mask.sum())

@@ -124,7 +124,7 @@ def check_held(path: str | Path, stream: IO[str]) -> None:
         )
 
 
-def held_by(path: str | Path) -> str | None:
+def find_holder(path: str | Path) -> str | None:
     """Return the holder of a file locked by `hold`; None if it is free. Nothing is changed."""
     try:
         with os.fdopen(os.open(path, os.O_RDONLY | _OPEN), encoding="utf-8", errors="replace") as stream:

@@ -13,7 +13,7 @@ from typing import Any
 
 from edp.errors import StorageError
 from edp.storage.headers import is_whole
-from edp.storage.locks import held_by
+from edp.storage.locks import find_holder
 from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_link_at, status_of
 from edp.storage.provenance import PROVENANCE
 from edp.storage.reading import parse_json, read_text, read_toml
@@ -142,7 +142,7 @@ def _kind(path: Path, identity: Mapping[str, object], status: Mapping[str, objec
 
 def _state(path: Path, kind: RunKind, status: Mapping[str, object]) -> str:
     """Return the state of a run; a state that is not recorded follows from the result, which is written at the end."""
-    if held_by(path / kind.lock):
+    if find_holder(path / kind.lock):
         return "running"
     recorded = status.get("status") or _study_state(path, kind)
     if not recorded:

@@ -32,7 +32,7 @@ def sample_recording(rate_hz: float = 100.0, ticks: int = 400) -> Recording:
     return Recording("R1", channels, values.astype(np.float32), rate_hz, "sim:test", {"seed": 3, "text": "ü"})
 
 
-def written_log(form: LogFormat, recording: Recording, folder: Path) -> Path:
+def write_log_file(form: LogFormat, recording: Recording, folder: Path) -> Path:
     """Write a recording with a format, under its first ending, and return the path."""
     path = folder / f"{recording.name}{form.suffixes[0]}"
     form.write(recording, path, WriteOptions())
@@ -59,7 +59,7 @@ def check_round_trip(form: LogFormat, recording: Recording) -> None:
         ContractError: something of it is lost or changed.
     """
     with tempfile.TemporaryDirectory(prefix="edp-format-") as folder:
-        path = written_log(form, recording, Path(folder))
+        path = write_log_file(form, recording, Path(folder))
         again = read_log(form, path)
         if path.is_file():
             with path.open("rb") as stream:
@@ -80,7 +80,7 @@ def check_damage(form: LogFormat) -> None:
         ContractError: another exception, or noise that is read as a log.
     """
     with tempfile.TemporaryDirectory(prefix="edp-format-") as folder:
-        path = written_log(form, sample_recording(), Path(folder))
+        path = write_log_file(form, sample_recording(), Path(folder))
         if not path.is_file():
             return
         content = path.read_bytes()

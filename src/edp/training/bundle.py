@@ -152,7 +152,7 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
         referenced.add(entry["file"])
         header |= {"schema": ADAPTED_SCHEMA, "adaptation": bundle.adaptation.to_plain() | {"arrays": entry}}
     # The header comes last: it is what makes the new files count.
-    write_json(path / HEADER, with_plugins(header))
+    write_json(path / HEADER, add_plugins(header))
     # Old files go only after the rename; a kill in between leaves spare files, not a broken bundle.
     for old in (
         file for what in ("weights", "integers", "adaptation") for file in entries_of(path, f"{what}-*.safetensors")
@@ -183,7 +183,7 @@ def load_bundle(folder: str | Path) -> Bundle:
             version does not know.
     """
     path = _bundle_folder(folder)
-    with as_damage(path):
+    with convert_damage(path):
         header = _read_header(path)
         _check_schema(header, path)
         check_hash(header, path / HEADER)
@@ -192,7 +192,7 @@ def load_bundle(folder: str | Path) -> Bundle:
         return _assemble(header, path)
 
 
-def with_plugins(header: Mapping[str, object]) -> dict[str, object]:
+def add_plugins(header: Mapping[str, object]) -> dict[str, object]:
     """Return a header with the plug-ins whose parts it names."""
     plugins = origins_in(header)
     return {**header, PLUGINS: plugins} if plugins else dict(header)
@@ -221,7 +221,7 @@ def upgrade_bundle(folder: str | Path) -> Path:
         BundleError: not a bundle of an earlier version, or a damaged one; it is left as it is.
     """
     path = _bundle_folder(folder)
-    with as_damage(path):
+    with convert_damage(path):
         header = _read_header(path)
         schema = header["schema"]
         if schema not in UNHASHED | REWORDED:
@@ -231,7 +231,7 @@ def upgrade_bundle(folder: str | Path) -> Path:
         upgraded = _convert_keys(header) | {"schema": (UNHASHED | REWORDED)[schema]}
         # The content is assembled once, so that damage is not sealed under a new hash.
         _assemble(upgraded, path)
-    write_json(path / HEADER, with_plugins(upgraded))
+    write_json(path / HEADER, add_plugins(upgraded))
     return path
 
 
@@ -262,7 +262,7 @@ def _bundle_folder(folder: str | Path) -> Path:
 
 
 @contextlib.contextmanager
-def as_damage(path: Path) -> Iterator[None]:
+def convert_damage(path: Path) -> Iterator[None]:
     """Convert errors in a file of a bundle to one message that names the bundle."""
     # A damaged file can raise any of these deep in a parser; a bug elsewhere keeps its own type.
     kinds = (EdpError, LookupError, AttributeError, TypeError, ValueError, ArithmeticError, RuntimeError)

@@ -199,7 +199,7 @@ def fit_elements(
         point, matrix = _descend(
             problem, APART * rng.normal(size=every) if start else np.zeros(every), twin.spec.rounds
         )
-        fitted = twin.with_numbers(problem.numbers(point[:size]))
+        fitted = twin.with_parameters(problem.numbers(point[:size]))
         judge.twin = fitted
         error = judge.error()
         better = bool(error < least)

@@ -34,7 +34,7 @@ from edp.training.memory import check_training_memory
 from edp.training.objective import Objective
 from edp.training.outcome import Diverged, Fitted, TrainingError, TrainingProgress
 from edp.training.ridge_start import start_bypass
-from edp.training.spec import TrainingSpec, by_gradient, check_training, thread_count
+from edp.training.spec import TrainingSpec, check_training, thread_count, to_gradient_training
 from edp.training.strategy import BatchContext, DirectFit, EpisodicStrategy, StreamStrategy, TrainingStrategy
 from edp.training.validation import calibrate, validation_scores
 from edp.wording import typed
@@ -57,7 +57,8 @@ def fit(
         run: where the training writes; where given, a checkpoint after each epoch makes it resumable.
         on_event: called with progress.
         strategy: weights to begin with, a teacher, or what fits the network by itself; it is part of what the key of
-            `run` must tell apart. A strategy knows no folds: with it a committee trains by gradient (`by_gradient`).
+            `run` must tell apart. A strategy has no folds: with it a committee trains by gradient (see
+            `to_gradient_training`).
 
     Raises:
         ConfigError: settings that contradict one another.
@@ -73,7 +74,7 @@ def fit(
         if run is not None:
             run.folder.write_history(direct.history)
         return direct
-    spec = by_gradient(spec)
+    spec = to_gradient_training(spec)
     fitted = Loop(data, model, spec, run, strategy).fit(tell)
     best = max((row["epoch"] for row in fitted.history if row["best"]), default=0)
     if spec.refit == "none" or not best:

@@ -195,7 +195,7 @@ class FreeRunSampler:
         return np.asarray(first + np.arange(ticks + 1)[:, None], dtype=np.int64)
 
 
-def measured_ports(spec: FreeRunSpec, shape: tuple[int, int, int], prefix: int, rng: np.random.Generator) -> Array:
+def draw_measured_ports(spec: FreeRunSpec, shape: tuple[int, int, int], prefix: int, rng: np.random.Generator) -> Array:
     """Return the measured ports ``(tick, lane, answer)``: 1 in the prefix, later by the fractions in the settings."""
     _, lanes, answers = shape
     kind = rng.random(lanes)
@@ -334,7 +334,7 @@ def _update(
     rng = np.random.default_rng([spec.seed, done])
     rows = sampler.rows(twin.prefix_ticks + ticks, spec.lanes, rng)
     truth = sampler.answers[rows]
-    ports = measured_ports(spec, truth[1:].shape, twin.prefix_ticks, rng)
+    ports = draw_measured_ports(spec, truth[1:].shape, twin.prefix_ticks, rng)
     commands, measured, port = (torch.from_numpy(a) for a in (sampler.commands[rows[:-1]], truth[:-1], ports))
     answers = twin.free_run(commands, measured, port)
     loss = huber((answers - torch.from_numpy(truth[1:])) * weight, spec.delta).mean()

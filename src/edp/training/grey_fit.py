@@ -292,7 +292,7 @@ def _fit_form(
             # The last round of a stage is judged, whatever its number.
             if number != len(lengths) and number % spec.validate_every and length_s == lengths[number]:
                 continue
-            judge.twin = twin.with_numbers(problem.numbers(path.theta))
+            judge.twin = twin.with_parameters(problem.numbers(path.theta))
             better = path.judge(judge.error()) and path.least <= min(other.least for other in paths)
             moved = float(np.sqrt(np.mean((path.theta - before) ** 2)))
             row = {"update": progress.done, "start": path.number, "length_s": length_s, "validation": path.error}
@@ -309,7 +309,7 @@ def _fit_form(
         chosen = min(paths, key=lambda path: path.least)
         advance(chosen, rounds[spec.rounds[0] :])
     advance(chosen, rounds[-1:] * (spec.final_rounds if final else 0), True)
-    end = twin.with_numbers(problem.numbers(chosen.best))
+    end = twin.with_parameters(problem.numbers(chosen.best))
     return GreyFit(end, history, progress.seconds, chosen.information, chosen.best, chosen.least)
 
 

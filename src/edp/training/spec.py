@@ -133,7 +133,7 @@ class TrainingSpec:
                 )
 
 
-def by_gradient(spec: TrainingSpec) -> TrainingSpec:
+def to_gradient_training(spec: TrainingSpec) -> TrainingSpec:
     """Return the settings of a gradient training in chunks that replaces a training on folds.
 
     Chunks and updates an epoch are those of a committee where the spec leaves its defaults; all else stays.

@@ -45,7 +45,7 @@ def complete_tables(model: HistGradientBoostingRegressor, depth: int) -> Tables:
     return feature, threshold, leaf.astype(np.float32)
 
 
-def stacked_tables(tables: Sequence[Tables], trees: int) -> Tables:
+def stack_tables(tables: Sequence[Tables], trees: int) -> Tables:
     """Tables of several outputs, ``(output, tree, ...)``; missing trees give zero.
 
     Args:

@@ -67,7 +67,7 @@ def _predictor_of(path: str | Path) -> tuple[Predictor, str, Adaptation | None]:
     bundle = load_bundle(source)
     predictor = bundle.predictor
     # Integer networks have the counts of the network that they were quantised from.
-    counted = predictor.in_float() if isinstance(predictor, IntegerPredictor) else predictor
+    counted = predictor.to_float_network() if isinstance(predictor, IntegerPredictor) else predictor
     return counted, describe(predictor.spec), bundle.adaptation
 
 
@@ -98,10 +98,10 @@ def export_bundle(
         EdpError: not a bundle, an unknown form or option, or a network or name that this form cannot hold.
     """
     target, bundle = make_target(to, options), load_exported(path)
-    return target.write(bundle if calibration is None else in_integers(bundle, calibration), name, Path(folder))
+    return target.write(bundle if calibration is None else quantise_twin(bundle, calibration), name, Path(folder))
 
 
-def in_integers(bundle: Bundle, calibration: DataSource) -> Bundle:
+def quantise_twin(bundle: Bundle, calibration: DataSource) -> Bundle:
     """Return a twin whose cell computes in W8A16; complete recordings determine formats and weights.
 
     Raises:

@@ -80,7 +80,7 @@ class ModelInversion:
         if models.predictor is not None:
             model = PredictorAhead(models.predictor, ticks)
         else:
-            model = TwinAhead(models.needed_twin("inversion"), ticks, [channel.name for channel in plant.channels])
+            model = TwinAhead(models.require_twin("inversion"), ticks, [channel.name for channel in plant.channels])
         return InversionController(self, plant, limits, model)
 
 

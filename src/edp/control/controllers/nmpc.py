@@ -121,8 +121,8 @@ class PredictiveControl:
             ConfigError: one of them is missing or does not fit, or DAQP is not installed.
         """
         window = max(1, round(self.window_s * plant.rate_hz))
-        model = TwinModel(models.needed_twin("nmpc"), plant, window, self.smoothing, self.load)
-        valves = models.needed_map("nmpc")
+        model = TwinModel(models.require_twin("nmpc"), plant, window, self.smoothing, self.load)
+        valves = models.require_map("nmpc")
         fallback = PiController(ProportionalIntegral(), plant, limits, valves) if self.fallback else None
         return NmpcController(self, limits, model, SpeedToLever(valves, limits), fallback)
 

@@ -117,7 +117,7 @@ def changing_flags(
     return [flag for flag in spread(of_channel, judged) if flag is not None]
 
 
-def broken_flags(
+def flag_broken(
     table: CandidateTable, live: Sequence[int], judged: Sequence[int], trusted: Sequence[int]
 ) -> list[Flag]:
     """Flag channels that follow another with one gain in some recordings, but with another sign or not in others.

@@ -15,7 +15,7 @@ from edp.data.gathered import some_columns
 from edp.data.screening import artefacts, copies, forest, stability, values
 from edp.data.screening.clusters import clusters_of, least_of
 from edp.data.screening.information import Information
-from edp.data.screening.lagged import Lagged, lagged_covariances
+from edp.data.screening.lagged import Lagged, compute_lagged_covariances
 from edp.data.screening.proposal import ScreeningEvidence, noise_flags, propose, redundant_flags
 from edp.data.screening.ranks import Kendall, correlation, rank_columns
 from edp.data.screening.result import (
@@ -102,7 +102,7 @@ def _screen(recordings: Sequence[Recording], spec: ScreeningSpec, clock: _Clock)
         live = np.flatnonzero(table.live)
     matrices = _matrices(table, spec, clock)
     with clock.stage("lags") as tell:
-        lagged = lagged_covariances(table, spec.max_lag, _SHIFTS, lambda share: tell("lags", share))
+        lagged = compute_lagged_covariances(table, spec.max_lag, _SHIFTS, lambda share: tell("lags", share))
         names = [table.names[i] for i in live]
         targets = [table.names[i] for i in table.targets]
         curves, best = stability.lag_curves(table, lagged, names, targets, spec)
@@ -160,7 +160,7 @@ def _expand_matrix(table: CandidateTable, matrix: Array) -> Array:
     return full
 
 
-def trusted_names(table: CandidateTable, spec: ScreeningSpec) -> set[str]:
+def list_trusted(table: CandidateTable, spec: ScreeningSpec) -> set[str]:
     """Channels known to be measured on the machine: targets, the names of Table A.1, and those that the user names."""
     return {*(table.names[i] for i in table.targets), *spec.trusted, *TABLE_A1}
 
@@ -168,7 +168,7 @@ def trusted_names(table: CandidateTable, spec: ScreeningSpec) -> set[str]:
 def _structural_flags(table: CandidateTable, lagged: Lagged, spec: ScreeningSpec) -> list[Flag]:
     """Flag channels with problems independent of the targets: constant, clocks, per-file artefacts, leaks, copies."""
     names = [table.names[i] for i in lagged.live]
-    trust = trusted_names(table, spec)
+    trust = list_trusted(table, spec)
     trusted = [k for k, name in enumerate(names) if name in trust]
     targets = np.searchsorted(lagged.live, table.targets).tolist()
     flags = artefacts.dead_flags(table)
@@ -181,7 +181,7 @@ def _structural_flags(table: CandidateTable, lagged: Lagged, spec: ScreeningSpec
     correlations = lagged.pooled()
     support = np.abs(correlations[:, :, targets]).max(axis=(0, 2))
     flags += artefacts.changing_flags(names, lagged, open_ones(), trusted, support)
-    flags += artefacts.broken_flags(table, [int(k) for k in lagged.live], open_ones(), trusted)
+    flags += artefacts.flag_broken(table, [int(k) for k in lagged.live], open_ones(), trusted)
     flagged = sorted(set(range(len(names))) - set(open_ones()))
     flags += copies.find_leaks(names, correlations, trusted, targets, flagged)
     settled = {names.index(flag.channel) for flag in flags if flag.channel in names}
@@ -203,7 +203,7 @@ def _evidence(
     targets = np.searchsorted(lagged.live, table.targets)
     relations = stability.relations_of(lagged, targets, measured.metrics, spec.level)
     groups = clusters_of(spearman[np.ix_(columns, columns)], spec.collinear)
-    held_out = values.held_out_pieces(len(table.pieces), spec.forest.held_out, spec.seed)
+    held_out = values.choose_held_out(len(table.pieces), spec.forest.held_out, spec.seed)
     read = columns if spec.horizon else columns[~np.isin(columns, table.targets)]
     if not len(read):
         raise DataError(
@@ -284,7 +284,7 @@ def _assemble_result(
     free = {name for name in table.names if name not in targets} - {flag.channel for flag in flags}
     flags = flags + noise_flags(evidence, sorted(free))
     free = set(table.names) - {flag.channel for flag in flags}
-    trust = trusted_names(table, spec)
+    trust = list_trusted(table, spec)
     flags = flags + redundant_flags(evidence, sorted(free - trust), sorted(free))
     return ScreeningResult(
         tuple(recording.name for recording in recordings),

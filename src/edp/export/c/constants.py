@@ -123,7 +123,7 @@ def constants_of(graph: Graph, plan: MemoryPlan, written: bool = False) -> Itera
 
 def stored(layer: Layer, name: str, values: NDArray[Any]) -> NDArray[Any]:
     """Return the elements of a constant in the order of the C code."""
-    return laid(layer, name, integer_calls.laid_out(layer, values))
+    return laid(layer, name, integer_calls.lay_out(layer, values))
 
 
 def _tensor(layer: Layer, name: str, values: NDArray[Any], written: bool) -> CConstant:

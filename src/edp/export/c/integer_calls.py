@@ -146,7 +146,7 @@ def structs(layer: Layer) -> list[str]:
     return []
 
 
-def laid_out(layer: Layer, values: NDArray[Any]) -> NDArray[Any]:
+def lay_out(layer: Layer, values: NDArray[Any]) -> NDArray[Any]:
     """Return a constant in the order in which the runtime reads it: see ``edp_q_products``."""
     if values.dtype != np.int8 or values.ndim < 2:
         return values

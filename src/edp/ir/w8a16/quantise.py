@@ -92,7 +92,7 @@ class _Work:
             self.integer_fracs[name] = self.frac(value)
         return name
 
-    def as_float(self, value: str) -> str:
+    def to_float(self, value: str) -> str:
         """Return the name of a value as floats."""
         if value not in self.integer_fracs:
             return value
@@ -141,14 +141,14 @@ def quantise(graph: Graph, chosen: Formats, moments: Mapping[str, NDArray[np.flo
                     f"layer '{layer.name}' multiplies what a feedback edge hands on; 8-bit weights would move its "
                     "poles, so it has no form in integer arithmetic: export in float32"
                 )
-            work.out.append(replace(layer, inputs=tuple(work.as_float(name) for name in layer.inputs)))
+            work.out.append(replace(layer, inputs=tuple(work.to_float(name) for name in layer.inputs)))
             continue
         inputs = tuple(work.as_fixed(name) for name in layer.inputs)
         # Inputs are brought into integers first, since a layer's own format depends on theirs.
         done = LOWER[kind](work, layer, [work.integer_fracs[name] for name in inputs])
         work.out.append(replace(done, inputs=inputs))
         work.integer_fracs[layer.name] = done.frac
-    results = {meaning: work.as_float(value) for meaning, value in graph.results.items()}
+    results = {meaning: work.to_float(value) for meaning, value in graph.results.items()}
     finished = Graph(graph.inputs, tuple(work.out), results, {}, graph.window)
     return replace(finished, initial=_initial(graph, finished, work))
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from edp.ir import layers, memory
 from edp.ir.base import Layer
-from edp.ir.descent import reached_leaves, summed
+from edp.ir.descent import find_leaves, summed
 from edp.ir.layers import BinaryOperation, Function
 
 Rows = NDArray[np.float32]
@@ -239,7 +239,7 @@ def _glu(layer: layers.Glu, m: Memory, x: Rows) -> Rows:
 
 
 def _trees(layer: layers.TreeSums, m: Memory, x: Rows) -> Rows:
-    return summed(reached_leaves(layer.feature, layer.threshold, layer.leaf, x))
+    return summed(find_leaves(layer.feature, layer.threshold, layer.leaf, x))
 
 
 def _clip(layer: layers.Clip, m: Memory, x: Rows) -> Rows:

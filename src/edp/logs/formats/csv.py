@@ -30,7 +30,7 @@ from edp.logs.formats.base import (
 from edp.logs.formats.csv_controldesk import controldesk_head, read_controldesk
 from edp.logs.formats.csv_dates import dates_of, is_date
 from edp.logs.formats.csv_encoding import encoding_of
-from edp.logs.formats.csv_messages import at_own_times, message_columns
+from edp.logs.formats.csv_messages import drop_empty_rows, message_columns
 from edp.logs.formats.csv_preamble import TablePlace, find_table
 from edp.logs.formats.csv_scope import read_scope, scope_head
 from edp.logs.formats.csv_table import CsvTable, TextLayout, has_decimal_commas, is_grouped, is_number
@@ -96,7 +96,7 @@ class CsvFormat:
                 name = f"column_{column_index + 1}.{shared_name}"
                 repeated.setdefault(shared_name, []).append(name)
             if column_index in sparse and time is not None:
-                signals[name] = at_own_times(table, column_index, name, time)
+                signals[name] = drop_empty_rows(table, column_index, name, time)
                 continue
             key = str(column_index)
             load = partial(load_column, table, key, table.rows)
@@ -376,7 +376,7 @@ def _stamps(table: CsvTable, column_index: int, signal_map: SignalMap) -> Column
     if table.types[table.keys[column_index]] != pa.string():
         return load_column(table, str(column_index), table.rows) * time_factor(name, unit, signal_map)
     cells = table.texts(column_index)
-    numbers = table.grouped_numbers(column_index)
+    numbers = table.parse_grouped_numbers(column_index)
     if numbers is not None:
         return numbers * time_factor(name, unit, signal_map)
     try:

@@ -297,7 +297,7 @@ class CsvTable:
             self.refuse_text(column_index)
         return numbers
 
-    def grouped_numbers(self, column_index: int) -> NDArray[np.float64] | None:
+    def parse_grouped_numbers(self, column_index: int) -> NDArray[np.float64] | None:
         """Return a text column as numbers with thousands points, shape ``(rows,)``; None if it is not numeric."""
         if self.layout.decimal != ",":
             return None

@@ -27,7 +27,7 @@ class EdpMetadata:
     digest: str | None = None
     truth_digest: str | None = None
 
-    def for_log(self) -> Table:
+    def to_log_metadata(self) -> Table:
         """Return the metadata for a `RawLog`."""
         return {
             "rate_hz": self.rate_hz,

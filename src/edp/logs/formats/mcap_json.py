@@ -115,7 +115,7 @@ def read_json_mcap(path: Path) -> RawLog:
     signals, aliases, repeated = told_apart(named_signals)
     if facts.channels:
         signals, repeated = only(facts.channels, signals, repeated)
-    return RawLog(path, signals, aliases=aliases, repeated=repeated, **facts.for_log())
+    return RawLog(path, signals, aliases=aliases, repeated=repeated, **facts.to_log_metadata())
 
 
 def _signals(topic: _Topic, facts: EdpMetadata, origin: int) -> Iterator[tuple[str, RawSignal]]:

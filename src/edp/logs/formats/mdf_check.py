@@ -14,7 +14,7 @@ from pathlib import Path
 
 from edp.errors import DataError
 from edp.storage.memory import check_memory
-from edp.storage.unpacking import DEFLATE_RATIO, unpacked_size
+from edp.storage.unpacking import DEFLATE_RATIO, measure_unpacked
 
 _HEAD = 24
 """Bytes of a block before its links: id 4, reserved 4, length 8, count of links 8."""
@@ -160,7 +160,7 @@ class _Walk:
         if start + packed > block.at + block.length:
             raise self.broken(block.at, f"a packed block of {packed} bytes in {block.length}")
         try:
-            size = unpacked_size(_PACKINGS[kind], self.view[start : start + packed], original)
+            size = measure_unpacked(_PACKINGS[kind], self.view[start : start + packed], original)
         except Exception as error:
             # Each packing has exceptions of its own for damaged bytes.
             raise self.broken(block.at, f"a packed block that cannot be unpacked ({error})") from error

@@ -89,7 +89,7 @@ class ParquetFormat:
         signals, aliases, repeated = told_apart(named_signals)
         if edp_metadata.channels:
             signals, repeated = only(edp_metadata.channels, signals, repeated)
-        return RawLog(path, signals, aliases=aliases, repeated=repeated, **edp_metadata.for_log())
+        return RawLog(path, signals, aliases=aliases, repeated=repeated, **edp_metadata.to_log_metadata())
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
         """Write float32 columns in row groups without a time column: row k is at k / rate_hz."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from edp.logs.proposal.behaviour import Behaviour, Relation
 from edp.logs.proposal.columns import LogColumn
-from edp.logs.proposal.names import is_joint, kind_by_tag, kind_by_word, known_unit, unit_by_ending
+from edp.logs.proposal.names import find_unit, is_joint, kind_by_tag, kind_by_word, unit_by_ending
 from edp.logs.units import OTHER_UNITS, normalise_unit
 from edp.signals import KINDS, TIME_UNITS, UNITS, VOCABULARY, Kind
 
@@ -53,7 +53,7 @@ class KindGuess:
     check: str = ""
 
 
-def with_article(kind: Kind) -> str:
+def add_article(kind: Kind) -> str:
     """Return the kind with its article: ``an angular velocity``."""
     return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind.replace('_', ' ')}"
 
@@ -71,7 +71,7 @@ def kind_of(column: LogColumn, behaviour: Behaviour, family: int) -> KindGuess:
         family: number of instrument tags in the log that begin with the same letters, including this one.
     """
     if column.kind is not None:
-        unit = known_unit(column.unit) or KINDS[column.kind].si_unit
+        unit = find_unit(column.unit) or KINDS[column.kind].si_unit
         return KindGuess(column.kind, unit, 1.0, "the file states it")
     word = kind_by_word(column.name)
     if column.name in VOCABULARY:
@@ -98,13 +98,13 @@ def _guess_joint(kind: Kind, behaviour: Behaviour) -> KindGuess:
     if kind is Kind.ANGLE and unit_by_range(kind, behaviour) is not None:
         return _guess_by_range(kind, behaviour, 0.7, "a joint turns")
     if not is_plausible(kind, unit, behaviour):
-        return _numbers("a joint turns", f"{with_article(kind)}? unit unknown")
+        return _numbers("a joint turns", f"{add_article(kind)}? unit unknown")
     return KindGuess(kind, unit, 0.65, "a joint turns", f"{unit}? m if it slides")
 
 
 def _look_up_vocabulary(column: LogColumn, behaviour: Behaviour) -> KindGuess:
     kind = VOCABULARY[column.name].kind
-    unit = known_unit(column.unit) or KINDS[kind].si_unit
+    unit = find_unit(column.unit) or KINDS[kind].si_unit
     fits = kind in UNITS[unit].kinds and (bool(column.unit) or not _looks_small(kind, behaviour))
     if fits and is_plausible(kind, unit, behaviour):
         return KindGuess(kind, unit, 0.95 if column.unit else 0.85, "a name of Table A.1 or the simulator")
@@ -117,7 +117,7 @@ def _looks_small(kind: Kind, behaviour: Behaviour) -> bool:
 
 
 def _guess_by_unit(stated: str, word: Kind | None, behaviour: Behaviour) -> KindGuess:
-    unit = known_unit(stated)
+    unit = find_unit(stated)
     if unit is None and normalise_unit(stated) in OTHER_UNITS | TIME_UNITS.keys():
         return _numbers("the file states a unit without a kind", f"in {stated[:12]}, as numbers", SURE_NUMBERS)
     if unit is None:
@@ -132,9 +132,9 @@ def _guess_by_unit(stated: str, word: Kind | None, behaviour: Behaviour) -> Kind
     if word is not None and word not in kinds:
         return _numbers(f"its name says {word}, its unit {kinds[0]}", f"is '{unit}' right?")
     if unit in _SHORT_UNITS and word is None:
-        return _numbers("its unit may be two things", f"is '{unit}' {with_article(kinds[0])}?")
+        return _numbers("its unit may be two things", f"is '{unit}' {add_article(kinds[0])}?")
     if not is_plausible(kind, unit, behaviour):
-        return _numbers(f"{unit} beyond what {with_article(kind)} reaches", f"is '{unit}' right?")
+        return _numbers(f"{unit} beyond what {add_article(kind)} reaches", f"is '{unit}' right?")
     return KindGuess(kind, unit, 0.95, "the file states its unit")
 
 
@@ -149,9 +149,9 @@ def _guess_by_range(kind: Kind, behaviour: Behaviour, confidence: float, why: st
     """Return a kind with a unit derived from the range of the values."""
     unit = unit_by_range(kind, behaviour)
     if unit is None:
-        return _numbers(why, f"{with_article(kind)}? unit unknown")
+        return _numbers(why, f"{add_article(kind)}? unit unknown")
     if confidence < BOUND:
-        return _numbers(why, f"{with_article(kind)} in {unit}?", confidence)
+        return _numbers(why, f"{add_article(kind)} in {unit}?", confidence)
     return KindGuess(kind, unit, confidence, f"{why}, its numbers {unit}", f"unit {unit}?")
 
 

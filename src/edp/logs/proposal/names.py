@@ -148,7 +148,7 @@ def unit_by_ending(name: str) -> str | None:
     return UNIT_ENDINGS.get(words[-1]) if len(words) > 1 else None
 
 
-def known_unit(stated: str | None) -> str | None:
+def find_unit(stated: str | None) -> str | None:
     """Return a stated unit in EDP's spelling; None if it is unknown."""
     unit = normalise_unit(stated)
     return unit if unit in UNITS else None

@@ -12,7 +12,7 @@ import numpy as np
 from edp.logs.proposal.behaviour import Behaviour, Relation, behaviour_of, is_steered_by, relations_of, repeats
 from edp.logs.proposal.clocks import ClockGuess, clock_of
 from edp.logs.proposal.columns import LogColumn, LogLook
-from edp.logs.proposal.kinds import BOUND, KindGuess, kind_of, kind_of_change, with_article
+from edp.logs.proposal.kinds import BOUND, KindGuess, add_article, kind_of, kind_of_change
 from edp.logs.proposal.names import (
     ends_as_stamp,
     is_counter_name,
@@ -87,7 +87,7 @@ class MapProposal:
     columns: tuple[ColumnGuess, ...]
     signal_map: SignalMap
 
-    def of_role(self, *roles: str) -> tuple[ColumnGuess, ...]:
+    def select_role(self, *roles: str) -> tuple[ColumnGuess, ...]:
         """Return the channels with one of the given roles, in order."""
         return tuple(guess for guess in self.columns if guess.channel and guess.role in roles)
 
@@ -288,9 +288,9 @@ def _role(
     if column.unit == "us":
         return "command", 0.75, "the width of a pulse"
     if kind.kind in _COMMANDS and kind.confidence >= BOUND:
-        return "command", 0.65, with_article(kind.kind)
+        return "command", 0.65, add_article(kind.kind)
     if kind.kind in _MEASURED and kind.confidence >= BOUND:
-        return "measured", 0.85, with_article(kind.kind)
+        return "measured", 0.85, add_article(kind.kind)
     if behaviour.steps:
         return "command", 0.65, "moves in steps"
     if relation is not None and relation.how == "change":

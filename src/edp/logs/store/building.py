@@ -31,6 +31,7 @@ from edp.logs.store.index import (
     StoreEntry,
     StoreIndex,
     check_places,
+    check_seal,
     index_of,
     is_store,
     listed,
@@ -38,7 +39,6 @@ from edp.logs.store.index import (
     read_index,
     rows_path,
     stamped,
-    without_seal,
     write_plain,
 )
 from edp.progress import SILENT, Progress
@@ -405,7 +405,7 @@ def _records_beside(top: Path, index: StoreIndex) -> Iterator[Table]:
         with suppress(DataError):
             table = parse_json(read_text(path, BATCH_BYTES, where, DataError), where, DataError)
             record = object_with(table, ("files", "recordings"), where, DataError)
-            record = without_seal(record, where)
+            record = check_seal(record, where)
             batch = index_of(record, where)
             check_places(batch, where)
             if [(file.key, file.bytes) for file in batch.files] == [(path.stem, _size(rows_path(top, path.stem)))]:

@@ -200,7 +200,7 @@ class AdaptiveTwin:
         self._runner.resistance = forces.copy()
 
     def _apply_factors(self, logs: Doubles) -> GreyTwin:
-        return self.twin.with_numbers(self.twin.numbers * np.exp(self.moves @ (self.by_oil + logs)))
+        return self.twin.with_parameters(self.twin.numbers * np.exp(self.moves @ (self.by_oil + logs)))
 
     @property
     def factors(self) -> dict[str, float]:
@@ -220,7 +220,7 @@ class AdaptiveTwin:
             self.interrupt()
             return
         if self._state is None:
-            if not (np.isfinite(measured).all() and self.twin.within_stops(measured[None])[0]):
+            if not (np.isfinite(measured).all() and self.twin.is_within_stops(measured[None])[0]):
                 return
             self._state = dict(self.twin.initial_state(command[None], measured[None]))
         self._take(measured)

@@ -62,7 +62,7 @@ def _ports(build: Builder, twin: Twin, commands: int) -> tuple[str, str]:
     return build.combine("fed", ADD, *parts), last
 
 
-def bounded_layers(build: Builder, twin: Twin, fed: str, proposed: str) -> str:
+def add_bounds(build: Builder, twin: Twin, fed: str, proposed: str) -> str:
     """Answers within the bounds, scaled: `Twin.bounded` in layers."""
     scales, channels = twin.scales, twin.channels
     count, strokes = len(channels.velocities), len(channels.strokes)
@@ -72,13 +72,13 @@ def bounded_layers(build: Builder, twin: Twin, fed: str, proposed: str) -> str:
     if not strokes:
         return clipped
     velocity = build.pick("velocity", clipped, range(count))
-    velocity, stroke = stopped_strokes(build, twin, fed, velocity, list(range(count)))
+    velocity, stroke = add_stroke_stops(build, twin, fed, velocity, list(range(count)))
     pressures = build.width(clipped) - count
     rest = [build.pick("pressure", clipped, range(count, count + pressures))] if pressures else []
     return build.join("together", velocity, stroke, *rest)
 
 
-def stopped_strokes(build: Builder, twin: Twin, fed: str, velocity: str, columns: list[int]) -> tuple[str, str]:
+def add_stroke_stops(build: Builder, twin: Twin, fed: str, velocity: str, columns: list[int]) -> tuple[str, str]:
     """Add velocities of these columns without motion into an end stop, and the resulting strokes; all scaled."""
     scales, count = twin.scales, len(twin.channels.velocities)
     low, high = ((end - scales.answer_offset) / scales.answer_width for end in (scales.low, scales.high))

@@ -22,7 +22,7 @@ from edp.errors import DataError
 from edp.ir import Builder
 from edp.ir.layers import BinaryOperation, Clip, Dense
 from edp.ir.memory import Feed, Feedback
-from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, even_starts, solved_columns
+from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, even_starts, list_solved_columns
 from edp.networks.twin.scales import Array, TwinScales
 from edp.settings.bounds import check_bounds, check_count, integer
 
@@ -86,7 +86,7 @@ class N4sid:
         Raises:
             DataError: recordings that are too short for `horizon`.
         """
-        most = len(solved_columns(channels)) * (self.horizon - 1)
+        most = len(list_solved_columns(channels)) * (self.horizon - 1)
         orders = sorted({min(order, most) for order in self.orders})
         chosen = orders[0] if len(orders) == 1 else self._choose_order(channels, scales, train, orders)
         solution = _Projections.of(_scale_series(channels, scales, train), self.horizon)
@@ -109,7 +109,7 @@ class N4sid:
 
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
         """Order, A, B, C and K, with room for the largest order."""
-        most, solved = max(self.orders), len(solved_columns(channels))
+        most, solved = max(self.orders), len(list_solved_columns(channels))
         sizes = {"a": (most, most), "b": (most, len(channels.commands) + 1), "c": (solved, most), "k": (most, solved)}
         return {"order": (1,), **sizes}
 
@@ -136,7 +136,7 @@ class N4sidTwin(Twin):
         n, doubles = self.order, {name: values.astype(np.float64) for name, values in numbers.items()}
         self.a, self.b = doubles["a"][:n, :n], doubles["b"][:n]
         self.c, self.k = doubles["c"][:, :n], doubles["k"][:n]
-        solved = solved_columns(channels)
+        solved = list_solved_columns(channels)
         self._solved = solved
         self._offset, self._width = scales.answer_offset[solved], scales.answer_width[solved]
 
@@ -340,7 +340,7 @@ def _gain(a: Doubles, c: Doubles, process: Doubles, output: Doubles) -> Doubles:
 
 
 def _scale_series(channels: TwinChannels, scales: TwinScales, series: Sequence[Series]) -> list[Pair]:
-    solved = solved_columns(channels)
+    solved = list_solved_columns(channels)
     offset, width = scales.answer_offset[solved], scales.answer_width[solved]
     return [
         (
@@ -375,4 +375,4 @@ def _free_error(twin: Twin, judged: Sequence[Series]) -> float:
     state = twin.reset(commands[:, :prefix], truth[:, :prefix])
     answers, _ = twin.rollout(commands[:, prefix:], state)
     error = np.abs(answers - truth[:, prefix + 1 :]) / twin.scales.answer_width
-    return float(error[..., solved_columns(twin.channels)].mean())
+    return float(error[..., list_solved_columns(twin.channels)].mean())

@@ -325,7 +325,7 @@ def fits(mark: Mark, chosen: Mapping[str, str]) -> bool:
     return all(mark.when.get(key, option) == option for key, option in chosen.items())
 
 
-def with_unit(text: str, unit: str) -> str:
+def append_unit(text: str, unit: str) -> str:
     """Return an axis title with its unit in brackets."""
     shown = unit_text(unit)
     return f"{text} [{shown}]" if shown else text

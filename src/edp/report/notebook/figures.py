@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edp.errors import ConfigError, closest
 from edp.evaluation.study import StudyFile
 from edp.recording import Recording
-from edp.report.common.chart import BLUE, GREY, Chart, ChartAxis, DataSeries, Mark, Panel, Range, with_unit
+from edp.report.common.chart import BLUE, GREY, Chart, ChartAxis, DataSeries, Mark, Panel, Range, append_unit
 from edp.report.run.charts import horizon_chart
 from edp.report.run.facts import Facts
 from edp.report.run.figures import downsample
@@ -103,7 +103,7 @@ def _rows(name: str, panels: Sequence[Panel]) -> Chart:
 
 
 def _row(channel: Channel, label: str, marks: Sequence[Mark]) -> Panel:
-    return Panel(tuple(marks), ChartAxis("Time [s]"), title=with_unit(label, KINDS[channel.kind].report_unit))
+    return Panel(tuple(marks), ChartAxis("Time [s]"), title=append_unit(label, KINDS[channel.kind].report_unit))
 
 
 def _line(channel: Channel, values: Array, rate_hz: float, name: str, colour: str, width: float) -> DataSeries:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from edp.data.splits import kind_of_name
 from edp.errors import count_of
-from edp.evaluation.guard import MEASURE, MEASURE_NAME, NETWORK, lost_outputs
+from edp.evaluation.guard import MEASURE, MEASURE_NAME, NETWORK, find_lost_outputs
 from edp.evaluation.scores_file import DataSituation, ScoresFile, TargetChange, error_at
 from edp.settings.provenance import Provenance
 from edp.storage import read_object
@@ -25,7 +25,7 @@ FEW = 3
 
 def losses_line(scores: ScoresFile) -> str:
     """Name the outputs on which a baseline has less error at some horizon, worst first; empty without any."""
-    losses = lost_outputs(scores)
+    losses = find_lost_outputs(scores)
     if not losses:
         return ""
     several = len(scores.task.horizons) > 1
@@ -39,7 +39,7 @@ def losses_line(scores: ScoresFile) -> str:
     return f"At some time ahead a baseline has less error on {len(losses)} of {outputs}: {listed(parts)}{more}."
 
 
-def judged_line(scores: ScoresFile, provenance: Provenance | None) -> str:
+def describe_evaluation(scores: ScoresFile, provenance: Provenance | None) -> str:
     """Name the judged logs, with a warning if they are few or of one kind; empty if the scores name none.
 
     Args:

@@ -24,8 +24,8 @@ from edp.evaluation.study_facts import (
     ThesisPlanning,
     ThesisScreening,
 )
-from edp.report.common.chart import with_unit
-from edp.report.search.facts import finite, of_phase
+from edp.report.common.chart import append_unit
+from edp.report.search.facts import finite, require_phase
 from edp.stats.effects import effect_interval
 from edp.stats.variance import SplitVariance
 
@@ -54,7 +54,7 @@ class ArmView:
     mae: SplitVariance
 
 
-@of_phase(IsolationFacts, ())
+@require_phase(IsolationFacts, ())
 def arm_views(study: StudyFile, facts: IsolationFacts) -> tuple[ArmView, ...]:
     """Return the arms of phase 0 in their order."""
     views = []
@@ -108,7 +108,7 @@ def point_views(study: StudyFile) -> tuple[PointView, ...]:
     return tuple(points)
 
 
-@of_phase(CalibrationFacts, ())
+@require_phase(CalibrationFacts, ())
 def _view_calibration(study: StudyFile, facts: CalibrationFacts) -> tuple[PointView, ...]:
     points = []
     for backbone, calibration in facts.backbones.items():
@@ -211,7 +211,7 @@ def _view_confirmation(study: StudyFile) -> tuple[Forest, ...]:
     return (*_sound(study), *_thesis(study))
 
 
-@of_phase(SoundConfirmation, ())
+@require_phase(SoundConfirmation, ())
 def _sound(study: StudyFile, facts: SoundConfirmation) -> tuple[Forest, ...]:
     effects = []
     for entry in facts.evidence:
@@ -227,7 +227,7 @@ def _sound(study: StudyFile, facts: SoundConfirmation) -> tuple[Forest, ...]:
     return (Forest("confirmation", "Phase 3: confirmation", "", CHANGE, _sort_effects(effects), gate),)
 
 
-@of_phase(ThesisConfirmation, ())
+@require_phase(ThesisConfirmation, ())
 def _thesis(study: StudyFile, facts: ThesisConfirmation) -> tuple[Forest, ...]:
     planning = study.facts(ThesisPlanning)
     views: dict[str, list[EffectView]] = {}
@@ -253,7 +253,7 @@ def _thesis(study: StudyFile, facts: ThesisConfirmation) -> tuple[Forest, ...]:
     )
 
 
-@of_phase(ScreeningFacts, ())
+@require_phase(ScreeningFacts, ())
 def _view_screening(study: StudyFile, facts: ScreeningFacts) -> tuple[Forest, ...]:
     axis, effects = CHANGE, []
     if isinstance(facts, SoundScreening):
@@ -264,7 +264,7 @@ def _view_screening(study: StudyFile, facts: ScreeningFacts) -> tuple[Forest, ..
             tests = (effect.p, None, name in facts.passed, "goes on" if name in facts.passed else "stops")
             effects.append(EffectView(study.module(name), 100.0 * value, low, high, *tests))
     if isinstance(facts, ThesisScreening):
-        axis = with_unit("Best question less the baseline's median, left is better", study.unit)
+        axis = append_unit("Best question less the baseline's median, left is better", study.unit)
         for name, row in facts.modules.items():
             if row.gain is not None:
                 verdict = "goes on" if name in facts.passed else "stops"

@@ -207,7 +207,7 @@ def tiles(facts: FreeRunFacts) -> list[tuple[str, str, str]]:
     """Return key figures: value, unit, description."""
     twin = facts.twin
     velocity = twin.velocity_mae
-    if mixed_units(twin):
+    if has_mixed_units(twin):
         rows = actuator_tiles(twin)
     else:
         rows = [(number(velocity.mean), velocity.unit or "", "mean absolute error of the velocities")]
@@ -230,7 +230,7 @@ def free_run_tables(facts: FreeRunFacts) -> dict[str, Table]:
     """Return all tables with content, by name."""
     twin = facts.twin
     tables = [
-        *([actuator_table(facts.models)] if mixed_units(twin) else []),
+        *([actuator_table(facts.models)] if has_mixed_units(twin) else []),
         _summary_table("models", "The twin and its floors", "Model", facts.models, frozenset({0})),
         _summary_table("recordings", "By recording, the worst first", "Recording", _worst(twin.by_recording)),
         _summary_table("driving", "By way of driving", "Way of driving", twin.by_driving),
@@ -315,8 +315,8 @@ def _coverage_table(intervals: IntervalCoverage) -> Table:
 
 def _tabulate_ahead(facts: FreeRunFacts, first: AheadErrors) -> Table:
     caption = f"{figure(first.seconds)} s ahead of measured ports, told the commands in between"
-    if mixed_units(facts.twin):
-        return ahead_by_actuator(facts.models, caption)
+    if has_mixed_units(facts.twin):
+        return tabulate_ahead_by_actuator(facts.models, caption)
     rows: list[tuple[Value, ...]] = []
     for name, scores in facts.models.items():
         ahead = scores.ahead
@@ -343,7 +343,7 @@ def _tabulate_comparison(beside: PredictorComparison) -> Table:
     return Table(caption, heads, tuple(rows), name="beside")
 
 
-def mixed_units(scores: FreeRunScores) -> bool:
+def has_mixed_units(scores: FreeRunScores) -> bool:
     """Whether velocities of a twin have more than one unit."""
     return bool(scores.velocity_mae.units)
 
@@ -360,7 +360,7 @@ def actuator_table(models: Mapping[str, FreeRunScores]) -> Table:
     return _tabulate_actuators("actuators", "The twin and its floors, each actuator in its units", columns)
 
 
-def ahead_by_actuator(models: Mapping[str, FreeRunScores], caption: str) -> Table:
+def tabulate_ahead_by_actuator(models: Mapping[str, FreeRunScores], caption: str) -> Table:
     """Return the errors a few ticks ahead of measured ports, one row for each actuator and model."""
     columns = {
         name: [("Velocity MAE", one.ahead.velocity_mae), ("Stroke error", one.ahead.stroke_error)]

@@ -15,7 +15,7 @@ from edp.sim.episodes.episodes import EpisodeStart
 from edp.sim.faults import fault_text
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import check_machine
-from edp.sim.machine.machine_files import family_member, known_mass
+from edp.sim.machine.machine_files import family_member, look_up_mass
 from edp.storage.reading import Table
 
 OF_SPEC = (
@@ -60,11 +60,11 @@ def episode_start(spec: EnvironmentSpec, seed: int, options: Table | None) -> tu
     facts: dict[str, object] = {"seed": seed, "machine": machine.name, "material": spec.material}
     if spec.faults:
         facts["faults"] = "; ".join(map(fault_text, spec.faults))
-    mass_t = known_mass(machine.name)
+    mass_t = look_up_mass(machine.name)
     return start, facts if mass_t is None else {**facts, "mass_t": mass_t}
 
 
-def checked_mask(lanes: int, mask: Any) -> NDArray[np.bool_]:
+def check_mask(lanes: int, mask: Any) -> NDArray[np.bool_]:
     """Return the mask of environments that restart, shape ``(lanes,)``; all of them without a mask.
 
     Raises:
@@ -81,7 +81,7 @@ def checked_mask(lanes: int, mask: Any) -> NDArray[np.bool_]:
     return array
 
 
-def checked_seed(seed: Any) -> int | None:
+def check_seed(seed: Any) -> int | None:
     """Return a seed checked for Gymnasium.
 
     Raises:

@@ -105,7 +105,7 @@ def member_mass(seed: int, index: int, low_t: float = MASSES_T[0], high_t: float
     return float(low_t * (high_t / low_t) ** share)
 
 
-def scaled_machine(
+def scale_machine(
     base: Machine, mass_t: float, draws: Draws, name: str = "", base_mass_t: float = BASE_MASS_T
 ) -> Machine:
     """Scale a machine to another mass by the laws above.

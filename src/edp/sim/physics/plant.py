@@ -31,7 +31,7 @@ Clock = tuple[int, float, float, Array]
 
 
 @compiled
-def near_end(row: Array, axes: Array) -> bool:
+def is_near_end(row: Array, axes: Array) -> bool:
     """Whether any cylinder of a logged sample runs into a cushion, or moves at a stop."""
     for i in range(at.AXES):
         v, stroke = row[at.LOG_VELOCITY + i], row[at.LOG_STROKE + i]
@@ -68,7 +68,7 @@ def run_sample(
     thermal.warm(row, axes, plant, time_s, motors)
     # Once a sample, too: governor and inertia make tens of milliseconds.
     engine.turn(row, plant, time_s)
-    near, fine = False, near_end(row, axes)
+    near, fine = False, is_near_end(row, axes)
     if ground[0][terramechanics.ACTIVE] > 0.0:
         near, touching = terrain.look(row, time_s, axes, ground)
         fine = fine or touching

@@ -25,7 +25,7 @@ from edp.networks.trees import Trees
 from edp.training.bagging.learner import FoldFit, HeadPart
 from edp.training.bagging.table import committee_of
 from edp.training.outcome import TrainingProgress
-from edp.training.tree_tables import Tables, complete_tables, stacked_tables
+from edp.training.tree_tables import Tables, complete_tables, stack_tables
 
 GRID = 2.0**-12
 """Of the columns that trees are grown on, in spreads. Values that are equal but for rounding fall together, so that no
@@ -173,7 +173,7 @@ class TreeLearner:
         grown = [[one for one in each if one is not None] for each in tables]
         empty = self._empty()
         joined = [tuple(np.concatenate(part) for part in zip(*each, strict=True)) if each else empty for each in grown]
-        self.trees.set_tables(*stacked_tables(joined, self.trees.trees))  # type: ignore[arg-type]
+        self.trees.set_tables(*stack_tables(joined, self.trees.trees))  # type: ignore[arg-type]
         taken_away = sum((own for kind, own in zip(self.kinds, shares, strict=True) if kind.direct), np.zeros(outputs))
         return HeadPart(np.eye(outputs), np.zeros(outputs), np.asarray(taken_away))
 

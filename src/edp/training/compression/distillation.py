@@ -14,7 +14,7 @@ from torch import Tensor
 from edp.data.series import Series
 from edp.data.task import Task
 from edp.errors import ConfigError, DataError
-from edp.networks.losses import Huber, LossSpec, Prediction, masked_loss
+from edp.networks.losses import Huber, LossSpec, Prediction, compute_masked_loss
 from edp.networks.losses.base import POINT
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_hidden, stream_predictions
@@ -156,7 +156,7 @@ class Distillation:
         labelled = batch_context.valid & (strategy_columns[..., 0] > 0.5)
         teacher_predictions = strategy_columns[..., 1 : 1 + self.said].unflatten(-1, batch_context.future.shape[2:])
         target = objective.code.encode(teacher_predictions, batch_context.features)
-        loss = (1.0 - spec.truth) * masked_loss(
+        loss = (1.0 - spec.truth) * compute_masked_loss(
             spec.soft, batch_context.answer, target, batch_context.valid, objective.weights
         )
         if spec.truth:

@@ -138,7 +138,7 @@ def _regeneration(machine: Machine, number: MachineNumber) -> float:
     return float(LEAST_REGENERATION * flow * np.sqrt(own_bar / bar))
 
 
-def with_values(machine: Machine, values: Sequence[float] | Doubles) -> Machine:
+def set_values(machine: Machine, values: Sequence[float] | Doubles) -> Machine:
     """Return a machine with other parameters.
 
     Args:

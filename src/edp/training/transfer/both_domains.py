@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from edp.data.series import Series
 from edp.data.task import Task
-from edp.networks.losses import Huber, masked_loss
+from edp.networks.losses import Huber, compute_masked_loss
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
 from edp.settings.bounds import MOST_WEIGHT, SHARE, WEIGHT, check_bounds, span
@@ -107,7 +107,7 @@ class BothDomains:
         if spec.soft:
             source_predictions = batch.strategy_columns[..., 1:].unflatten(-1, batch.future.shape[2:])
             goal = objective.code.encode(source_predictions, batch.features)
-            soft = masked_loss(Huber(), batch.answer, goal, there, objective.weights)
+            soft = compute_masked_loss(Huber(), batch.answer, goal, there, objective.weights)
             loss = loss + spec.weight * spec.soft * soft
         if spec.reversal:
             hidden = reverse(batch.hidden, spec.reversal * ramp(batch.progress))

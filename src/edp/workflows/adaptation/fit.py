@@ -26,7 +26,7 @@ from edp.training import save_bundle
 from edp.training.bundle import weights_digest
 from edp.workflows.adaptation.replay import replay
 from edp.workflows.deployment import footprint_of
-from edp.workflows.train_evaluate import trained_run
+from edp.workflows.train_evaluate import read_trained_run
 
 Rows = NDArray[np.float64]
 HISTORY = "history.jsonl"
@@ -62,7 +62,7 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
     """
     check_claimable(out, "adaptation")
     folder = Path(run)
-    bundle, experiment, provenance, data = trained_run(folder)
+    bundle, experiment, provenance, data = read_trained_run(folder)
     spec = spec or AdaptationSpec()
     key = run_key({"adaptation": asdict(spec), "weights": weights_digest(bundle.predictor)}, data.digest)
     # Before the folder is claimed: what is refused must not keep a corrected command out.
@@ -70,7 +70,7 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
     with Run.create(out, "adaptation", key, experiment_toml(experiment)) as target:
         if is_file_at(folder / HISTORY):
             write_bytes(target.file(HISTORY), (folder / HISTORY).read_bytes())
-        write_json(target.file("provenance.json"), provenance.with_entries(adaptation=adaptation.digest).to_table())
+        write_json(target.file("provenance.json"), provenance.add_entries(adaptation=adaptation.digest).to_table())
         save_bundle(replace(bundle, adaptation=adaptation), target.file("bundle"))
         # The footprint counts the adaptation too; the one of the source run would state too little.
         write_json(target.file("footprint.json"), footprint_of(target.path)[0].to_json())

@@ -294,7 +294,7 @@ def read(
     return Recordings(source.read(), source)
 
 
-def as_recordings(data: Recordings | Recording | Sequence[Recording]) -> Recordings:
+def to_recordings(data: Recordings | Recording | Sequence[Recording]) -> Recordings:
     """Convert user data to `Recordings`.
 
     Raises:

@@ -198,7 +198,7 @@ def choose(promises: Mapping[str, Promise]) -> PortfolioChoice:
     return PortfolioChoice(name, best, excess, doubt)
 
 
-def in_report_units(error: DoubleArray, data: Prepared) -> dict[str, dict[str, float]]:
+def to_report_units(error: DoubleArray, data: Prepared) -> dict[str, dict[str, float]]:
     """Root-mean-square errors, standardised by the data, by horizon and target in report units."""
     factors = np.array([KINDS[kind].report_factor for kind in data.target_kinds])
     scale = np.asarray(data.scaler().target_scale, dtype=np.float64)

@@ -29,9 +29,9 @@ from edp.workflows.auto.promise import (
     blocks_of,
     by_output,
     choose,
-    in_report_units,
     promise_of,
     standard_truth,
+    to_report_units,
 )
 from edp.workflows.auto.recordings import (
     ReadOnce,
@@ -144,7 +144,7 @@ def _write_choice(
     stated.write(run.path)
     if floor is not None and winner is not floor:
         # What the skill is measured against: `edp evaluate` needs its error on the test recordings, too.
-        provenance = Provenance().with_entries(auto=stated.sentence)
+        provenance = Provenance().add_entries(auto=stated.sentence)
         save_bundle(make_bundle(floor.fitted.predictor, data, provenance), run.file(FLOOR))
     bundle = keep_fitted(run, source, winner.experiment, data, winner.fitted, {"auto": stated.sentence})
     return AutoResult(bundle, stated)
@@ -182,13 +182,13 @@ def _make_choice_file(
             label=CANDIDATES[name].label,
             seconds=round(one.fitted.seconds, 2),
             parameters=sum(parameter.numel() for parameter in one.fitted.predictor.parameters()),
-            promise=in_report_units(one.promise.error(), data),
+            promise=to_report_units(one.promise.error(), data),
         )
         for name, one in trained.items()
     }
     promise, floor = trained[choice.name].promise, trained.get(FLOOR)
     still = _persistence(settings, data, amount)
-    unchanged = in_report_units(still.last(len(promise.rows)).error(), data)
+    unchanged = to_report_units(still.last(len(promise.rows)).error(), data)
     tested = sum(max(0, part.samples - data.task.max_horizon) for part in data.test)
     against = still if floor is None or choice.name == FLOOR else floor.promise
     skill = promise.relative_to(against)
@@ -203,7 +203,7 @@ def _make_choice_file(
         candidates=candidates,
         persistence=unchanged,
         interval=ErrorBounds(
-            **{side: in_report_units(bound, data) for side, bound in promise.interval(tested).items()}
+            **{side: to_report_units(bound, data) for side, bound in promise.interval(tested).items()}
         ),
         skill=Skill(
             against=PERSISTENCE if against is still else FLOOR,

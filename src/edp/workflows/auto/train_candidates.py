@@ -113,7 +113,7 @@ def train_candidate(job: CandidateTraining, on_event: OnEvent | None = None) -> 
 def _train_on_folds(job: CandidateTraining, on_event: OnEvent | None) -> TrainedCandidate:
     bagged = fit_bagged(job.data, job.experiment.model, job.experiment.training, on_event)
     truth = standard_truth(bagged.fitted.predictor, job.data)
-    promise = promise_of(bagged.at_every_tick(truth), truth, job.blocks)
+    promise = promise_of(bagged.predict_all(truth), truth, job.blocks)
     return TrainedCandidate(job.experiment, bagged.fitted, promise)
 
 

@@ -18,7 +18,7 @@ from edp.training.bundle import blank_scaler
 from edp.training.compression.pruning import check_pruning
 from edp.workflows.compression.bench import CompressionRequest
 from edp.workflows.compression.formats import FORMATS, resource_usage
-from edp.workflows.compression.variants import rounded_order
+from edp.workflows.compression.variants import make_rounded_request
 
 STEP = 4  # widths are multiples of it: what kernels compute at a time
 RECIPES = ("distilled", "pruned")  # and the better one is trained on with rounded numbers
@@ -59,7 +59,8 @@ class CompressionPlan:
             return []
         # The better recipe is chosen in float: rounding both would double the trainings.
         return [
-            rounded_order(min(orders, key=lambda order: errors.get(order, math.inf))) for orders in self.orders.values()
+            make_rounded_request(min(orders, key=lambda order: errors.get(order, math.inf)))
+            for orders in self.orders.values()
         ]
 
 

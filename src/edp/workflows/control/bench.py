@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from edp.config.control import ControlExperiment
-from edp.control.base import unused_models
+from edp.control.base import list_unused_models
 from edp.control.controllers import CONTROLLERS, ControllerSpec
 from edp.control.guard import LoopGuard
 from edp.control.loop import LoopResult, run_loop, start_options
@@ -244,7 +244,7 @@ def _check_used(experiment: ControlExperiment, sources: ControlSources) -> None:
     """Raise ConfigError for models that the controller of an experiment does not use."""
     needs, kind = experiment.controller.needs, CONTROLLERS.name_of(experiment.controller)
     available = [name for name in ("twin", "predictor") if getattr(sources, name) is not None]
-    for name in unused_models(needs, available):
+    for name in list_unused_models(needs, available):
         uses = " and a ".join(need.replace("_", " ") for need in needs)
         raise ConfigError(
             f"--{name}: it has no effect with the controller '{kind}', which uses a {uses}; "

@@ -87,7 +87,7 @@ def parts_of(
             f"controller '{CONTROLLERS.name_of(spec)}' has no form in C; these have: pi, nmpc. Run edp control with "
             "one of them"
         )
-    valves = models.needed_map(CONTROLLERS.name_of(spec))
+    valves = models.require_map(CONTROLLERS.name_of(spec))
     loop = spec if isinstance(spec, ProportionalIntegral) else ProportionalIntegral()
     plan: PlanParts | None = None
     reads: tuple[str, ...] = STROKES

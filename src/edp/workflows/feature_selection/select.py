@@ -24,8 +24,8 @@ from edp.report import build_screening_page, write_screening_pictures
 from edp.signals import VOCABULARY, SignalMap
 from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.storage.provenance import command_line
-from edp.workflows.feature_selection.changes import with_changes
-from edp.workflows.feature_selection.trials import OnTrial, Trials, TrialSpec, try_feature_sets, with_differences
+from edp.workflows.feature_selection.changes import add_changes
+from edp.workflows.feature_selection.trials import OnTrial, Trials, TrialSpec, add_differences, try_feature_sets
 
 PROPOSED, DIFFERENCES, CHANGES, ALL = "proposed", "proposed + differences", "proposed + changes", "all candidates"
 # The file stays readable; the whole list is in `screening.json`.
@@ -213,10 +213,10 @@ def _sets(screening: ScreeningResult, first: Recording) -> dict[str, FeatureSett
     channels = (*(target for target in screening.targets if target not in names), *names)
     proposed = FeatureSettings(name=PROPOSED, channels=channels)
     sets = {PROPOSED: proposed}
-    differences = with_differences(proposed, first, DIFFERENCES)
+    differences = add_differences(proposed, first, DIFFERENCES)
     if differences.derived:
         sets[DIFFERENCES] = differences
-    changes = with_changes(proposed, screening, first, CHANGES)
+    changes = add_changes(proposed, screening, first, CHANGES)
     if changes.derived:
         sets[CHANGES] = changes
     sets[ALL] = FeatureSettings(name=ALL, channels=screening.channels)

@@ -225,7 +225,7 @@ def train_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str
     return {}
 
 
-def with_differences(settings: FeatureSettings, recording: Recording, name: str) -> FeatureSettings:
+def add_differences(settings: FeatureSettings, recording: Recording, name: str) -> FeatureSettings:
     """Return the set with tick-to-tick changes of its cylinder pressures, as in FG2 (eq. 3.1)."""
     derived_sources = {entry.source for entry in settings.derived}
     candidates = [c for c in settings.channels if c not in derived_sources]

@@ -40,7 +40,7 @@ from edp.storage.paths import files_below, full_path, status_of
 from edp.training import Bundle, load_bundle
 from edp.training.blas import one_blas_thread
 from edp.training.bundle import weights_digest
-from edp.training.delta import MOST_BYTES, read_delta, with_delta
+from edp.training.delta import MOST_BYTES, apply_delta, read_delta
 from edp.workflows.fleet.machines import MachineSource, StoredMachine, machines_of
 from edp.workflows.fleet.personal import read_fleet
 from edp.workflows.monitor import run_monitor
@@ -179,7 +179,7 @@ def _errors_of(bundle: Bundle, source: MachineSource, where: Mapping[str, str | 
     series = [task.series(recording) for recording in recordings]
     delta, monitor = where["delta"], where["monitor"]
     if delta is not None:
-        network = with_delta(network, read_delta(delta))
+        network = apply_delta(network, read_delta(delta))
     factor = np.array([KINDS[kind].report_factor for kind in bundle.target_kinds])
     errors = [np.abs(error) * factor for horizon, error in stream_errors(network, series) if horizon == 0]
     if not errors:

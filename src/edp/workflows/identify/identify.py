@@ -38,7 +38,7 @@ from edp.storage.paths import is_there
 from edp.storage.provenance import PROVENANCE
 from edp.storage.runs import Run, check_claimable, run_key
 from edp.training.grey_fit import GreyProblem, fit_grey_box
-from edp.training.identification.bodies import Poses, linked_bodies, realised
+from edp.training.identification.bodies import Poses, convert_bodies, realised
 from edp.training.identification.elements import (
     NO_MOTORS,
     check_same_linkage,
@@ -52,13 +52,13 @@ from edp.training.identification.machine_text import machine_text
 from edp.training.identification.mapping import GreyParts
 from edp.training.identification.rows import TOLD, IdentifiedNumber, body_rows, line_comments, number_rows
 from edp.training.identification.stability import covariance
-from edp.training.identification.tie import MachineTie, deviations, kept_back, nearest
+from edp.training.identification.tie import MachineTie, deviations, fix_coordinates, nearest
 from edp.training.progress_steps import free_run_steps
 from edp.training.provenance import training_provenance
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 from edp.wording import percent, typed
 from edp.workflows.identify.compare import FrontChannels, MeasuredRuns
-from edp.workflows.twin.prepare_twin import prepared_twin
+from edp.workflows.twin.prepare_twin import cut_recordings
 
 Doubles = NDArray[np.float64]
 KIND, RUN, RESULT, GREY_FOLDER = "identification", ".run", "identification.json", "grey"
@@ -152,7 +152,7 @@ def identify(
             f"settings: twin.linkage = '{grey.linkage[:80]}' came; the linkage is that of --machine ({base.name}): "
             "leave twin.linkage out"
         )
-    channels, data = prepared_twin(recordings, settings)
+    channels, data = cut_recordings(recordings, settings)
     _check_strokes(channels, data, base)
     # What could not be judged, or holds no number, is refused before the fit of minutes.
     celsius, notes = _celsius(recordings, base)
@@ -366,7 +366,7 @@ def _machine(fit: _Tied, spread: Doubles, data: Prepared) -> tuple[Machine, list
     excited = deviations(information)[:count] < UNEXCITED
     back = np.concatenate([~excited, np.zeros(len(theta) - count, np.bool_)])
     final = replace(tie, free=excited)
-    settled = kept_back(theta, information, back)
+    settled = fix_coordinates(theta, information, back)
     machine, load = final.machine(settled), tie.load_at(settled)
     valves = machine.valves
     missing = np.array(tie.parts.conflux) < 0
@@ -382,7 +382,7 @@ def _machine(fit: _Tied, spread: Doubles, data: Prepared) -> tuple[Machine, list
     nine, body = body_rows(tie, load, spread[count:, count:], twin.wiring.z_of, poses)
     numbers = number_rows(tie.base, machine, left[:count], excited)
     if tie.parts.table.front is not None:
-        return replace(machine, bodies=linked_bodies(load, tie.base)), numbers + body, []
+        return replace(machine, bodies=convert_bodies(load, tie.base)), numbers + body, []
     try:
         return replace(machine, bodies=realised(nine, tie.base)), numbers + body, []
     except ConfigError as error:
@@ -441,8 +441,8 @@ def _scores(
     floor: TwinSpec = replace(TWINS["static"](), prefix_ticks=twin.prefix_ticks)
     static = floor.start(twin.channels, twin.scales, data.train, settings.training.seed)
     answers = {
-        MACHINE: runs.by_machine(machines[1], front),
-        f"machine {machines[0].name}": runs.by_machine(machines[0], front),
+        MACHINE: runs.group_by_machine(machines[1], front),
+        f"machine {machines[0].name}": runs.group_by_machine(machines[0], front),
         GREY: runs.by_twin(twin),
         "static map": runs.by_twin(static),
     }

@@ -12,7 +12,7 @@ import numpy as np
 from edp.errors import ConfigError, EdpError, brief
 from edp.live.addresses import LOOPBACK, resolve_bind
 from edp.live.layout import Forecast, LiveLayout, LiveTrace, label, sentence
-from edp.live.pace import Pace, checked_speed
+from edp.live.pace import Pace, check_speed
 from edp.live.saved import write_session_page
 from edp.live.session import HISTORY_BYTES, MOST_TEXT, LiveSession
 from edp.monitor.monitor_file import load_monitor
@@ -68,7 +68,7 @@ class LiveOrder:
 
     def __post_init__(self) -> None:
         check_bounds("the live view", self, free_s=span(0.1, MAX_FREE_S))
-        checked_speed(self.speed)
+        check_speed(self.speed)
         resolve_bind(self.host, "--bind")
 
 

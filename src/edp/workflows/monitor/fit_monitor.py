@@ -22,7 +22,7 @@ from edp.monitor.monitor import Monitor
 from edp.monitor.monitor_file import load_monitor, save_monitor
 from edp.monitor.residuals.base import ONE_BY_ONE, FitMaterial, ResidualSource, ResidualSpec, SideBySide
 from edp.monitor.residuals.flow_balances import FlowBalances
-from edp.monitor.residuals.groups import Group, sensed_channels
+from edp.monitor.residuals.groups import Group, select_sensed
 from edp.monitor.residuals.virtual_sensors import VirtualSensorsSpec
 from edp.monitor.session_blocks import SessionBlocks, session_means
 from edp.progress import SILENT, Progress
@@ -259,7 +259,7 @@ def _add_dictionary(
     return replace(monitor, diagnosis=dictionary)
 
 
-def watched_channels(recordings: Sequence[Recording], experiment: MonitorExperiment) -> tuple[Channel, ...]:
+def select_watched(recordings: Sequence[Recording], experiment: MonitorExperiment) -> tuple[Channel, ...]:
     """Return the channels that all recordings hold and sensors can measure, or those of the settings.
 
     Raises:
@@ -279,7 +279,7 @@ def watched_channels(recordings: Sequence[Recording], experiment: MonitorExperim
                 hint = closest(name, recording.channel_names)
                 raise DataError(f"healthy log '{recording.name}' has no channel '{name}'{hint}")
     shared = set(first.channel_names).intersection(*(recording.channel_names for recording in recordings))
-    offered = [channel for channel in sensed_channels(first.channels) if channel.name in shared]
+    offered = [channel for channel in select_sensed(first.channels) if channel.name in shared]
     chosen = experiment.channels or tuple(channel.name for channel in offered)
     channels = tuple(channel for channel in first.channels if channel.name in chosen)
     if len(channels) < 2:
@@ -411,7 +411,7 @@ def _healthy_sessions(recordings: Sequence[Recording], experiment: MonitorExperi
         ConfigError: a dictionary that cannot be.
     """
     check_dictionary(experiment.dictionary)
-    channels = watched_channels(recordings, experiment)
+    channels = select_watched(recordings, experiment)
     _check_values(recordings, channels)
     sessions = _enough_sessions(recordings)
     order = np.random.default_rng(experiment.seed).permutation(len(sessions)).tolist()

@@ -51,10 +51,10 @@ def choose_targets(proposal: MapProposal) -> tuple[tuple[str, ...], list[str]]:
     Raises:
         DataError: nothing moves.
     """
-    measured = proposal.of_role("measured")
+    measured = proposal.select_role("measured")
     notes = []
     if not measured:
-        measured = proposal.of_role("command", "reference")
+        measured = proposal.select_role("command", "reference")
         if not measured:
             texts = len(proposal.look.texts)
             unread = f", and {texts} that hold text" if texts else ""
@@ -183,7 +183,7 @@ def propose_plant(proposal: MapProposal, targets: Sequence[str], inputs: Sequenc
         inputs: channels that command, where no kind tells it.
     """
     kinds = {guess.channel: guess.kind.kind for guess in proposal.columns if guess.channel}
-    commands = [guess.channel for guess in proposal.of_role("command")]
+    commands = [guess.channel for guess in proposal.select_role("command")]
     if not commands:
         return PlantProposal(
             why_not="no column looks like a command: record what moves the machine (valve current, pilot pressure, "
@@ -216,7 +216,7 @@ def _propose_from_positions(
         )
     if not assignments["commands"] and not any(kinds[name] in COMMANDS for name in commands):
         assignments = {"commands": tuple(commands)}
-    measured = tuple(guess.channel for guess in proposal.of_role("measured") if guess.kind.kind in RATE_OF)
+    measured = tuple(guess.channel for guess in proposal.select_role("measured") if guess.kind.kind in RATE_OF)
     others = [
         name for name, kind in kinds.items() if kind in RATE_OF and name not in (*measured, *assignments["commands"])
     ]

@@ -16,7 +16,7 @@ from edp.logs.proposal.experiments import Experiments, part_experiments
 from edp.logs.proposal.frames import refuse_frames
 from edp.logs.proposal.groups import LogGroup, group_logs
 from edp.logs.proposal.propose import ColumnGuess, MapProposal, propose_map
-from edp.logs.proposal.shapes import beside_notes, pace_notes, shape_notes
+from edp.logs.proposal.shapes import note_ignored_files, pace_notes, shape_notes
 from edp.logs.proposal.timing import Timing, repair_table, timing_of
 from edp.logs.read import find_recordings
 from edp.logs.source import DataSource
@@ -34,7 +34,7 @@ from edp.workflows.proposal.files import (
     check_files,
     data_set_text,
     map_table,
-    named_paths,
+    name_paths,
     remarks_of,
     settings_text,
     toml_text,
@@ -118,7 +118,7 @@ class LogsProposal:
 
 def _untold_inputs(proposal: MapProposal) -> tuple[str, ...]:
     """Return command channels if all are generic; none if a name contains the comma that separates names."""
-    commands = proposal.of_role("command")
+    commands = proposal.select_role("command")
     names = tuple(guess.channel for guess in commands)
     plain = all(guess.kind.kind is Kind.GENERIC for guess in commands) and not any("," in name for name in names)
     return names if plain else ()
@@ -162,9 +162,9 @@ def propose(path: str | Path | Sequence[str | Path], progress: Progress = SILENT
     notes += [
         *more,
         *pace_notes(proposal.look, proposal.clock, chosen),
-        *(note for one in source.paths for note in beside_notes(one, paths)),
+        *(note for one in source.paths for note in note_ignored_files(one, paths)),
     ]
-    channels = [guess.channel for guess in proposal.of_role("reference", "command", "measured")]
+    channels = [guess.channel for guess in proposal.select_role("reference", "command", "measured")]
     if len(channels) > MOST_FEATURES:
         notes.append(
             f"of {count_of(len(channels), 'moving channel')} the first {MOST_FEATURES} are features (task.features)"
@@ -202,7 +202,7 @@ def _recordings(
 ) -> list[tuple[Path, dict[str, object]]]:
     """Return the logs of a group as entries of a data set; an experiment has a map that names its variable."""
     if experiments is None:
-        return [(path, {"path": str(full_path(path)), "name": name}) for path, name in named_paths(group.paths)]
+        return [(path, {"path": str(full_path(path)), "name": name}) for path, name in name_paths(group.paths)]
     columns = map_table(proposal.signal_map)
     named = zip(group.paths, experiments.entries, experiments.names())
     return [
@@ -333,7 +333,7 @@ def _propose_from_pairs(
     train = next(ending for ending in pairs if ending in _TRAINS)
     test = next(ending for ending in pairs if ending != train)
     recordings = []
-    for path, name in named_paths(group.paths):
+    for path, name in name_paths(group.paths):
         for ending in (train, test):
             renamed = [(stem, guess) for stem, guess in pairs[ending].items()]
             entries = tuple(
@@ -348,7 +348,7 @@ def _propose_from_pairs(
     renamed_proposal = replace(proposal, columns=renamed_columns)
     targets, notes = choose_targets(renamed_proposal)
     repairs = _set_rate(group, proposal)[1].shared
-    channels = [guess.channel for guess in renamed_proposal.of_role("reference", "command", "measured")]
+    channels = [guess.channel for guess in renamed_proposal.select_role("reference", "command", "measured")]
     tests = [str(one["name"]) for one in recordings if str(one["name"]).endswith(f"_{test}")]
     files = {
         DATA: data_set_text(recordings),

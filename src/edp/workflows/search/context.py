@@ -14,7 +14,7 @@ from edp.config.experiment import Table
 from edp.errors import ConfigError, DataError, closest
 from edp.evaluation.study import Decision, facts_of_kind
 from edp.stats.folds import repeated_folds, repeated_splits
-from edp.workflows.search.modules import with_modules
+from edp.workflows.search.modules import add_modules
 from edp.workflows.search.settings import SearchSpec
 from edp.workflows.search.space import WIDTHS, Candidate
 from edp.workflows.search.trainings import Outcome, TrainingRequest
@@ -93,7 +93,7 @@ class SearchContext:
 
     def network(self, settings: Table, names: Sequence[str] = (), options: Candidate | None = None) -> Table:
         """Return settings with modules and toggles added, and this search's widths."""
-        return with_modules(settings, names, self.channels, options, self.shaped)
+        return add_modules(settings, names, self.channels, options, self.shaped)
 
     def orders(self, settings: Table, runs: Sequence[int], seed: int = 0) -> list[TrainingRequest]:
         """Return one request per run: the same folds and seeds for every arm (common random numbers).

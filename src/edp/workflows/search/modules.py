@@ -147,7 +147,7 @@ def title_of(name: str) -> str:
     return part_of(name).title
 
 
-def with_modules(
+def add_modules(
     settings: Table,
     names: Iterable[str],
     channels: Sequence[str] = (),
@@ -191,7 +191,7 @@ def options_of(settings: Table, name: str, shape: Shape | None = None) -> dict[s
     Args:
         settings: to which the module would be added; what it would have there is one of the values.
         name: of the module, or of a toggle, which has none.
-        shape: as in `with_modules`.
+        shape: as in `add_modules`.
     """
     options = {key: tuple(option.values) for key, option in _options(settings, name, shape).items()}
     return {key: Choice(values) for key, values in options.items() if len(values) > 1}

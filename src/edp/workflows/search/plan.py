@@ -13,12 +13,12 @@ from edp.config.experiment import (
     FeatureSettings,
     Table,
     build,
+    embed_feature_set,
     merged,
     override,
     plain_tree,
     preset_table,
     read_toml,
-    with_set_file,
 )
 from edp.data.feature_files import is_set_file, read_set_table
 from edp.data.features import FEATURE_SETS
@@ -108,7 +108,7 @@ def _use_task(search: Table, table: Table, experiment: Experiment) -> Table:
 
 def _read_named_files(table: Table, folder: Path) -> Table:
     """`table` with the feature sets and the budget that it names by files."""
-    resolved, search = with_set_file(table, folder), table.get("search")
+    resolved, search = embed_feature_set(table, folder), table.get("search")
     if not isinstance(search, Mapping):
         return resolved
     compression = search.get("compression")

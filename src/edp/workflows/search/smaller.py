@@ -26,7 +26,7 @@ from edp.training.fit import fit
 from edp.training.spec import TrainingSpec
 from edp.workflows.compression.bench import TUNING_EPOCHS, Bench, CompressionRequest
 from edp.workflows.compression.pipeline import TEACHER, Evaluator, formats_of
-from edp.workflows.compression.variants import rounded_order
+from edp.workflows.compression.variants import make_rounded_request
 from edp.workflows.search.trainings import TrainingRequest, experiment_of, mean_scores, prepared, session_scores
 
 Weights = dict[str, Tensor]
@@ -64,7 +64,7 @@ class Recipe:
         # Rounded networks are made of plain ones, whose order comes first.
         name = f"{'p' if self.pruned else 'u'}{self.units}"
         plain = CompressionRequest(name=name, units=self.units, pruned=self.pruned)
-        return rounded_order(plain) if self.rounded else plain
+        return make_rounded_request(plain) if self.rounded else plain
 
     def experiment(self, experiment: Experiment) -> Experiment:
         """Return the experiment of the network's last training, given the teacher's."""

@@ -21,7 +21,7 @@ from edp.networks.twin.model_selection import AutoTwin
 from edp.networks.twin.recurrent import Recurrent, member_seed
 from edp.storage.runs import PARTS, KeyedRun, part_of
 from edp.training.free_run import FreeRunSpec
-from edp.training.free_run_members import MemberTraining, joined_members
+from edp.training.free_run_members import MemberTraining, join_members
 from edp.wording import setting_text, typed
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
 from edp.workflows.twin.pace import paced
@@ -306,7 +306,7 @@ class TwinChoice:
         first, several = trial.fits[0], len(trial.fits) > 1
         unseen = [(fit.fitted.twin, fold.validation) for fit, fold in zip(trial.fits, self.folds, strict=True)]
         if isinstance(trial.spec, Recurrent):
-            result = FittedFormulation(trial.spec, joined_members([fit.fitted for fit in trial.fits]))
+            result = FittedFormulation(trial.spec, join_members([fit.fitted for fit in trial.fits]))
         elif not first.fitted.history:
             result = self._whole.fitted(trial.spec, None)
         elif isinstance(trial.spec, ElementsBox):

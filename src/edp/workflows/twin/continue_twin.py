@@ -18,7 +18,7 @@ from edp.evaluation.guard import free_run_error
 from edp.networks.twin import TWINS, Twin
 from edp.networks.twin.model_selection import AutoTwin
 from edp.networks.twin.recurrent import RecurrentTwin, averaged, member_seed
-from edp.networks.twin.recurrent_members import scales_for, separated, with_scales
+from edp.networks.twin.recurrent_members import replace_scales, scales_for, separated
 from edp.networks.twin.static_map import StaticMap, StaticTwin
 from edp.settings.tree import Table
 from edp.storage.runs import PARTS, KeyedRun
@@ -163,7 +163,7 @@ class ContinuedTwin:
         start = self.start.twin
         scales = scales_for(start, self.fit.scales, self.fit.data.train)
         # End stops are the machine's: the twin as it is has those of these recordings, too.
-        as_it_is = with_scales(start, scales)
+        as_it_is = replace_scales(start, scales)
         fits = [FittedTwin(as_it_is, [], 0.0)]
         tried = [TwinCandidate("the twin as it is", 0.0, error=self._error(as_it_is))]
         for share in SHARES:

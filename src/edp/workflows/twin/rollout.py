@@ -23,7 +23,7 @@ from edp.settings.bounds import above, span
 from edp.signals import Channel
 from edp.training.twin_bundle import load_twin
 from edp.wording import setting_text, typed
-from edp.workflows.twin.judge_twin import reported_channels, shown_runs
+from edp.workflows.twin.judge_twin import describe_channels, select_shown_runs
 
 FREE = "_twin"
 """Behind the name of a channel, for what the twin answered in its place."""
@@ -118,9 +118,9 @@ def rollout_log(run: str | Path, source: DataSource, request: RolloutRequest) ->
     if request.plots is not None:
         write_rollout_plots(result.recording, FREE, (start + 1) / recording.rate_hz, request.plots)
     if request.page is not None:
-        content = FreeRunFile(channels=reported_channels(twin.channels), models={TWIN: result.scores})
+        content = FreeRunFile(channels=describe_channels(twin.channels), models={TWIN: result.scores})
         title = f"{recording.name} from {typed(result.start_s)} s"
-        build_twin_page(FreeRunFacts(title, content, shown_runs(runs, intervals))).write(request.page)
+        build_twin_page(FreeRunFacts(title, content, select_shown_runs(runs, intervals))).write(request.page)
     return result
 
 

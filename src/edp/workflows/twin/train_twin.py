@@ -40,7 +40,7 @@ from edp.workflows.twin.continue_twin import BaseTwin, ContinuedTwin
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
 from edp.workflows.twin.ground_twin import ground_twin
 from edp.workflows.twin.judge_twin import judge_twin, write_scores
-from edp.workflows.twin.prepare_twin import driving_labels, prepare_twin, prepared_twin
+from edp.workflows.twin.prepare_twin import cut_recordings, driving_labels, prepare_twin
 
 FOLDER = "twin"
 DATASHEET = "datasheet"
@@ -96,7 +96,7 @@ def train_twin(
     if base is not None:
         experiment = base.settled(experiment)
     recordings = source.read()
-    channels, data = prepared_twin(recordings, experiment)
+    channels, data = cut_recordings(recordings, experiment)
     labels, begun = driving_labels(recordings), {}
     if base is not None:
         base.check(channels, data.train)
@@ -121,7 +121,7 @@ def train_twin(
         intervals = calibrated(result.unseen or ((fitted.twin, data.validation),), experiment.judge)
         before = None if base is None else base.bundle.provenance.more.get(RANGES)
         ranges = command_ranges(channels, [*data.train, *data.validation], before)
-        provenance = training_provenance(source, data, experiment.training.seed, 1, fitted.seconds).with_entries(
+        provenance = training_provenance(source, data, experiment.training.seed, 1, fitted.seconds).add_entries(
             **_full_strokes(recordings), **_oil(recordings), **result.facts, **{RANGES: ranges}
         )
         bundle = TwinBundle(result.spec, fitted.twin, provenance, {}, intervals)

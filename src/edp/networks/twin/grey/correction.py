@@ -92,7 +92,7 @@ def index_of(port: IntArray, n: int, nodes: int) -> Any:
 
 
 @inner
-def fed_ports(ports: IntArray, y: Array, s: Array, fed: Array) -> None:
+def read_ports(ports: IntArray, y: Array, s: Array, fed: Array) -> None:
     """Write the port readings to `fed`, in units of the grey box, shape (output,)."""
     n, nodes = len(s), len(y) - len(s)
     for c in range(len(ports)):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from edp.data.series import Series
 from edp.networks.twin.grey import parameter_index as at
-from edp.networks.twin.grey.initial_bodies import balance_columns, balanced_bodies
+from edp.networks.twin.grey.initial_bodies import balance_bodies, balance_columns
 from edp.networks.twin.grey.parameters import ParameterTable
 
 Array = NDArray[np.float64]
@@ -74,7 +74,7 @@ def load_start(
         goal[i] /= size
     flat = matrix.reshape(-1, matrix.shape[2]), goal.reshape(-1)
     if table.front is not None:
-        values, others = balanced_bodies(table, *flat)
+        values, others = balance_bodies(table, *flat)
         return _insert_friction(table, others, declared, values)
     solution = _ridge(*flat)
     return _insert_solution(table, solution, declared, values)

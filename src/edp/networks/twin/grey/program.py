@@ -157,10 +157,10 @@ def frame_of(form: GreyForm) -> FramePlaces:
 def program_of(form: GreyForm) -> GreyProgram:
     """Return the compiled functions of a form, from the cache on disk if it has them."""
     functions = _Functions(form)
-    return functions.program(loaded_module(functions.module, form))
+    return functions.program(load_module(functions.module, form))
 
 
-def loaded_module(module: CodeModule, identity: object) -> Loaded:
+def load_module(module: CodeModule, identity: object) -> Loaded:
     """Load the functions of a module, from the cache on disk if it has them under this identity."""
     file = None if compiler.folder is None else compiler.folder / f"{digest_of(identity)}.o"
     loaded = load(read_or_compile(file, module.object_code), module.names)

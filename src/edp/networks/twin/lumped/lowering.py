@@ -12,7 +12,7 @@ from edp.ir import Builder
 from edp.ir.base import INPUT
 from edp.ir.layers import Activate, BinaryOperation, Clip, Function, ScaleShift
 from edp.ir.memory import Feed, Feedback
-from edp.networks.twin.lowering import stopped_strokes
+from edp.networks.twin.lowering import add_stroke_stops
 from edp.networks.twin.lumped.constants import EDGE, EMPTY, SLIP, SPILL
 from edp.networks.twin.lumped.parts import Doubles
 
@@ -96,7 +96,7 @@ def lowered_answers(build: Builder, twin: ElementsTwin, fed: str) -> str:
             columns = [twin.columns[mass.velocity] for mass in parts.masses]
             speed = tick.bounded("bounded", tick.scaled("scaled", _masses(tick), columns), columns)
             if channels.strokes:
-                speed, stroke = stopped_strokes(build, twin, fed, speed, columns)
+                speed, stroke = add_stroke_stops(build, twin, fed, speed, columns)
                 note(stroke, [len(channels.velocities) + column for column in columns])
             note(speed, columns)
     if parts.lags:

@@ -185,7 +185,7 @@ def free_run(numbers: Values, commands: Doubles, answer: Values, hidden: Values,
 
 
 @compiled
-def measured_run(
+def simulate_measured(
     numbers: Doubles,
     commands: NDArray[np.float32],
     measured: NDArray[np.float32],

@@ -167,7 +167,7 @@ SOURCES: Registry[type[LiveSource]] = Registry("live source")
 """Sources by the name of their option."""
 
 
-def chosen_rate(options: SourceOptions, needs: Needs, what: str) -> float:
+def choose_rate(options: SourceOptions, needs: Needs, what: str) -> float:
     """Rate of a source that takes it from the models.
 
     Raises:

@@ -13,13 +13,13 @@ import numpy as np
 
 from edp.errors import ConfigError, DataError
 from edp.live.addresses import LOOPBACK, resolve_bind
-from edp.logs.units import check_unit, mapped_channel, unit_for
+from edp.logs.units import channel_from_entry, check_unit, unit_for
 from edp.settings.bounds import shown
 from edp.signals import VOCABULARY, Channel, Kind, SignalMap
 from edp.storage.reading import Table, parse_json
 from edp.wording import typed
 from edp.workflows.live.sources.arrivals import Arrivals
-from edp.workflows.live.sources.base import SOURCES, LiveSource, Needs, Row, Sink, SourceOptions, chosen_rate
+from edp.workflows.live.sources.base import SOURCES, LiveSource, Needs, Row, Sink, SourceOptions, choose_rate
 
 MOST_BYTES = 16_384
 """Maximum size of a datagram: 400 channels. The limit of a network is 65,507 bytes."""
@@ -80,8 +80,8 @@ class UdpSource(LiveSource):
     @classmethod
     def of(cls, options: SourceOptions, needs: Needs) -> UdpSource:
         """`SourceOptions.value` is the port; the setting ``bind`` another address than loopback."""
-        rate, signal_map = chosen_rate(options, needs, "--udp"), options.signal_map()
-        mapped = tuple(mapped_channel(entry) for entry in signal_map.channels) if signal_map else ()
+        rate, signal_map = choose_rate(options, needs, "--udp"), options.signal_map()
+        mapped = tuple(channel_from_entry(entry) for entry in signal_map.channels) if signal_map else ()
         names = {channel.name for channel in mapped}
         channels = (*mapped, *(channel for channel in needs.channels if channel.name not in names))
         host = options.settings.get("bind", LOOPBACK)
@@ -184,7 +184,7 @@ def _conversions(signal_map: SignalMap | None) -> Callable[[str, Mapping[str, fl
     """From a channel's name and a row to its value in SI units."""
     entries: Table = {entry.name: entry for entry in (signal_map.channels if signal_map else ())}
     units = {
-        name: unit_for(check_unit(entry.unit, where), mapped_channel(entry).kind, where)
+        name: unit_for(check_unit(entry.unit, where), channel_from_entry(entry).kind, where)
         for name, entry in entries.items()
         if entry.unit is not None and (where := f"signal map, channel '{name}'")
     }
