@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from edp.data.frozen import SECOND_TEST_SET
 from edp.errors import ConfigError, StorageError
 from edp.evaluation.study_facts import FACTS, OPTIONAL
-from edp.settings.tree import SettingsTree, Table
+from edp.settings.tree import SettingsTree
 from edp.storage.ledger import Opening
 from edp.storage.paths import is_file_at, is_folder_at
 from edp.storage.reading import read_json
@@ -51,10 +51,9 @@ class Decision:
     facts: Any
     sentences: tuple[str, ...]
 
-    def to_json(self) -> Table:
+    def to_json(self) -> object:
         """Return plain values that JSON has: a number that is not finite becomes null."""
-        table: Table = _plain(self)
-        return table
+        return _plain(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,7 +150,7 @@ class StudyFile:
     unit: str
     preset: str
     data: StudyData
-    spec: Table
+    spec: Mapping[str, Any]
     sessions: SessionSets
     created: str = ""
     modules: Mapping[str, str]
@@ -203,7 +202,7 @@ class StudyFile:
             tested |= set(indices[len(indices) - sum(sealed) :] if sum(sealed) else ())
         return frozenset(tested)
 
-    def to_json(self) -> Table:
+    def to_json(self) -> dict[str, object]:
         """Return plain values that JSON has: a number that is not finite becomes null."""
         return {"schema": SCHEMA, **_plain(self)}
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -10,7 +10,6 @@ from edp.config.experiment import (
     Change,
     Experiment,
     FeatureSettings,
-    Table,
     TaskSettings,
     build,
     load_experiment,
@@ -121,7 +120,7 @@ def target_experiment(source: SourceModel, changes: Sequence[Change] = ()) -> Ex
     return build(Experiment, merged(table, combined(layers)), "of the source with --set")
 
 
-def _check_kept(layer: Table) -> None:
+def _check_kept(layer: Mapping[str, object]) -> None:
     """Refuse changes of task and network, which give weights their meaning, and of values of ``[finetune]``."""
     for name in layer:
         if name not in PLACES:
