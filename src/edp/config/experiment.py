@@ -21,7 +21,17 @@ from edp.networks.losses import LOSSES, TERMS
 from edp.networks.physics import PhysicsSpec
 from edp.networks.plain import NETWORK_PARTS, USUAL_KINDS
 from edp.networks.predictor import ModelSpec
-from edp.settings.tree import Change, SettingsTree, combined, merged, override, parse_toml, read_toml
+from edp.settings.tree import (
+    Change,
+    SettingsTree,
+    combined,
+    merged,
+    override,
+    parse_toml,
+    read_toml,
+    value_at,
+    with_value,
+)
 from edp.training.averages import AVERAGES
 from edp.training.fit import TrainingSpec
 from edp.training.optimizers import OPTIMIZERS
@@ -211,11 +221,10 @@ def experiment_toml(experiment: Experiment) -> str:
 
 def with_set_file(table: Mapping[str, object], folder: Path) -> dict[str, object]:
     """Return `table` with the feature set in place of its file name, so that a run folder is self-contained."""
-    task = table.get("task")
-    if not isinstance(task, dict) or not is_set_file(task.get("features")):
+    name = value_at(table, "task.features")
+    if not is_set_file(name):
         return dict(table)
-    path = folder / task["features"]
-    features = read_set_table(path)
+    features = read_set_table(folder / name)
     # Checked here, where the file can still be named.
-    build(FeatureSettings, features, f"'{path}'")
-    return {**table, "task": {**task, "features": features}}
+    build(FeatureSettings, features, f"'{folder / name}'")
+    return with_value(table, "task.features", features)

@@ -82,6 +82,22 @@ def merged(base: Mapping[str, object], change: Mapping[str, object]) -> dict[str
     return result
 
 
+def value_at(table: object, path: str, default: Any = None) -> Any:
+    """Return the value at keys that are joined by points; a default where there is none."""
+    for key in path.split("."):
+        if not isinstance(table, Mapping) or key not in table:
+            return default
+        table = table[key]
+    return table
+
+
+def with_value(table: object, path: str, value: object) -> dict[str, object]:
+    """Return a table with another value at keys that are joined by points; missing tables on the way are added."""
+    key, _, rest = path.partition(".")
+    old = table if isinstance(table, Mapping) else {}
+    return {**old, key: with_value(old.get(key), rest, value) if rest else value}
+
+
 def override(change: Change) -> dict[str, object]:
     """Parse ``key.path=value`` into a table.
 

@@ -16,7 +16,7 @@ from edp.logs.source import DataSource
 from edp.logs.write import write_recording
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
-from edp.settings.tree import merged, read_toml
+from edp.settings.tree import merged, read_toml, value_at, with_value
 from edp.storage import make_folder
 from edp.storage.paths import is_there
 from edp.training import Diverged
@@ -128,17 +128,16 @@ def _experiment(
     own = _table(settings)
     preset = preset or ("standard" if {"model", "training"} & own.keys() else AUTO)
     table = preset_table(preset)
-    usual_task, own_task = (part if isinstance(part, dict) else {} for part in (table.get("task"), own.get("task")))
     task: dict[str, object] = {"targets": list(targets), "horizons": list(horizons)}
     if features is not None:
         task["features"] = features if isinstance(features, str) else {"name": "own", "channels": list(features)}
-    elif "features" not in own_task:
-        usual = FEATURE_SETS.get(str(usual_task["features"]))
-        whole = usual is not None and set(usual.inputs) <= set(data.names)
-        task["features"] = usual_task["features"] if whole else "all"
+    elif value_at(own, "task.features") is None:
+        name = value_at(table, "task.features")
+        usual = FEATURE_SETS.get(str(name))
+        task["features"] = name if usual is not None and set(usual.inputs) <= set(data.names) else "all"
     # Arguments and settings could contradict each other in silence; one of them is asked for.
     for key in ("targets", "horizons"):
-        if key in own_task:
+        if value_at(own, f"task.{key}") is not None:
             raise ConfigError(f"settings: task.{key} is the argument `{key}` of edp.train; leave it out")
     table = merged(table, {"task": task})
     if tests is not None:
@@ -168,12 +167,8 @@ def _nested(settings: Mapping[str, object]) -> dict[str, object]:
     """Dotted keys as tables, in the order given."""
     table: dict[str, object] = {}
     for key, value in settings.items():
-        # Keys are built up from the innermost part.
-        first, *others = reversed(str(key).split("."))
-        change: dict[str, object] = {first: _nested(value) if isinstance(value, Mapping) else _plain(value)}
-        for part in others:
-            change = {part: change}
-        table = merged(table, change)
+        plain = _nested(value) if isinstance(value, Mapping) else _plain(value)
+        table = merged(table, with_value({}, str(key), plain))
     return table
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from edp.config.experiment import Experiment, build, merged, plain_tree
+from edp.settings.tree import value_at, with_value
 
 
 @dataclass(frozen=True)
@@ -17,7 +18,7 @@ class Arm:
     such as ``model.backbone.units``.
 
     Attributes:
-        tables: of an experiment, or of a part of one, such as a block.
+        tables: those of a settings file of an experiment.
     """
 
     tables: Mapping[str, Any] = field(default_factory=dict)
@@ -37,26 +38,20 @@ class Arm:
 
     def __getitem__(self, path: str) -> Any:
         """Return the value or table at a path."""
-        value: Any = self.tables
-        for key in path.split("."):
-            value = value[key]
-        return value
+        if path not in self:
+            raise KeyError(path)
+        return self.get(path)
 
     def get(self, path: str, default: Any = None) -> Any:
         """Return the value at a path, or a default if there is none."""
-        try:
-            return self[path]
-        except KeyError:
-            return default
+        return value_at(self.tables, path, default)
 
     def __contains__(self, path: str) -> bool:
         return self.get(path, self) is not self
 
     def with_value(self, path: str, value: object) -> Arm:
         """Return an arm with another value at a path."""
-        key, _, rest = path.partition(".")
-        inner = Arm(self.tables.get(key, {})).with_value(rest, value).tables if rest else value
-        return Arm({**self.tables, key: inner})
+        return Arm(with_value(self.tables, path, value))
 
     def merged(self, change: Mapping[str, object]) -> Arm:
         """Return an arm with tables laid over these; see `edp.settings.tree.merged`."""

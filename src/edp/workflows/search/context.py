@@ -126,11 +126,10 @@ class SearchContext:
         validation: tuple[str, ...],
     ) -> TrainingRequest:
         """Request a training; sessions of `validation` select the best of several epochs, and nothing for one epoch."""
-        sessions = (arm.tables, self.source, train, judged)
-        if self.spec.epochs == 1:
-            return TrainingRequest(*sessions, seed, updates)
         epochs, patience = self.spec.epochs, self.spec.patience
-        return TrainingRequest(*sessions, seed, updates, epochs=epochs, patience=patience, validation=validation)
+        chosen_by = validation if epochs > 1 else ()
+        sessions = (arm.tables, self.source, train, judged)
+        return TrainingRequest(*sessions, seed, updates, epochs=epochs, patience=patience, validation=chosen_by)
 
     def seed(self, *parts: object) -> int:
         """Return a seed for each purpose, derived from the root."""

@@ -14,6 +14,7 @@ from edp.networks.heads import GluHead
 from edp.networks.losses import Correlation
 from edp.networks.predictor import check_combination
 from edp.registry import Registry
+from edp.settings.tree import value_at, with_value
 from edp.workflows.search.arms import Arm
 from edp.workflows.search.space import Choice, Value
 
@@ -223,7 +224,7 @@ class _Option:
             return arm.with_value(self.path, plain)
         blocks = list(arm["model.blocks"])
         index = next(i for i, block in enumerate(blocks) if block["kind"] == self.kind)
-        blocks[index] = Arm(blocks[index]).with_value(self.path, plain).tables
+        blocks[index] = with_value(blocks[index], self.path, plain)
         return arm.with_value("model.blocks", blocks)
 
 
@@ -231,18 +232,18 @@ def _options(arm: Arm, name: str, shape: Shape | None = None) -> dict[str, _Opti
     module, options = part_of(name), {}
     if not module.options:
         return {}  # a search asks for those of every module thousands of times
-    part = Arm(plain_tree(_added(arm, {name}).experiment(f"with {name}")))
+    whole = Arm(plain_tree(_added(arm, {name}).experiment(f"with {name}")))
     if shape is not None:
-        part = shape(part)
-    kind = None if module.block is None else module.block["kind"]
+        whole = shape(whole)
+    part, kind = whole.tables, None if module.block is None else module.block["kind"]
     if kind is not None:
-        part = Arm(next(block for block in part["model.blocks"] if block["kind"] == kind))
+        part = next(block for block in whole["model.blocks"] if block["kind"] == kind)
     for path, values in module.options.items():
-        present = _label(part[path])
+        present = _label(value_at(part, path))
         # A value of the settings outside of the searched ones stays possible.
         labelled = {_label(value): value for value in values}
         if present not in labelled:
-            labelled = {present: part[path], **labelled}
+            labelled = {present: value_at(part, path), **labelled}
         options[f"{name}.{path.rpartition('.')[2]}"] = _Option(labelled, present, path, kind)
     return options
 
@@ -269,7 +270,7 @@ def conflicts(arm: Arm, names: Iterable[str], channels: Sequence[str] = ()) -> l
     reasons = []
     for (one, first), (other, second) in combinations(chosen, 2):
         mine, theirs = dict(_leaves(first.change)), dict(_leaves(second.change))
-        both = sorted(".".join(path) for path in mine.keys() & theirs.keys() if mine[path] != theirs[path])
+        both = sorted(path for path in mine.keys() & theirs.keys() if mine[path] != theirs[path])
         if both:
             reasons.append(f"'{one}' and '{other}' both set {', '.join(both)}; keep one of them")
     if reasons:
@@ -317,9 +318,9 @@ def _added(arm: Arm, names: set[str]) -> Arm:
     return arm
 
 
-def _leaves(table: Mapping[str, object], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+def _leaves(table: Mapping[str, object], before: str = "") -> Iterator[tuple[str, object]]:
     for key, value in table.items():
         if isinstance(value, Mapping):
-            yield from _leaves(value, (*path, key))
+            yield from _leaves(value, f"{before}{key}.")
         else:
-            yield (*path, key), value
+            yield f"{before}{key}", value

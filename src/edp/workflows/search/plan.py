@@ -24,7 +24,7 @@ from edp.data.features import FEATURE_SETS
 from edp.errors import ConfigError, closest
 from edp.evaluation.controller import load_budget
 from edp.settings.bounds import shown
-from edp.settings.tree import combined
+from edp.settings.tree import combined, value_at, with_value
 from edp.storage import parse_toml
 from edp.workflows.search.arms import Arm
 from edp.workflows.search.phases.isolation import DEFAULT_BACKBONE, arm_of
@@ -95,9 +95,8 @@ def load_plan(path: str | Path | None = None, preset: str = "quick", overrides: 
 
 def _with_task(search: Mapping[str, object], table: Mapping[str, object], experiment: Experiment) -> dict[str, object]:
     """Use the feature set and the horizon of the task if ``[search]`` does not set them."""
-    completed, task = dict(search), table.get("task")
-    if "features" not in search and isinstance(task, Mapping) and "features" in task:
-        features = task["features"]
+    completed, features = dict(search), value_at(table, "task.features")
+    if "features" not in search and features is not None:
         own = features if isinstance(features, str) else experiment.task.features
         completed["features"] = [own if isinstance(own, str) else plain_tree(own)]
     horizons = experiment.task.horizons
@@ -108,23 +107,17 @@ def _with_task(search: Mapping[str, object], table: Mapping[str, object], experi
 
 def _with_files(table: Mapping[str, object], folder: Path) -> dict[str, object]:
     """`table` with the feature sets and the budget that it names by files."""
-    resolved, search = with_set_file(table, folder), table.get("search")
-    if not isinstance(search, Mapping):
-        return resolved
-    compression = search.get("compression")
-    if isinstance(compression, Mapping) and isinstance(compression.get("budget"), str):
-        search = {
-            **search,
-            "compression": {**compression, "budget": asdict(load_budget(folder / compression["budget"]))},
-        }
-        resolved = {**resolved, "search": search}
-    if not isinstance(search.get("features"), list):
-        return resolved
-    sets = [
-        build(FeatureSettings, read_set_table(folder / one), f"'{folder / one}'") if is_set_file(one) else one
-        for one in search["features"]
-    ]
-    return {**resolved, "search": {**search, "features": sets}}
+    resolved = with_set_file(table, folder)
+    budget, features = (value_at(table, f"search.{key}") for key in ("compression.budget", "features"))
+    if isinstance(budget, str):
+        resolved = with_value(resolved, "search.compression.budget", asdict(load_budget(folder / budget)))
+    if isinstance(features, list):
+        sets = [
+            build(FeatureSettings, read_set_table(folder / one), f"'{folder / one}'") if is_set_file(one) else one
+            for one in features
+        ]
+        resolved = with_value(resolved, "search.features", sets)
+    return resolved
 
 
 def _check_parts(spec: SearchSpec, base: Arm, where: str) -> None:

@@ -119,7 +119,9 @@ def run_search(
     check_uncoordinated(Path(folder) / "ledger")
     # Before anything is made on disk: what is refused leaves no folder.
     recordings = source.read()
-    parts = None if is_enough(len(recordings), plan.spec) else divide_logs(source, recordings, _gap(plan))
+    # Samples that a prediction reads and looks ahead.
+    reach = plan.experiment.model.window + max(plan.experiment.task.horizons)
+    parts = None if is_enough(len(recordings), plan.spec) else divide_logs(source, recordings, reach)
     data = _Data.of(recordings if parts is None else parts.recordings, plan)
     development, test, second = set_apart(data.names, data.families, plan.spec)
     target = make_folder(folder)
@@ -200,11 +202,6 @@ class _Data:
         hours = sum(recording.duration_s for recording in recordings) / 3600
         digests = {recording.name: recording.digest for recording in recordings}
         return _Data(names, families, recordings[0].channel_names, state.hexdigest(), hours, unit, digests)
-
-
-def _gap(plan: SearchPlan) -> int:
-    """Return the samples that a prediction reads and looks ahead: window plus largest horizon."""
-    return plan.experiment.model.window + max(plan.experiment.task.horizons)
 
 
 class _Observer:

@@ -23,7 +23,7 @@ from edp.data.splits import ByTime
 from edp.data.task import Task
 from edp.errors import BundleError, ConfigError, EdpError
 from edp.networks.predictor import Predictor
-from edp.settings.tree import combined
+from edp.settings.tree import combined, value_at
 from edp.storage.paths import is_file_at
 from edp.training import Bundle, load_bundle
 from edp.training.bundle import weights_digest
@@ -129,10 +129,7 @@ def _check_kept(layer: Mapping[str, object]) -> None:
                 "changed, and those of finetune"
             )
     for path in OWN:
-        value: object = layer
-        for key in path.split("."):
-            value = value.get(key) if isinstance(value, dict) else None
-        if value is not None:
+        if value_at(layer, path) is not None:
             raise ConfigError(f"{path}: a fine-tuning has settings of its own for it, in its table [finetune]")
 
 

@@ -48,7 +48,7 @@ class Confirmation:
                 confirmed=(), evidence=()
             )
             return Decision("confirmation", facts, ("No module passed the screening.",))
-        base = baseline_of(context)[0]
+        base = baseline_of(context).arm
         arms = [base, *(context.network(base, [name]) for name in passed)]
         return (yield from (_thesis if context.spec.mode == "thesis" else _sound)(context, passed, arms))
 

@@ -35,7 +35,7 @@ class Exploration:
     def run(self, context: SearchContext) -> Course:
         """Ask about all modules and options of active ones; train both winners on fresh folds with equal seeds."""
         spec = context.spec
-        base = baseline_of(context)[0]
+        base = baseline_of(context).arm
         free = fitting(base, context.channels, spec.modules)
         earlier = context.facts(SynthesisFacts)
         # The winner of phase 4 is the warm start: phase 5 is to find at least that.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,12 +41,21 @@ class ModuleScreening:
         return (yield from (_thesis(context) if context.spec.mode == "thesis" else _sound(context)))
 
 
-def baseline_of(context: SearchContext) -> tuple[Arm, Candidate, Space]:
-    """Return the baseline and its values, and the window around them for the tuning of candidates."""
+class TunedBaseline(NamedTuple):
+    """Winner of phase 1, its values, and the window around them for the tuning of candidates."""
+
+    arm: Arm
+    values: Candidate
+    window: Space
+
+
+def baseline_of(context: SearchContext) -> TunedBaseline:
+    """Return the baseline of the later phases."""
     facts = context.facts(CalibrationFacts)
     space = {name: dimension for name, dimension in context.spec.space.items() if name in context.spec.elastic}
     beyond = context.spec.mode == "thesis"
-    return Arm(facts.settings), facts.baseline, elastic(space, facts.baseline, context.spec.elastic, beyond)
+    window = elastic(space, facts.baseline, context.spec.elastic, beyond)
+    return TunedBaseline(Arm(facts.settings), facts.baseline, window)
 
 
 def _sound(context: SearchContext) -> Course:

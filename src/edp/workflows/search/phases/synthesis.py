@@ -58,7 +58,9 @@ class Synthesis:
         if facts.antagonistic:
             left = ", ".join(map(title_of, facts.antagonistic))
             sentences.append(f"Confirmed alone, but not wanted together: {left}.")
-        ours, base = (_shown(facts.test[arm]["composite"], context.unit) for arm in ("synthesis", "baseline"))
+        scores = (facts.test[arm]["composite"] for arm in ("synthesis", "baseline"))
+        failed, unit = "no score, since a training failed", behind(context.unit)
+        ours, base = (failed if score is None else typed(score, 3) + unit for score in scores)
         gain = facts.test_gain
         interval = "" if gain is None else f"; {percent(gain.change, signed=True)}, p {typed(gain.p, 2)}"
         sentences.append(
@@ -111,10 +113,6 @@ def gained(context: SearchContext, outcomes: Sequence[Outcome]) -> RelativeChang
     if min(arms.shape[1:]) < 2 or not np.isfinite(arms).all():
         return None
     return relative_change(clustered_t(arms[0] - arms[1]), float(arms[1].mean()))
-
-
-def _shown(score: float | None, unit: str) -> str:
-    return "no score, since a training failed" if score is None else typed(score, 3) + behind(unit)
 
 
 PHASES.register("synthesis")(Synthesis())
