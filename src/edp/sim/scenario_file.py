@@ -57,7 +57,7 @@ def read_scenario_file(path: str | Path) -> dict[str, object]:
     """
     table = _table(path)
     settings = SCENARIO_FILE.build(ScenarioFile, table, str(path))
-    return _stated(settings, table)
+    return _split_settings(settings, table)
 
 
 def scenario_changes(overrides: Sequence[str]) -> dict[str, object]:
@@ -66,8 +66,8 @@ def scenario_changes(overrides: Sequence[str]) -> dict[str, object]:
     Raises:
         ConfigError: a key that a scenario file does not have, or a value of another kind.
     """
-    table = _merged(overrides)
-    return _stated(SettingsTree().build(_CHANGES, table, "--set"), table)
+    table = _merge_overrides(overrides)
+    return _split_settings(SettingsTree().build(_CHANGES, table, "--set"), table)
 
 
 def limit_settings(path: str | Path | None, overrides: Sequence[str]) -> LimitSpec:
@@ -76,16 +76,16 @@ def limit_settings(path: str | Path | None, overrides: Sequence[str]) -> LimitSp
     Raises:
         ConfigError: a key or value that cannot be.
     """
-    table = merged({} if path is None else _table(path), _merged(overrides))
+    table = merged({} if path is None else _table(path), _merge_overrides(overrides))
     return SettingsTree().build(LimitSpec, table.get("limit", {}), "[limit]", "limit")
 
 
 def _table(path: str | Path) -> dict[str, object]:
     source = Path(path)
-    return _resolved(read_toml(source, f"scenario file {source}", ConfigError), source.parent)
+    return _resolve_paths(read_toml(source, f"scenario file {source}", ConfigError), source.parent)
 
 
-def _merged(overrides: Sequence[str]) -> dict[str, object]:
+def _merge_overrides(overrides: Sequence[str]) -> dict[str, object]:
     return combined([override(text) for text in overrides])
 
 
@@ -94,7 +94,7 @@ def suffix_of(form: str) -> str:
     return f".{form.lstrip('.')}"
 
 
-def _stated(settings: Any, table: Mapping[str, object]) -> dict[str, object]:
+def _split_settings(settings: Any, table: Mapping[str, object]) -> dict[str, object]:
     """Return the stated values of the data set and of the write options."""
     values = {key: getattr(settings, key) for key in table if key not in ("files", "limit")}
     files = {} if settings.files is None else SCENARIO_FILE.plain(settings.files)
@@ -103,7 +103,7 @@ def _stated(settings: Any, table: Mapping[str, object]) -> dict[str, object]:
     return values | files
 
 
-def _resolved(table: Mapping[str, object], folder: Path) -> dict[str, object]:
+def _resolve_paths(table: Mapping[str, object], folder: Path) -> dict[str, object]:
     """Return the table with absolute paths of machine and material files."""
     resolved = dict(table)
     machine, materials = table.get("machine"), table.get("materials")

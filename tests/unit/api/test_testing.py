@@ -24,7 +24,7 @@ from edp.networks.streaming import Cost, Streaming
 from edp.registry import Registry
 from edp.signals import Kind
 from edp.workflows.search.arms import Arm
-from edp.workflows.search.modules import MODULES, fitting, with_modules
+from edp.workflows.search.modules import MODULES, add_modules, fitting
 
 
 def entered(monkeypatch, registry: Registry, name: str, part: object) -> object:
@@ -100,7 +100,7 @@ def test_a_sound_block_of_a_third_party_passes(monkeypatch):
     assert MODULES["gain"].options == {"strength": [1.0, 2.0]}
     arm = Arm.from_experiment(load_experiment(None, "quick", ["model.blocks=[]"]))
     assert fitting(arm)[-1] == "gain"
-    assert with_modules(arm, ["gain"])["model.blocks"] == [{"kind": "gain"}]
+    assert add_modules(arm, ["gain"])["model.blocks"] == [{"kind": "gain"}]
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from noted_progress import NotedProgress
 from ray_nodes import needs_ray, three_nodes
+from read_progress_notes import NotedProgress
 
 import edp.jobs.cluster
 from edp.errors import ConfigError

@@ -31,6 +31,7 @@ from edp.logs.store.index import (
     StoreEntry,
     StoreIndex,
     check_places,
+    check_seal,
     index_of,
     is_store,
     listed,
@@ -38,7 +39,6 @@ from edp.logs.store.index import (
     read_index,
     rows_path,
     stamped,
-    without_seal,
     write_plain,
 )
 from edp.progress import SILENT, Progress
@@ -169,16 +169,16 @@ def build_store(
         check_writable(make_folder(top / ROWS))
         remove_unfinished(top / ROWS)
         remove_unfinished(top)
-        return _built({log.key: log for log in logs}, top, workers, progress)
+        return _build_index({log.key: log for log in logs}, top, workers, progress)
     finally:
         release(top / LOCK, lock) if is_file_at(top / INDEX) else lock.close()
 
 
-def _built(logs: dict[str, StoredLog], top: Path, workers: Workers, progress: Progress) -> StoreIndex:
+def _build_index(logs: dict[str, StoredLog], top: Path, workers: Workers, progress: Progress) -> StoreIndex:
     before = read_index(top) if is_file_at(top / INDEX) else StoreIndex()
-    index = _without_replaced(_without_lost(before, top), logs)
+    index = _drop_replaced(_drop_lost(before, top), logs)
     for batch_index in _records_beside(top, index):
-        index = _with_record(index, batch_index, logs)
+        index = _add_record(index, batch_index, logs)
     stored = {entry.log_key for entry in index.recordings}
     index = replace(index, refused=())
     missing = {key: log for key, log in logs.items() if key not in stored}
@@ -201,17 +201,17 @@ def _built(logs: dict[str, StoredLog], top: Path, workers: Workers, progress: Pr
         refused += len(indices[number].refused)
         read.step(done, refused=refused)
     for number in range(len(batches)):
-        index = _with_record(index, indices[number], logs)
+        index = _add_record(index, indices[number], logs)
     order = {key: number for number, key in enumerate(logs)}
     # As the logs are in order; those of earlier builds first.
     recordings = sorted(index.recordings, key=lambda entry: order.get(entry.log_key, -1))
-    index = _in_order(replace(index, recordings=tuple(recordings)))
+    index = _sort_index(replace(index, recordings=tuple(recordings)))
     write_plain(top / INDEX, plain_index(index))
     _remove_unused(top, index)
     return index
 
 
-def _in_order(index: StoreIndex) -> StoreIndex:
+def _sort_index(index: StoreIndex) -> StoreIndex:
     """Return the index with files and lists of channels in the order of the recordings, whoever read first."""
     files = {file.key: file for file in index.files}
     used = dict.fromkeys(entry.rows for entry in index.recordings)
@@ -224,7 +224,7 @@ def _in_order(index: StoreIndex) -> StoreIndex:
     return replace(index, lists=tuple(lists), files=rows, recordings=tuple(recordings))
 
 
-def _without_replaced(index: StoreIndex, logs: dict[str, StoredLog]) -> StoreIndex:
+def _drop_replaced(index: StoreIndex, logs: dict[str, StoredLog]) -> StoreIndex:
     """Return the index without recordings whose log was changed or is read with other options."""
     paths = {log.where for log in logs.values()}
     unchanged = tuple(entry for entry in index.recordings if entry.log not in paths or entry.log_key in logs)
@@ -232,7 +232,7 @@ def _without_replaced(index: StoreIndex, logs: dict[str, StoredLog]) -> StoreInd
     return replace(index, recordings=unchanged, files=tuple(file for file in index.files if file.key in used))
 
 
-def _without_lost(index: StoreIndex, top: Path) -> StoreIndex:
+def _drop_lost(index: StoreIndex, top: Path) -> StoreIndex:
     """Return the index without recordings whose data file is missing or truncated; their logs are read again."""
     whole = {file.key for file in index.files if _size(rows_path(top, file.key)) == file.bytes}
     recordings = tuple(entry for entry in index.recordings if entry.rows in whole)
@@ -298,7 +298,7 @@ def store_batch(batch: LogBatch) -> dict[str, object]:
             at = stream.tell()
             try:
                 with nullcontext(log.path) if log.remote is None else copied(log.remote) as near:
-                    entry, channels = _stored(replace(log, path=near), key, batch.key, first, stream.write)
+                    entry, channels = _store_log(replace(log, path=near), key, batch.key, first, stream.write)
                 # What a recording says of its source must not be the copy, which is gone.
                 entry = replace(
                     entry,
@@ -331,7 +331,7 @@ def store_batch(batch: LogBatch) -> dict[str, object]:
     return record
 
 
-def _stored(
+def _store_log(
     log: StoredLog, key: str, rows: str, first: int, write: Callable[[Any], object]
 ) -> tuple[StoreEntry, tuple[Channel, ...]]:
     """Write the samples of a log and return its index entry."""
@@ -348,7 +348,7 @@ def _stored(
     for part in parts(assembly, PART_SAMPLES, name):
         digest.update(part.values)
         write(np.ascontiguousarray(part.values, dtype="<f4").data)
-        source, meta = part.source, _merged_meta(meta, part.meta)
+        source, meta = part.source, _merge_meta(meta, part.meta)
     _check_digest(assembly, digest.text)
     if log.machine:
         meta[MACHINE] = log.machine
@@ -368,7 +368,7 @@ def _stored(
     return entry, channels
 
 
-def _merged_meta(meta: Mapping[str, object], part: Mapping[str, object]) -> dict[str, object]:
+def _merge_meta(meta: Mapping[str, object], part: Mapping[str, object]) -> dict[str, object]:
     """Merge the metadata of a log with those of one more part; each repair occurs once."""
     repairs = repairs_of(meta)
     repairs += [repair for repair in repairs_of(part) if repair not in repairs]
@@ -393,14 +393,14 @@ def _records_beside(top: Path, index: StoreIndex) -> Iterator[StoreIndex]:
         with suppress(DataError):
             table = parse_json(read_text(path, BATCH_BYTES, where, DataError), where, DataError)
             record = object_with(table, ("files", "recordings"), where, DataError)
-            record = without_seal(record, where)
+            record = check_seal(record, where)
             batch = index_of(record, where)
             check_places(batch, where)
             if [(file.key, file.bytes) for file in batch.files] == [(path.stem, _size(rows_path(top, path.stem)))]:
                 yield batch
 
 
-def _with_record(index: StoreIndex, batch: StoreIndex, logs: dict[str, StoredLog]) -> StoreIndex:
+def _add_record(index: StoreIndex, batch: StoreIndex, logs: dict[str, StoredLog]) -> StoreIndex:
     """Return the index extended by the requested recordings of a batch."""
     lists = list(index.lists)
     recordings = list(index.recordings)

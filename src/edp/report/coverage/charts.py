@@ -22,7 +22,7 @@ from edp.report.common.chart import (
     Mark,
     Panel,
     Texts,
-    with_unit,
+    append_unit,
 )  # fmt: skip
 from edp.wording import figure, label_by_name
 
@@ -135,8 +135,8 @@ def joint_chart(coverage: Coverage, group: str) -> Chart | None:
         cells = _cells(x, y, share, top, "% of the samples", "{x:.4g}, {y:.4g}: {label:.3f} %")
         title = f"correlation {joint.correlation:.2f}, {joint.information:.2f} nat".replace("-", "−")
         panels.append(Panel(
-            (replace(cells, barred=len(panels) == 0),), ChartAxis(with_unit(names[joint.x], joint.x_unit)),
-            ChartAxis(with_unit(names[joint.y], joint.y_unit), grid=False), title,
+            (replace(cells, barred=len(panels) == 0),), ChartAxis(append_unit(names[joint.x], joint.x_unit)),
+            ChartAxis(append_unit(names[joint.y], joint.y_unit), grid=False), title,
         ))  # fmt: skip
     height = 60 + 270 * -(-len(joints) // columns)
     return Chart(GROUPS[group], tuple(panels), columns=columns, height=height, legend="none")

@@ -150,7 +150,7 @@ def title_of(name: str) -> str:
     return part_of(name).title
 
 
-def with_modules(
+def add_modules(
     arm: Arm,
     names: Iterable[str],
     channels: Sequence[str] = (),
@@ -174,7 +174,7 @@ def with_modules(
     reasons = conflicts(arm, module_names, channels)
     if reasons:
         raise ConfigError("modules: " + "; ".join(reasons))
-    changed = _added(arm, module_names)
+    changed = _add_modules(arm, module_names)
     if shape is not None:
         changed = shape(changed)
     for name in (name for name in MODULES if name in module_names):
@@ -194,7 +194,7 @@ def options_of(arm: Arm, name: str, shape: Shape | None = None) -> dict[str, Cho
     Args:
         arm: to which the module would be added; what it would have there is one of the values.
         name: of the module, or of a toggle, which has none.
-        shape: as in `with_modules`.
+        shape: as in `add_modules`.
     """
     options = {key: tuple(option.values) for key, option in _options(arm, name, shape).items()}
     return {key: Choice(values) for key, values in options.items() if len(values) > 1}
@@ -232,7 +232,7 @@ def _options(arm: Arm, name: str, shape: Shape | None = None) -> dict[str, _Opti
     module, options = part_of(name), {}
     if not module.options:
         return {}  # a search asks for those of every module thousands of times
-    whole = Arm(plain_tree(_added(arm, {name}).experiment(f"with {name}")))
+    whole = Arm(plain_tree(_add_modules(arm, {name}).experiment(f"with {name}")))
     if shape is not None:
         whole = shape(whole)
     part, kind = whole.tables, None if module.block is None else module.block["kind"]
@@ -277,7 +277,9 @@ def conflicts(arm: Arm, names: Iterable[str], channels: Sequence[str] = ()) -> l
         return reasons
     try:
         # Building the experiment is the rule: every part knows its own conflicts.
-        experiment = _added(arm, module_names).experiment("with " + (", ".join(sorted(module_names)) or "no modules"))
+        experiment = _add_modules(arm, module_names).experiment(
+            "with " + (", ".join(sorted(module_names)) or "no modules")
+        )
         # Conflicts do not depend on the rate; 100 Hz is the thesis's.
         task = experiment.task.resolve(100.0, channels, physics=experiment.model.physics)
         check_combination(task, experiment.model)
@@ -294,7 +296,7 @@ def fitting(arm: Arm, channels: Sequence[str] = (), among: Sequence[str] = ()) -
         channels: of the recordings, for the feature set ``all``.
         among: names of those that are asked about; empty for all.
     """
-    free = (name for name in MODULES if (not among or name in among) and _added(arm, {name}) != arm)
+    free = (name for name in MODULES if (not among or name in among) and _add_modules(arm, {name}) != arm)
     return tuple(name for name in free if not conflicts(arm, (name,), channels))
 
 
@@ -304,7 +306,7 @@ def contradicting(arm: Arm, names: Iterable[str], channels: Sequence[str] = ()) 
     return frozenset(frozenset(pair) for pair in pairs if conflicts(arm, pair, channels))
 
 
-def _added(arm: Arm, names: set[str]) -> Arm:
+def _add_modules(arm: Arm, names: set[str]) -> Arm:
     for name, module in (*MODULES.items(), *TOGGLES.items()):
         if name not in names:
             continue
