@@ -23,13 +23,14 @@ from common import DATA_AND_PARTS, Bench, Verdict, benchmark, option, table, ver
 from decoys import FAMILIES, Decoy, lay_decoys
 from edp.config.experiment import FeatureSettings, load_experiment
 from edp.data.screening import FlagKind, ScreeningResult, ScreeningSpec, screen
+from edp.evaluation.trials_file import Trials
 from edp.logs import write_recording
 from edp.logs.source import DataSource
 from edp.recording import Recording
 from edp.signals import TABLE_A1, ChannelMap, SignalMap
 from edp.sim import simulate_many
 from edp.sim.data_set import SimulationOrder
-from edp.workflows.feature_selection.trials import Trials, TrialSpec, add_differences, try_feature_sets
+from edp.workflows.feature_selection.trials import TrialSpec, add_differences, try_feature_sets
 from edp.workflows.train_evaluate import channel_importance
 from m22_truth import Cause, causes
 from screening_thesis import TARGETS, only_table_a1
@@ -200,7 +201,7 @@ def main(bench: Bench) -> object:
     drawn = min(value for name, value in errors.items() if name.startswith("random"))
     bench.check("MAE of the proposal against FG1", errors["proposed"], errors["FG1"], "<= 1.05", trials.unit)
     bench.check("MAE of the proposal against the best random set", errors["proposed"], drawn, "<= 0.9", trials.unit)
-    details |= {"trials": trials.to_json(), "importances": importances}
+    details |= {"trials": trials.to_table(), "importances": importances}
     return details
 
 

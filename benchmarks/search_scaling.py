@@ -21,11 +21,13 @@ from edp.jobs.base import Job, complete
 from edp.jobs.processes import LocalPool
 from edp.storage.ledger import Ledger, Record, TrainingIdentity, TrainingStatus, digest_of
 from edp.storage.provenance import environment
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.jobs import job_of
-from edp.workflows.search.trainings import TrainingRequest, settings_of
+from edp.workflows.search.trainings import TrainingRequest
 from edp.workflows.train_evaluate import DataSource, SimulationOrder, simulate_data_set
 
 OPEN_S, SHARE, SPEEDUP = 1.0, 0.02, 1.8
+SETTINGS = Arm.from_experiment(load_experiment(None, "quick")).tables
 HORIZONS, SCORES, SESSIONS = ("1", "10"), ("mae", "rmse", "p95", "p99", "composite"), 5
 
 
@@ -33,10 +35,9 @@ def fill(folder: Path, count: int) -> None:
     """Records of the size that a search writes; not synced one by one, as they are only read."""
     with Ledger(folder):
         pass
-    settings, machine = settings_of(load_experiment(None, "quick")), environment(1)
+    config, machine = {"settings": SETTINGS, "updates": 800}, environment(1)
     for seed in range(count):
         split = {"train": [f"session {i}" for i in range(20)], "judged": [f"session {i}" for i in range(20, 25)]}
-        config = {"settings": settings, "updates": 800}
         identity = TrainingIdentity("edp.workflows.search.jobs:train", config, split, seed, 1, "code", "data", machine)
         scores = {name: seed / (7 + i) for i, name in enumerate(SCORES)}
         result = {"sessions": {name: dict.fromkeys(HORIZONS, scores) for name in split["judged"]}, "scores": scores}
@@ -63,12 +64,11 @@ def orders(data: Path, count: int, updates: int, first_seed: int) -> list[Job]:
     recordings = source.read()
     digest = digest_of(sorted(recording.digest for recording in recordings))
     names = [recording.name for recording in recordings]
-    settings = settings_of(load_experiment(None, "quick"))
     found = []
     for number in range(count):
         judged = (names[number % len(names)],)
         train = tuple(name for name in names if name not in judged)
-        order = TrainingRequest(settings, source.to_plain(), train, judged, first_seed + number, updates)
+        order = TrainingRequest(SETTINGS, source.to_plain(), train, judged, first_seed + number, updates)
         found.append(job_of(order, digest))
     return found
 

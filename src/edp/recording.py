@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError, closest
-from edp.settings.tree import Table
 from edp.signals import Channel
 
 FloatArray = NDArray[np.float32]
@@ -68,7 +67,7 @@ class Recording:
     values: FloatArray
     rate_hz: float
     source: str = ""
-    meta: Table = field(default_factory=dict)
+    meta: Mapping[str, object] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.values.ndim != 2 or self.values.shape[1] != len(self.channels):

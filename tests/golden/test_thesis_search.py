@@ -1,6 +1,5 @@
 """The search of the thesis: what `--preset thesis` can reach and does, against the text and its printed figures."""
 
-import copy
 import dataclasses
 import itertools
 import re
@@ -10,11 +9,12 @@ import numpy as np
 import pytest
 
 from edp.errors import ConfigError
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.engine import run_phases
 from edp.workflows.search.modules import THESIS_MODULES, TOGGLES, fitting
 from edp.workflows.search.phases import PHASES
-from edp.workflows.search.phases.isolation import arm_settings
+from edp.workflows.search.phases.isolation import arm_of
 from edp.workflows.search.plan import load_plan
 from edp.workflows.search.settings import (
     CalibrationSpec,
@@ -23,7 +23,7 @@ from edp.workflows.search.settings import (
     TrialsSpec,
 )
 from edp.workflows.search.space import Choice, Real, apply, elastic, halved
-from edp.workflows.search.trainings import SCORES, Outcome, costs_of, settings_of
+from edp.workflows.search.trainings import SCORES, Outcome, costs_of
 
 PLAN = load_plan(None, "thesis")
 DOC = Path(__file__).parents[2] / "docs/thesis_preset.md"
@@ -32,7 +32,7 @@ SESSIONS = tuple(f"s{number:02d}" for number in range(31))
 
 def context(**changes):
     spec = dataclasses.replace(PLAN.spec, **changes)
-    return SearchContext(spec, settings_of(PLAN.experiment), {"path": "nowhere"}, SESSIONS[:25], SESSIONS[25:])
+    return SearchContext(spec, Arm.from_experiment(PLAN.experiment), {"path": "nowhere"}, SESSIONS[:25], SESSIONS[25:])
 
 
 def network(values, modules=(), options=None):
@@ -87,9 +87,9 @@ def test_widths_halve_and_the_baseline_is_that_of_table_4_8():
 def test_every_point_of_the_space_makes_a_network_of_every_backbone():
     held = context()
     for backbone in PLAN.spec.backbones:
-        arm = copy.deepcopy(held.base)
+        arm = held.base
         if backbone != "hybrid":
-            arm = arm_settings(held.base, backbone, "FG2")
+            arm = arm_of(held.base, backbone, "FG2")
         for layers, kernel in itertools.product((1, 2, 3, 4), (3, 5, 7)):
             made = held.shaped(
                 apply(arm, {"units": 64, "layers": layers, "kernel": kernel} if backbone != "lstm" else {})
@@ -301,7 +301,7 @@ def test_only_phase_1_is_pruned_and_phase_4_begins_without_a_warm_start(walked):
     on = found.decided["synthesis"].to_json()["facts"]["on"]
     assert set(PLAN.spec.toggles) <= set(on)
     assert set(on) - set(PLAN.spec.toggles) == set(found.decided["confirmation"].to_json()["facts"]["confirmed"])
-    registered = fitting(found.decided["calibration"].to_json()["facts"]["settings"], among=PLAN.spec.modules)
+    registered = fitting(Arm(found.decided["calibration"].facts.settings), among=PLAN.spec.modules)
     assert set(found.decided["exploration"].to_json()["facts"]["on"]) == {*registered, *PLAN.spec.toggles}
     first = found.decided["exploration"].to_json()["facts"]["trials"][0]
     earlier = found.decided["synthesis"].to_json()["facts"]

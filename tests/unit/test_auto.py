@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from noted_progress import NotedProgress
+from read_progress_notes import NotedProgress
 
 from edp.data.splits import SPLITS
 from edp.errors import ConfigError, DataError, StorageError
@@ -293,15 +293,14 @@ def test_spans_grow_with_the_horizon_as_far_as_the_data_allow():
     assert spans_of(amount).smoothed == [4, 8, 16, 32]
     assert spans_of(replace(amount, horizon=100)).lags[-1] == 256
     assert spans_of(replace(amount, shortest=80)).lags[-1] == 8
-    assert CANDIDATES["recurrent"].tables(replace(amount, rows=5000)) is None
-    assert CANDIDATES["recurrent"].tables(replace(amount, shortest=140)) is not None
-    assert CANDIDATES["recurrent"].tables(replace(amount, shortest=140, horizon=100)) is None
-    parts = CANDIDATES["committee"].tables(amount)["model"]["backbone"]
-    assert parts["near"] == []
-    parts = CANDIDATES["committee"].tables(replace(amount, rows=5000, shortest=40))["model"]["backbone"]
-    assert (parts["lags"], parts["near"]) == ([1, 2, 3, 4], [0, 1, 2, 4])
+    assert CANDIDATES["recurrent"].plan(replace(amount, rows=5000)) is None
+    assert CANDIDATES["recurrent"].plan(replace(amount, shortest=140)) is not None
+    assert CANDIDATES["recurrent"].plan(replace(amount, shortest=140, horizon=100)) is None
+    assert CANDIDATES["committee"].plan(amount).model.backbone.near == ()
+    backbone = CANDIDATES["committee"].plan(replace(amount, rows=5000, shortest=40)).model.backbone
+    assert (backbone.lags, backbone.near) == ((1, 2, 3, 4), (0, 1, 2, 4))
     steps = [
-        CANDIDATES["committee"].tables(replace(amount, minutes=minutes))["training"]["bagging"]["steps"]
+        CANDIDATES["committee"].plan(replace(amount, minutes=minutes)).training.bagging.steps
         for minutes in (0.01, 1.0, 100.0)
     ]
     assert steps == sorted(steps)

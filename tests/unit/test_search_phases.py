@@ -10,6 +10,7 @@ import pytest
 from edp.config.experiment import load_experiment, plain_tree
 from edp.errors import ConfigError, DataError
 from edp.evaluation.controller import Budget
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.context import SearchContext, set_apart
 from edp.workflows.search.engine import run_phases
 from edp.workflows.search.modules import THESIS_MODULES
@@ -26,7 +27,7 @@ from edp.workflows.search.settings import (
 from edp.workflows.search.smaller import Recipe
 from edp.workflows.search.space import Choice, Real
 from edp.workflows.search.study import SamplerSpec
-from edp.workflows.search.trainings import SCORES, Outcome, settings_of
+from edp.workflows.search.trainings import SCORES, Outcome
 
 pytestmark = pytest.mark.long
 
@@ -44,7 +45,7 @@ SPEC = SearchSpec(
 
 
 def context(spec=SPEC):
-    base = settings_of(load_experiment(None, "quick", ["model.blocks=[]", "model.backbone.units=4"]))
+    base = Arm.from_experiment(load_experiment(None, "quick", ["model.blocks=[]", "model.backbone.units=4"]))
     return SearchContext(spec, base, {"path": "nowhere"}, SESSIONS[:9], SESSIONS[9:11], second=SESSIONS[11:])
 
 
@@ -160,7 +161,7 @@ class OneFoldMisleads(World):
 
     def _train(self, order):
         found = super()._train(order)
-        easy = order.judged == context().orders({}, [0])[0].judged
+        easy = order.judged == context().orders(Arm(), [0])[0].judged
         if easy and order.settings["model"]["backbone"]["kind"] == "lstm":
             for scores in found.result["sessions"].values():
                 scores["10"] = {name: value - 2.0 for name, value in scores["10"].items()}

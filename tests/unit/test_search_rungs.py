@@ -13,12 +13,13 @@ from edp.errors import ConfigError
 from edp.evaluation.study import Decision
 from edp.evaluation.study_facts import IsolationFacts
 from edp.stats.variance import PairedVariance
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.engine import run_phases
 from edp.workflows.search.settings import CalibrationSpec, IsolationSpec, SearchSpec
 from edp.workflows.search.space import Choice, Real
 from edp.workflows.search.study import SamplerSpec, Study
-from edp.workflows.search.trainings import SCORES, Outcome, TrainingRequest, settings_of
+from edp.workflows.search.trainings import SCORES, Outcome, TrainingRequest
 
 pytestmark = pytest.mark.long
 
@@ -49,7 +50,7 @@ ISOLATION = Decision("isolation", FACTS, ())
 
 
 def context(**changes):
-    base = settings_of(load_experiment(None, "quick", ["model.blocks=[]", "model.backbone.units=4"]))
+    base = Arm.from_experiment(load_experiment(None, "quick", ["model.blocks=[]", "model.backbone.units=4"]))
     spec = dataclasses.replace(SPEC, **changes)
     return SearchContext(spec, base, {"path": "nowhere"}, SESSIONS[:9], SESSIONS[9:], decided={"isolation": ISOLATION})
 

@@ -8,10 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edp.config.experiment import Experiment, build, load_experiment, merged, plain_tree
+from edp.config.experiment import load_experiment, plain_tree
 from edp.errors import ConfigError
 from edp.networks.blocks import BLOCKS
 from edp.networks.predictor import check_combination
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.modules import MODULES, THESIS_MODULES, add_modules, conflicts, contradicting, fitting
 from edp.workflows.search.space import DIMENSIONS, THESIS, Choice, Real, applicable, apply, check, elastic, names
 
@@ -21,7 +22,7 @@ BACKBONES = ("hybrid", "lstm", "gru", "tcn")
 
 def settings(backbone="hybrid", *changes):
     overrides = ["model.blocks=[]", f'model.backbone={{kind="{backbone}"}}', *changes]
-    return plain_tree(load_experiment(None, "quick", overrides))
+    return Arm(plain_tree(load_experiment(None, "quick", overrides)))
 
 
 def listed():
@@ -32,7 +33,7 @@ def listed():
 @pytest.mark.parametrize(("title", "setting"), listed(), ids=lambda value: value if "=" not in value else "")
 def test_each_module_is_what_the_settings_page_says(title, setting):
     (name,) = [name for name, module in MODULES.items() if module.title == title]
-    made = build(Experiment, add_modules(settings(), [name]), "test")
+    made = add_modules(settings(), [name]).experiment()
     wanted = load_experiment(None, "quick", ["model.blocks=[]", 'model.backbone={kind="hybrid"}', setting])
     assert made == wanted
 
@@ -57,7 +58,7 @@ def test_modules_that_fit_can_be_built_in_any_pair_that_does_not_contradict(back
             with pytest.raises(ConfigError, match="modules: "):
                 add_modules(base, pair)
             continue
-        made = build(Experiment, add_modules(base, pair), "test")
+        made = add_modules(base, pair).experiment()
         check_combination(made.task.resolve(100.0, physics=made.model.physics), made.model)
 
 
@@ -76,7 +77,7 @@ def test_all_less_the_contradictions_go_together():
     made = add_modules(settings(), set(MODULES) - {"gru", "physics_residual"})
     kinds = [block["kind"] for block in made["model"]["blocks"]]
     assert sorted(kinds) == sorted(set(MODULES) & set(BLOCKS))
-    assert build(Experiment, made, "test").model.backbone.zoneout == 0.1
+    assert made.experiment().model.backbone.zoneout == 0.1
 
 
 @given(st.permutations(["squeeze_excitation", "temporal_difference", "glu_head", "stanh"]))
@@ -97,7 +98,7 @@ def test_contradictions_say_why():
 
 
 def test_the_feature_set_of_all_channels_needs_their_names():
-    every = merged(settings(), {"task": {"features": "all"}})
+    every = settings().with_value("task.features", "all")
     channels = load_experiment(None, "quick").task.resolve(100.0).features.channels
     assert fitting(every, channels) == tuple(MODULES)
     assert fitting(every) == ()
@@ -114,7 +115,7 @@ def test_every_corner_of_the_thesis_space_can_be_built(backbone):
             for name, held in space.items()
         }
         check(space, corner)
-        made = build(Experiment, apply(base, corner), "test")
+        made = apply(base, corner).experiment()
         assert made.training.optimizer.learning_rate == corner["learning_rate"]
         assert made.model.backbone.dropout == corner["dropout"]
         if backbone in ("tcn", "hybrid"):

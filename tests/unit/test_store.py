@@ -6,7 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
-from noted_progress import NotedProgress
+from read_progress_notes import NotedProgress
 
 from edp.data.features import FeatureSet
 from edp.data.prepared import prepare
@@ -314,9 +314,9 @@ def test_the_index_of_a_store_is_plain_json_of_its_schema(logs, tmp_path):
 
 def test_a_store_is_read_from_python_and_screened(logs, tmp_path):
     import edp
-    from edp.workflows.feature_selection.select import _read, _read_all_columns
+    from edp.workflows.feature_selection.select import _read
 
     build(logs, tmp_path / "store")
     assert_same(list(edp.read(tmp_path / "store")), read_data_set(logs))
     source = DataSource.of(tmp_path / "store")
-    assert_same(_read(_read_all_columns(source), source.inspect())[0], read_data_set(logs))
+    assert_same(_read(source, source.inspect())[0], read_data_set(logs))

@@ -8,13 +8,13 @@ import pytest
 from edp.config.experiment import FeatureSettings, load_experiment
 from edp.data.features import Derived
 from edp.errors import ConfigError
+from edp.evaluation.trials_file import PairedDifference
 from edp.logs import write_recording
 from edp.logs.source import DataSource
 from edp.recording import Recording
 from edp.signals import Channel, Kind
 from edp.storage import read_json
 from edp.workflows.feature_selection.trials import (
-    PairedDifference,
     TrialSpec,
     _difference,
     _drawn,
@@ -121,11 +121,11 @@ def test_what_could_not_be_tried_is_told(trials):
 
 
 def test_trials_are_kept(trials, source, experiment, folder):
-    assert read_json(folder / "trials.json") == json.loads(json.dumps(trials.to_json()))
+    assert read_json(folder / "trials.json") == json.loads(json.dumps(trials.to_table()))
     before = {path: path.stat().st_mtime_ns for path in folder.glob("*/history.jsonl")}
     assert len(before) == 8
     again = try_feature_sets(source, experiment, SETS, folder, TrialSpec(random=1, seeds=(0, 1), barred=("u", "p")))
-    assert again.to_json() == trials.to_json()
+    assert again.to_table() == trials.to_table()
     assert {path: path.stat().st_mtime_ns for path in folder.glob("*/history.jsonl")} == before
 
 

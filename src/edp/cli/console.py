@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
 from typing import Annotated, Any, cast
@@ -113,7 +113,7 @@ PATH_OPTIONS = frozenset(
 """Options of all commands that name a file or folder."""
 
 
-def emit(as_json: bool, facts: dict[str, Any], show: Callable[[], None]) -> None:
+def emit(as_json: bool, facts: Mapping[str, object], show: Callable[[], None]) -> None:
     """Print facts as JSON, or call `show` for readable output."""
     if as_json:
         # Strict JSON: NaN would break every other reader.

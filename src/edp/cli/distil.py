@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,11 +11,9 @@ from edp.cli.console import JsonFlag, duration, emit, out, table
 from edp.cli.options import DataOption, MapOption, RepairOption, SettingsOption, source_if_given
 from edp.cli.progress import show_progress
 from edp.errors import ConfigError
-from edp.storage.reading import Table
 from edp.wording import figure
 
 if TYPE_CHECKING:
-    from edp.evaluation.footprint import Footprint
     from edp.settings.tree import Change
 
 
@@ -70,20 +67,20 @@ def distil(
     with show_progress("distil", as_json) as progress:
         bundle = make(run, request, folder, source, progress)
     counts = {"teacher": footprint(load_bundle(run).predictor), "student": footprint(bundle.predictor)}
+    seconds, error = bundle.provenance.seconds or 0.0, progress.display.measured("validation_mae")
     facts = {
         "run": str(folder),
         "bundle": str(folder / "bundle"),
-        "seconds": bundle.provenance.seconds,
-        "validation_mae": progress.display.measured("validation_mae"),
+        "seconds": seconds,
+        "validation_mae": error,
         **{name: {"parameters": count.parameters, "macs_tick": count.macs_tick} for name, count in counts.items()},
     }
-    emit(as_json, facts, lambda: _show(counts, facts))
 
+    def show() -> None:
+        rows = [(name, count.parameters, count.macs_tick, count.macs_window) for name, count in counts.items()]
+        table("", ["network", "parameters", "MACs per tick", "MACs per window"], rows)
+        tail = "" if error is None else f", validation MAE {figure(error)} (report units)"
+        out.print(f"distilled in {duration(seconds)}{tail}; bundle in {folder / 'bundle'}")
+        out.print(f"next: edp evaluate {folder}")
 
-def _show(counts: Mapping[str, Footprint], facts: Table) -> None:
-    rows = [(name, count.parameters, count.macs_tick, count.macs_window) for name, count in counts.items()]
-    table("", ["network", "parameters", "MACs per tick", "MACs per window"], rows)
-    error = facts["validation_mae"]
-    tail = "" if error is None else f", validation MAE {figure(error)} (report units)"
-    out.print(f"distilled in {duration(facts['seconds'])}{tail}; bundle in {facts['bundle']}")
-    out.print(f"next: edp evaluate {facts['run']}")
+    emit(as_json, facts, show)

@@ -68,9 +68,10 @@ def _print_monitor_footprint(file: Path, limits: Budget, as_json: bool) -> None:
     facts = {"name": file.name, **counts.to_json(limits)}
 
     def show() -> None:
-        networks = facts["networks"]
-        keys = ("number_format", "parameters", "runs", "every", "macs_tick")
-        rows = [(i, *(network[key] for key in keys)) for i, network in enumerate(networks)]
+        rows = [
+            (i, one.number_format, one.footprint.parameters, one.runs, one.every, one.runs * one.footprint.macs_tick)
+            for i, one in enumerate(counts.networks)
+        ]
         table(file.name, ["network", "numbers", "parameters", "runs", "every, ticks", "MACs"], rows)
         chain = counts.chain
         out.print(

@@ -20,7 +20,6 @@ from edp.wording import figure, number, percent
 
 if TYPE_CHECKING:
     from edp.data.coverage import Coverage
-    from edp.logs import DataQuality
     from edp.logs.source import DataSource
 
 SETTINGS = "settings.toml"
@@ -102,7 +101,9 @@ def inspect(
         if coverage_facts is not None and page is not None:
             out.print(f"page: {full_path(page)}")
         out.print(verdict_text(quality))
-        if quality.proposed or (errors and signal_map is None and _lacks_map(quality)):
+        # A log of which no channel was taken needs a signal map.
+        is_undescribed = any(not report.channels for report in quality.reports)
+        if quality.proposed or (errors and signal_map is None and is_undescribed):
             out.print(
                 f"next: edp init {shlex.join(map(str, data))}, which writes a signal map and settings; then edp train "
                 "with both"
@@ -119,11 +120,6 @@ def inspect(
     if errors:
         err.print("see the advice beside each error, or ask for a repair with --repair when training")
         raise typer.Exit(FAULTY)
-
-
-def _lacks_map(quality: DataQuality) -> bool:
-    """Whether no channel of a log was taken, which a signal map mends."""
-    return any(not report.channels for report in quality.reports)
 
 
 def _training(data: Sequence[Path], signal_map: Path | None) -> str:

@@ -23,7 +23,6 @@ from edp.cli.options import (
 from edp.cli.progress import show_progress
 from edp.errors import ConfigError, count_of
 from edp.storage.paths import full_path
-from edp.storage.reading import Table
 from edp.wording import figure
 
 if TYPE_CHECKING:
@@ -104,10 +103,11 @@ def fit(
     with show_progress("monitor", as_json) as progress:
         fitted = fit_monitor(runs, source, experiment, folder, progress, divided)
     monitor = fitted.monitor
-    facts: Table = {
+    wall_s = time.monotonic() - began
+    facts = {
         "monitor": str(folder),
         "seconds": fitted.seconds,
-        "wall_s": time.monotonic() - began,
+        "wall_s": wall_s,
         "workers": divided.processes,
         "residuals": list(monitor.residual_names),
         "doubtful": list(fitted.doubtful),
@@ -121,9 +121,9 @@ def fit(
         show_fitted(fitted)
         spent = f"{duration(fitted.seconds)} of processor time"
         if cluster:
-            spent = f"{duration(facts['wall_s'])} on the cluster at {cluster}"
+            spent = f"{duration(wall_s)} on the cluster at {cluster}"
         elif not divided.are_alone:
-            spent = f"{duration(facts['wall_s'])} by {facts['workers']} processes"
+            spent = f"{duration(wall_s)} by {divided.processes} processes"
         fitted_text = "was fitted before, nothing to do" if fitted.is_read else f"fitted in {spent}"
         out.print(f"{fitted_text}; monitor in {folder}")
         out.print(f"next: edp monitor run {folder} LOGS")

@@ -12,7 +12,7 @@ from edp.cli.console import JsonFlag, emit, err, out, table
 from edp.storage.paths import full_path
 
 if TYPE_CHECKING:
-    from edp.workflows.fleet.registry import RegistryEntry
+    pass
 
 RegistryArgument = Annotated[Path, typer.Argument(metavar="REGISTRY", help="Folder of the registry.")]
 
@@ -94,7 +94,8 @@ def show_entry(
             f"{entry.kind} of {registry}", ["", ""], [*facts, *_rows("data", entry.data), *_rows("judge", entry.judge)]
         )
         for step in steps:
-            out.print(f"from: {_format_entry(step)}")
+            absent = f"{step} (not in this registry)"
+            out.print(f"from: {absent if isinstance(step, str) else f'{step.name} ({step.id}): {step.label}'}")
         if not steps:
             out.print("from: random weights")
 
@@ -104,7 +105,3 @@ def show_entry(
 
 def _rows(what: str, facts: Any) -> list[tuple[str, str]]:
     return [(f"{what}: {key}", str(value)) for key, value in facts.items()]
-
-
-def _format_entry(step: RegistryEntry | str) -> str:
-    return f"{step} (not in this registry)" if isinstance(step, str) else f"{step.name} ({step.id}): {step.label}"

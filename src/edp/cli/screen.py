@@ -195,7 +195,7 @@ def show_selection(selection: Selection) -> None:
         out.print(f"note: {note}")
     if selection.trials is not None:
         out.print()
-        print_table(tables.trials_table(selection.trials.to_json()))
+        print_table(tables.trials_table(selection.trials))
         for note in selection.trials.notes:
             out.print(f"note: {note}")
         out.print()
@@ -226,7 +226,7 @@ def facts_of(selection: Selection) -> dict[str, object]:
         "repeats": [repeat.to_json() for repeat in selection.quality.repeats],
         "notes": [*proposal.notes, *selection.notes],
         "seconds": selection.screening.seconds,
-        "trials": None if selection.trials is None else selection.trials.to_json(),
+        "trials": None if selection.trials is None else selection.trials.to_table(),
         "files": {name: str(path) for name, path in selection.files.items()},
     }
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -161,13 +160,12 @@ def export(
     from edp.workflows.search.export import export_study
 
     file, names = export_study(study, output)
-    facts = {"journal": str(file), "studies": names}
-    emit(as_json, facts, lambda: _show_journal(file, names))
 
+    def show() -> None:
+        out.print(f"{len(names)} studies in {file}")
+        out.print(f"next: optuna-dashboard {file}")
 
-def _show_journal(file: Path, names: Sequence[str]) -> None:
-    out.print(f"{len(names)} studies in {file}")
-    out.print(f"next: optuna-dashboard {file}")
+    emit(as_json, {"journal": str(file), "studies": names}, show)
 
 
 def _write_report(study: Path, output: Path | None, pictures: bool) -> Path:

@@ -12,7 +12,6 @@ from edp.cli.console import JsonFlag, Steps, count_text, emit, err, format_time_
 from edp.cli.options import ClusterOption, OpenOption, WorkersOption, check_effects, workers_of
 from edp.cli.progress import show_progress
 from edp.errors import count_of
-from edp.storage.reading import Table
 from edp.wording import figure, number
 
 if TYPE_CHECKING:
@@ -88,14 +87,14 @@ def simulate(
     later velocity the least mean absolute error follows that any predictor could reach: one that knows the true state
     and all laws, but neither the operator's future choices nor, in the second column, anything but them.
     """
-    from edp.sim.data_set import SimulationOrder, suffix_of
+    from edp.sim.data_set import SimulationOrder
     from edp.sim.faults import fault_text, parse_fault
-    from edp.sim.scenario_file import limit_settings
+    from edp.sim.scenario_file import limit_settings, suffix_of
 
     check_effects(context, {"changes.limit": limit})
     order = SimulationOrder.of(
         scenario,
-        _note,
+        lambda text: err.print(f"note: {text}"),
         changes,
         machine=machine,
         minutes=minutes,
@@ -113,9 +112,10 @@ def simulate(
     paths = run(folder, order, divided, as_json)
     limit_facts = run_limit(folder, order, spec, divided, as_json) if limit else None
     what_simulated = f"{order.family} machines" if order.family else order.machine
-    facts: Table = {"folder": str(folder), "recordings": len(paths), "minutes": order.minutes}
-    if order.faults:
-        facts["faults"] = [fault_text(entry) for entry in order.faults]
+    faults = [fault_text(entry) for entry in order.faults or ()]
+    facts: dict[str, object] = {"folder": str(folder), "recordings": len(paths), "minutes": order.minutes}
+    if faults:
+        facts["faults"] = faults
     facts |= {"machine": what_simulated, "seed": order.seed}
     if limit_facts is not None:
         facts["limit"] = limit_facts.to_table()
@@ -124,7 +124,7 @@ def simulate(
         if limit_facts is not None:
             limit_table(limit_facts)
         out.print(f"{count_of(len(paths), 'recording')} of {what_simulated}, {figure(order.minutes)} min, in {folder}")
-        for text in facts.get("faults", ()):
+        for text in faults:
             out.print(f"fault: {text}")
         out.print(f"next: edp inspect {folder}   or   edp train {folder} --out runs/first")
 
@@ -191,7 +191,3 @@ def limit_table(limit: LimitFile) -> None:
         "each)"
     )
     table(title, ["k", *names, "mean", "95 %", "commands known", "persistence"], rows)
-
-
-def _note(text: str) -> None:
-    err.print(f"note: {text}")

@@ -12,7 +12,6 @@ from edp.cli.inspect import FAULTY
 from edp.cli.options import ClusterOption, MapOption, OpenOption, RepairOption, source_of, workers_of
 from edp.cli.progress import show_progress
 from edp.errors import count_of
-from edp.storage.reading import Table
 from edp.wording import number
 
 if TYPE_CHECKING:
@@ -87,13 +86,14 @@ def check(
 
 def _show(index: StoreIndex, folder: Path, as_json: bool) -> None:
     size = sum(file.bytes for file in index.files)
-    facts: Table = {
+    channels = sorted({channel.name for channels in index.lists for channel in channels})
+    facts = {
         "store": str(folder),
         "recordings": len(index.recordings),
         "hours": index.hours(),
         "bytes": size,
         "files": len(index.files),
-        "channels": sorted({channel.name for channels in index.lists for channel in channels}),
+        "channels": channels,
         "refused": [{"log": refused.log, "why": refused.why} for refused in index.refused],
     }
 
@@ -101,7 +101,7 @@ def _show(index: StoreIndex, folder: Path, as_json: bool) -> None:
         rows = [
             ("recordings", f"{len(index.recordings):,}"),
             ("hours", number(index.hours(), 2)),
-            ("channels", f"{len(facts['channels'])}"),
+            ("channels", f"{len(channels)}"),
             ("size", f"{number(size / 1e6, 1)} MB in {count_of(len(index.files), 'file')}"),
         ]
         table(f"store {folder}", ["", ""], rows)

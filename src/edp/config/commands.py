@@ -10,7 +10,7 @@ from typing import TypeVar
 from edp.config.experiment import SETTINGS, Change, Experiment, read_layers
 from edp.errors import ConfigError, closest
 from edp.settings.bounds import shown
-from edp.settings.tree import SettingsTree, Table, merged
+from edp.settings.tree import SettingsTree, merged
 
 TRAINING_TABLES = tuple(entry.name for entry in fields(Experiment))
 """Tables that a command which trains takes beside its own."""
@@ -24,7 +24,7 @@ def command_settings(
     overrides: Sequence[Change] = (),
     others: Collection[str] = (),
     tree: SettingsTree = SETTINGS,
-) -> tuple[T, tuple[Table, ...]]:
+) -> tuple[T, tuple[dict[str, object], ...]]:
     """Return the settings of a command from its table in a TOML file, changed by overrides; and the other settings.
 
     Args:
@@ -51,7 +51,7 @@ def command_settings(
             own = key in (entry.name for entry in fields(spec))  # type: ignore[arg-type]
             hint = f"; did you mean '{command}.{key}'?" if own else closest(key, known_tables)
             raise ConfigError(f"settings {where}: unknown key {shown(key)}{hint}")
-    table: Table = {}
+    table: dict[str, object] = {}
     for layer in layers:
         table = merged(table, {key: value for key, value in layer.items() if key == command})
     rest = tuple({key: value for key, value in layer.items() if key != command} for layer in layers)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from edp.control.tasks import TASKS, TaskSpec
 from edp.control.tasks.grade import Grade
 from edp.errors import ConfigError
 from edp.settings.bounds import MOST_SEED, above, check_bounds, integer, span
-from edp.settings.tree import SettingsTree, Table
+from edp.settings.tree import SettingsTree
 from edp.wording import setting_text, typed
 
 CONTROL_SETTINGS = SettingsTree(
@@ -65,7 +65,7 @@ class ControlExperiment:
 
 
 def load_control_experiment(
-    path: str | Path | None = None, overrides: Sequence[str] = (), options: Table | None = None
+    path: str | Path | None = None, overrides: Sequence[str] = (), options: Mapping[str, object] | None = None
 ) -> ControlExperiment:
     """Load settings from a TOML file, changed by command options and ``key.path=value`` overrides.
 

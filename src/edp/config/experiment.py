@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from importlib import resources
 from pathlib import Path
@@ -21,7 +21,17 @@ from edp.networks.losses import LOSSES, TERMS
 from edp.networks.physics import PhysicsSpec
 from edp.networks.plain import NETWORK_PARTS, USUAL_KINDS
 from edp.networks.predictor import ModelSpec
-from edp.settings.tree import Change, SettingsTree, Table, combined, merged, override, parse_toml, read_toml
+from edp.settings.tree import (
+    Change,
+    SettingsTree,
+    combined,
+    merged,
+    override,
+    parse_toml,
+    read_toml,
+    value_at,
+    with_value,
+)
 from edp.training.averages import AVERAGES
 from edp.training.fit import TrainingSpec
 from edp.training.optimizers import OPTIMIZERS
@@ -33,7 +43,6 @@ __all__ = [
     "Change",
     "Experiment",
     "FeatureSettings",
-    "Table",
     "TaskSettings",
     "build",
     "embed_feature_set",
@@ -178,7 +187,7 @@ def load_experiment(
     return build(Experiment, table, where)
 
 
-def read_layers(path: str | Path | None = None, overrides: Sequence[Change] = ()) -> list[Table]:
+def read_layers(path: str | Path | None = None, overrides: Sequence[Change] = ()) -> list[dict[str, object]]:
     """Return the table of a settings file and of all overrides, in the order of application.
 
     Raises:
@@ -190,7 +199,7 @@ def read_layers(path: str | Path | None = None, overrides: Sequence[Change] = ()
     return first + ([every] if every else [])
 
 
-def preset_table(name: str) -> Table:
+def preset_table(name: str) -> dict[str, object]:
     """Return the table of a preset, merged with its `base` if it names one.
 
     Raises:
@@ -210,13 +219,12 @@ def experiment_toml(experiment: Experiment) -> str:
     return tomli_w.dumps(plain_tree(experiment))
 
 
-def embed_feature_set(table: Table, folder: Path) -> Table:
+def embed_feature_set(table: Mapping[str, object], folder: Path) -> dict[str, object]:
     """Return `table` with the feature set in place of its file name, so that a run folder is self-contained."""
-    task = table.get("task")
-    if not isinstance(task, dict) or not is_set_file(task.get("features")):
-        return table
-    path = folder / task["features"]
-    features = read_set_table(path)
+    name = value_at(table, "task.features")
+    if not is_set_file(name):
+        return dict(table)
+    features = read_set_table(folder / name)
     # Checked here, where the file can still be named.
-    build(FeatureSettings, features, f"'{path}'")
-    return {**table, "task": {**task, "features": features}}
+    build(FeatureSettings, features, f"'{folder / name}'")
+    return with_value(table, "task.features", features)

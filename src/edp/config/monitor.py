@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from edp.monitor.residuals.flow_balances import FlowBalancesSpec
 from edp.monitor.residuals.look_ahead import LookAheadSpec
 from edp.monitor.residuals.virtual_sensors import VirtualSensorsSpec
 from edp.settings.bounds import MIN_MINUTES, MOST_NAMES, SEED, above, between, check_bounds, check_count, integer, span
-from edp.settings.tree import SettingsTree, Table
+from edp.settings.tree import SettingsTree
 
 MONITOR_SETTINGS = SettingsTree({"residuals": RESIDUALS, "detector": DETECTORS}, what="settings")
 
@@ -119,7 +119,7 @@ class MonitorExperiment:
 
 
 def load_monitor_experiment(
-    path: str | Path | None = None, overrides: Sequence[str] = (), options: Table | None = None
+    path: str | Path | None = None, overrides: Sequence[str] = (), options: Mapping[str, object] | None = None
 ) -> MonitorExperiment:
     """Load settings from a TOML file, changed by command options and ``key.path=value`` overrides.
 

@@ -7,7 +7,7 @@ It works on any recordings: roles come from names or kinds (`edp.data.roles`), a
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,8 @@ from edp.data.splits import Split
 from edp.data.twin_channels import INTEGRAL
 from edp.errors import DataError
 from edp.recording import STRETCH_S, Recording, spread_recordings
+from edp.settings.results import json_value
 from edp.signals import KINDS, Kind
-from edp.storage.reading import Table
 from edp.wording import typed
 
 Array = NDArray[np.float64]
@@ -138,11 +138,10 @@ class Coverage:
 
     def to_json(self) -> dict[str, object]:
         """Convert to JSON types; arrays become lists, the occupancy gets its fraction of visited cells."""
-        plain: Table = _plain(asdict(self))
-        plain["singular"] = {str(lags): value for lags, value in self.singular.items()}
+        plain = json_value(self)
         if self.occupancy is not None:
             plain["occupancy"]["share"] = self.occupancy.share
-        return plain
+        return dict(plain)
 
 
 def cover(
@@ -381,13 +380,3 @@ def mutual_information(x: Array, y: Array, bins: int = QUANTILES) -> float:
     # Expected value for independent signals (Miller and Madow): (rows - 1) (columns - 1) / 2 n.
     chance = (np.count_nonzero(table.sum(axis=1)) - 1) * (np.count_nonzero(table.sum(axis=0)) - 1) / (2.0 * len(x))
     return float(max((share[seen] * np.log(share[seen] / outer[seen])).sum() - chance, 0.0))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return value

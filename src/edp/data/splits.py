@@ -322,10 +322,11 @@ class ByMachine:
         if not self.test_masses:
             return []
         low, high = self.test_masses
-        masses = {owner: r.meta.get(MASS) for owner, r in zip(owners, recordings, strict=True)}
-        matching = [owner for owner, mass in masses.items() if mass is not None and low <= float(mass) <= high]
+        stated = {owner: r.meta.get(MASS) for owner, r in zip(owners, recordings, strict=True)}
+        masses = {owner: float(mass) for owner, mass in stated.items() if isinstance(mass, int | float)}
+        matching = [owner for owner, mass in masses.items() if low <= mass <= high]
         if not matching:
-            known_masses = [float(mass) for mass in masses.values() if mass is not None]
+            known_masses = list(masses.values())
             span = (
                 f"they go from {typed(min(known_masses))} to {typed(max(known_masses))} t"
                 if known_masses

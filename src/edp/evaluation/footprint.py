@@ -17,7 +17,6 @@ from edp.ir.w8a16.quantise import outline
 from edp.networks.predictor import Predictor
 from edp.networks.streaming import Cost, state_numbers
 from edp.settings.results import plain_value
-from edp.storage.reading import Table
 
 GRAPHS: dict[str, Callable[[Predictor], Graph]] = {
     "float32": lambda predictor: predictor.graph(),
@@ -68,7 +67,7 @@ class Footprint:
                 return entry
         raise ExportError(self.refused[number_format])
 
-    def to_json(self, budget: Budget | None = None) -> Table:
+    def to_json(self, budget: Budget | None = None) -> dict[str, object]:
         """Return plain values, with the verdict against a budget where one is given."""
         plain = asdict(self)
         plain |= {"rows": plain_value(self.rows), "estimates": [entry.to_json() for entry in self.estimates]}

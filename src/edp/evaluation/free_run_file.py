@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from edp.errors import ConfigError
 from edp.settings.bounds import MOST_ROWS, above, check_bounds, integer
 from edp.settings.results import ResultFile, read_part
-from edp.storage.reading import Table
 
 TWIN = "twin"
 """Name of the twin among the models."""
@@ -307,7 +306,7 @@ class FreeRunFile(ResultFile):
             raise ConfigError(f"'models.{TWIN}' is missing; it must be given")
 
 
-def read_models(table: Table, where: str) -> Mapping[str, FreeRunScores]:
+def read_models(table: Mapping[str, object], where: str) -> Mapping[str, FreeRunScores]:
     """Build scores by name of a model from the header of a twin, which messages call `where`; empty without scores.
 
     Raises:

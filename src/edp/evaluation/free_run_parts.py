@@ -41,10 +41,9 @@ def by_channel(channels: Sequence[Channel], values: NDArray[Any], integral: bool
         values: SI units, ``(channel,)`` or ``(run, channel)``.
         integral: whether they are integrals of the channels over seconds.
     """
-    unit_of = {
-        channel.name: _integrate_unit(KINDS[channel.kind].report_unit) if integral else KINDS[channel.kind].report_unit
-        for channel in channels
-    }
+    unit_of = {channel.name: KINDS[channel.kind].report_unit for channel in channels}
+    if integral:
+        unit_of = {name: unit.removesuffix("/s") for name, unit in unit_of.items()}
     units = set(unit_of.values())
     unit = units.pop() if len(units) == 1 else None
     by_run = _convert_to_report_units(channels, values)
@@ -174,8 +173,3 @@ def _where(channels: Sequence[Channel], errors: Array, axes: NDArray[np.bool_]) 
     seen = [i for i, count in enumerate(counts) if count]
     row = by_channel([channels[i] for i in seen], sums[seen] / counts[seen])
     return replace(row, by_channel={channel.name: row.by_channel.get(channel.name) for channel in channels})
-
-
-def _integrate_unit(unit: str) -> str:
-    """Return the unit of the integral over seconds of a quantity in `unit`."""
-    return unit.removesuffix("/s")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 from edp.evaluation.controller import BOARD_SLOW, BOARD_TYPICAL, CORES, STACK_BYTES, Budget, Estimate, LimitCheck
 from edp.evaluation.footprint import Footprint, footprint
@@ -176,7 +175,7 @@ class MonitorFootprint:
     program_bytes: int
     state_bytes: int
 
-    def to_json(self, budget: Budget) -> dict[str, Any]:
+    def to_json(self, budget: Budget) -> dict[str, object]:
         """Plain values with the verdict against `budget`."""
         return {
             "networks": [

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from edp.data.frozen import SECOND_TEST_SET
 from edp.errors import ConfigError, StorageError
 from edp.evaluation.study_facts import FACTS, OPTIONAL
-from edp.settings.tree import SettingsTree, Table
+from edp.settings.results import json_value
+from edp.settings.tree import SettingsTree
 from edp.storage.ledger import Opening
 from edp.storage.paths import is_file_at, is_folder_at
 from edp.storage.reading import read_json
@@ -51,10 +51,9 @@ class Decision:
     facts: Any
     sentences: tuple[str, ...]
 
-    def to_json(self) -> Table:
+    def to_json(self) -> object:
         """Return plain values that JSON has: a number that is not finite becomes null."""
-        table: Table = _plain(self)
-        return table
+        return json_value(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,7 +150,7 @@ class StudyFile:
     unit: str
     preset: str
     data: StudyData
-    spec: Table
+    spec: Mapping[str, Any]
     sessions: SessionSets
     created: str = ""
     modules: Mapping[str, str]
@@ -203,28 +202,14 @@ class StudyFile:
             tested |= set(indices[len(indices) - sum(sealed) :] if sum(sealed) else ())
         return frozenset(tested)
 
-    def to_json(self) -> Table:
+    def to_json(self) -> dict[str, object]:
         """Return plain values that JSON has: a number that is not finite becomes null."""
-        return {"schema": SCHEMA, **_plain(self)}
+        return {"schema": SCHEMA, **json_value(self)}
 
 
 def facts_of_kind(decisions: Sequence[Decision], kind: type[F]) -> F | None:
     """Return the results of a class among decisions; None without any."""
     return next((decision.facts for decision in decisions if isinstance(decision.facts, kind)), None)
-
-
-def _plain(value: Any) -> Any:
-    if is_dataclass(value):
-        return {
-            entry.name: _plain(getattr(value, entry.name))
-            for entry in fields(value)
-            if not entry.metadata.get("optional") or getattr(value, entry.name) is not None
-        }
-    if isinstance(value, Mapping):
-        return {key: _plain(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 STUDY_TREE = SettingsTree(what="study", null_is_nan=True)

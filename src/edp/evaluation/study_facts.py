@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 from edp.evaluation.compression import Scores
 from edp.evaluation.controller import Budget, ResourceUsage
-from edp.settings.tree import Table
 from edp.stats.confirm import ModuleEvidence
 from edp.stats.importance import MainEffect
 from edp.stats.thesis_confirm import ThesisEvidence
@@ -126,7 +125,7 @@ class CalibrationFacts:
     final: FinalRound | None = field(default=None, metadata=OPTIONAL)
     backbone: str
     baseline: Mapping[str, Scalar]
-    settings: Table
+    settings: Mapping[str, object]
     front: Mapping[str, tuple[TrialRow, ...]] | None = field(default=None, metadata=OPTIONAL)
 
 
@@ -229,7 +228,7 @@ class JointFacts:
         front: numbers of the trials that no other surpasses in score and cost.
     """
 
-    settings: Table
+    settings: Mapping[str, object]
     values: Mapping[str, Scalar]
     modules: tuple[str, ...]
     score: float
@@ -267,7 +266,7 @@ class ExplorationFacts(JointFacts):
     fresh: Mapping[str, float]
     runs: int
     teacher: str
-    teacher_settings: Table
+    teacher_settings: Mapping[str, object]
 
 
 @dataclass(frozen=True, kw_only=True)

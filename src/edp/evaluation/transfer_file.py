@@ -9,7 +9,6 @@ from edp.errors import ConfigError
 from edp.evaluation.scores_file import MEAN, ByHorizon, Metrics, ScoredTarget
 from edp.settings.bounds import above, check_bounds
 from edp.settings.results import ResultFile
-from edp.settings.tree import Table
 
 TARGET, SOURCE = "target", "source"
 """Domains: the other machine, and the machine that the network was trained for."""
@@ -98,8 +97,8 @@ class TransferFile(ResultFile):
     method: str
     before: str
     network: str
-    settings: Table = field(default_factory=dict)
-    source: Table = field(default_factory=dict)
+    settings: Mapping[str, object] = field(default_factory=dict)
+    source: Mapping[str, object] = field(default_factory=dict)
     task: TransferTask
     targets: tuple[ScoredTarget, ...]
     data: TransferData

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 from edp.errors import EdpError
@@ -9,11 +10,10 @@ from edp.logs.proposal.columns import names_in_log
 from edp.logs.read import find_recordings
 from edp.logs.repair import Repair
 from edp.logs.source import DataSource
-from edp.settings.tree import Table
 from edp.signals import SignalMap
 
 
-def read_as_before(source: DataSource, reader: Table) -> DataSource:
+def read_as_before(source: DataSource, reader: Mapping[str, object]) -> DataSource:
     """Return the source with the map and repairs used for other logs, unless the source states its own map.
 
     Only where all of these had one map and the first log of the source has all of its columns; any other source stays

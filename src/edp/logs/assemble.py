@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 from edp.errors import DataError
 from edp.logs.formats.base import ColumnTable, RawLog, RawSignal
 from edp.logs.formats.names import name_of_file
-from edp.logs.repair import Mask, Repair, repair_gaps, repair_stamps, repair_values
+from edp.logs.repair import Mask, Repair, repair_gaps, repair_stamps, repair_values, repairs_of
 from edp.logs.resolve import ChannelSource
 from edp.logs.timebase import Clock, Grid, Rows, common_grid, hold_rows, uniform_clock
 from edp.recording import FloatArray, Recording
 from edp.signals import SignalMap
 from edp.storage.memory import check_memory
-from edp.storage.reading import Table
 from edp.wording import typed
 
 _CACHED_ROWS = 4096
@@ -93,9 +92,9 @@ class Assembly:
             DataError: a column cannot be read, or holds missing values that may not be repaired.
         """
         values, repairs = self._repair_columns(start, stop, before)
-        meta: Table = dict(self.raw.meta)
+        meta = dict(self.raw.meta)
         if self.repairs or repairs:
-            meta["repairs"] = [*meta.get("repairs", []), *self.repairs, *repairs]
+            meta["repairs"] = [*repairs_of(meta), *self.repairs, *repairs]
         if self.resampled:
             meta["resampled_from_hz"] = max(clock.rate_hz for clock in self.clocks)
         return Recording(
@@ -107,7 +106,9 @@ class Assembly:
             meta=meta,
         )
 
-    def _repair_columns(self, start: int, stop: int, before: FloatArray | None) -> tuple[FloatArray, list[Table]]:
+    def _repair_columns(
+        self, start: int, stop: int, before: FloatArray | None
+    ) -> tuple[FloatArray, list[dict[str, object]]]:
         values = self.values(start, stop)
         missing = self.missing[start:stop]
         if self.repair.gaps != "hold":

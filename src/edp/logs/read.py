@@ -41,8 +41,8 @@ def read_recording(
 
     Args:
         path: a log of any known format (`edp.logs.list_suffixes`), or the folder of a ROS 2 bag.
-        signal_map: assignment of columns to channels. An empty map uses the names of the vocabulary and the units
-            stated in the file (SI units if none is stated).
+        signal_map: which columns become which channels; an empty map takes the vocabulary's names with the units
+            that the file states (SI where it states none).
         name: the recording's name; default: as the file says, else the file's stem.
         rows: ``(start, stop)`` of the resulting samples, stop exclusive, None for the end.
         repair: allowed repairs. By default there are none, and defects are errors.

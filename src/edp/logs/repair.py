@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,6 +116,12 @@ def repair_gaps(missing: Mask, rate_hz: float, repair: Repair, where: str) -> tu
     good_starts, good_stops = runs(~missing)
     best = int(np.argmax(good_stops - good_starts))
     return slice(int(good_starts[best]), int(good_stops[best])), [fact]
+
+
+def repairs_of(meta: Mapping[str, object]) -> list[object]:
+    """Return the repairs that the facts of a recording state."""
+    repairs = meta.get("repairs")
+    return list(repairs) if isinstance(repairs, list | tuple) else []
 
 
 def repair_values(

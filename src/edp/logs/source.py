@@ -34,7 +34,7 @@ from edp.logs.units import add_kinds, drop_derived_kinds
 from edp.progress import SILENT, Progress
 from edp.recording import MACHINE, Recording
 from edp.settings.provenance import DataOrigin
-from edp.settings.tree import Table, build, plain_tree, read_toml
+from edp.settings.tree import build, plain_tree, read_toml
 from edp.signals import SignalMap
 from edp.storage.ledger import TrainingIdentity, WithState
 from edp.storage.paths import full_path, is_file_at, is_there, status_of
@@ -162,9 +162,9 @@ class DataSource:
         """Folder of the store; for a store in a bucket, the folder of its copy."""
         return local_store(self.address) if self.address else self.path
 
-    def to_plain(self) -> Table:
+    def to_plain(self) -> dict[str, object]:
         """Convert to a dictionary for provenance, with which the same data can be read again."""
-        plain: Table = {"path": self.address or str(full_path(self.path))}
+        plain: dict[str, object] = {"path": self.address or str(full_path(self.path))}
         if self.signal_map is not None:
             # Kinds that units tell are written out: an entry without one was read by an earlier version.
             plain["map"] = plain_tree(add_kinds(self.signal_map))
@@ -177,7 +177,7 @@ class DataSource:
         return plain
 
     @staticmethod
-    def from_plain(plain: Table) -> DataSource:
+    def from_plain(plain: Mapping[str, Any]) -> DataSource:
         """Create the source that `to_plain` described."""
         signal_map = drop_derived_kinds(build(SignalMap, plain["map"], "provenance map")) if "map" in plain else None
         repair = build(Repair, plain["repair"], "provenance repair") if "repair" in plain else None
@@ -398,7 +398,7 @@ def load_signal_map(path: str | Path) -> SignalMap:
     return map_of_table(read_toml(path), f"'{path}'")
 
 
-def map_of_table(table: Table, where: str) -> SignalMap:
+def map_of_table(table: Mapping[str, object], where: str) -> SignalMap:
     """Build a signal map from the content of a map file; `where` names it in messages.
 
     Raises:
@@ -468,7 +468,7 @@ def _expand_variables(entry: str, path: Path) -> str:
     return full
 
 
-def _map_table(table: Table) -> Table:
+def _map_table(table: Mapping[str, object]) -> Mapping[str, object]:
     """Convert the user's form ``[channels.NAME] column = ...`` to a list of entries."""
     channels = table.get("channels")
     if not isinstance(channels, dict):
@@ -509,6 +509,14 @@ class LogInspections:
     broken: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class _LogPart:
+    """Logs of a unit of work, with their full paths."""
+
+    logs: tuple[Log, ...]
+    paths: tuple[str, ...]
+
+
 def _units_of_logs(logs: Sequence[Log]) -> list[WorkUnit]:
     """Divide logs into parts of similar size."""
     parts: list[list[Log]] = []
@@ -523,15 +531,15 @@ def _units_of_logs(logs: Sequence[Log]) -> list[WorkUnit]:
     for part in parts:
         stored = [log.stored for log in part]
         arguments = {"logs": [log.key for log in stored], "unmapped": [log.signal_map is None for log in part]}
-        where = {"logs": tuple(part), "paths": [str(full_path(log.path)) for log in part]}
+        where = {"part": _LogPart(tuple(part), tuple(str(full_path(log.path)) for log in part))}
         units.append(WorkUnit(f"{__name__}:inspect_logs", part[0].path.name, arguments, "", where, len(part)))
     return units
 
 
-def inspect_logs(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState:
+def inspect_logs(identity: TrainingIdentity, where: Mapping[str, _LogPart]) -> WithState:
     """Inspect the logs of a unit."""
     reports, sketches, broken = [], [], []
-    for log, full in zip(where["logs"], where["paths"], strict=True):
+    for log, full in zip(where["part"].logs, where["part"].paths, strict=True):
         # The path as it was given stands in messages; where it leads nowhere on this node, the resolved one is read.
         path = log.path if is_there(log.path) else Path(full)
         try:

@@ -11,7 +11,6 @@ from typing import Any, Self
 from edp import __version__
 from edp.errors import StorageError
 from edp.settings.results import plain_fields, read_part
-from edp.settings.tree import Table
 from edp.storage import read_object
 from edp.storage.paths import is_file_at
 from edp.storage.provenance import PROVENANCE, command_line, environment
@@ -44,7 +43,7 @@ class DataOrigin:
     """
 
     source: str | None = None
-    reader: Table = field(default_factory=dict)
+    reader: Mapping[str, object] = field(default_factory=dict)
     rate_hz: float | None = None
     train: DataPart | None = None
     validation: DataPart | None = None
@@ -81,7 +80,7 @@ class Provenance:
     data: DataOrigin | None = None
     seed: int | None = None
     seconds: float | None = None
-    more: Table = field(default_factory=dict)
+    more: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def from_table(cls, table: Mapping[str, object], where: str) -> Self:
@@ -105,9 +104,9 @@ class Provenance:
         file = Path(folder) / PROVENANCE
         return cls.from_table(read_object(file), f"'{file}'")
 
-    def to_table(self) -> Table:
+    def to_table(self) -> dict[str, object]:
         """Return the content of the file."""
-        return plain_fields(replace(self, more={})) | self.more
+        return {**plain_fields(replace(self, more={})), **self.more}
 
     def add_entries(self, **entries: Any) -> Self:
         """Return the provenance with additional entries of a command."""

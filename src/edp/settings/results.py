@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import typing
 from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
@@ -12,7 +13,7 @@ from typing import Any, ClassVar, Self
 
 from edp.errors import ConfigError, StorageError
 from edp.settings.bounds import shown
-from edp.settings.tree import SettingsTree, Table
+from edp.settings.tree import SettingsTree
 from edp.storage import read_object, write_json
 
 T = typing.TypeVar("T")
@@ -71,7 +72,7 @@ class ResultFile:
             )
         return read_part(cls, values, where, cls.WHAT, cls.ADVICE)
 
-    def to_table(self) -> Table:
+    def to_table(self) -> dict[str, object]:
         """Return the content of the file."""
         return ({"schema": self.SCHEMA} if self.SCHEMA else {}) | plain_fields(self)
 
@@ -80,7 +81,7 @@ class ResultFile:
         write_json(Path(folder) / self.NAME, self.to_table())
 
 
-def read_part(cls: type[T], table: Mapping[str, object], where: str, what: str = "results", advice: str = AGAIN) -> T:
+def read_part(cls: type[T], table: object, where: str, what: str = "results", advice: str = AGAIN) -> T:
     """Build a dataclass of results from a part of a file, which messages call `where`.
 
     Raises:
@@ -92,7 +93,7 @@ def read_part(cls: type[T], table: Mapping[str, object], where: str, what: str =
         raise StorageError(f"{error}\nThe file was changed by hand or is of another version: {advice}") from error
 
 
-def plain_fields(value: Any) -> Table:
+def plain_fields(value: Any) -> dict[str, object]:
     """Return the fields of a dataclass of results as JSON has them; see `ResultFile` for those that are left out."""
     empty = _empty_defaults(value.__class__)
     values = ((entry.name, getattr(value, entry.name)) for entry in fields(value))
@@ -108,6 +109,27 @@ def plain_value(value: Any) -> Any:
     if isinstance(value, tuple | list):
         return [plain_value(entry) for entry in value]
     return str(value) if isinstance(value, Enum | Path) else value
+
+
+def json_value(value: Any) -> Any:
+    """Return a value as JSON has it: arrays become lists, and a number that is not finite becomes null.
+
+    A field of a dataclass whose metadata say ``optional`` is left out while it is None.
+    """
+    if is_dataclass(value):
+        parts = ((entry, getattr(value, entry.name)) for entry in fields(value))
+        return {
+            entry.name: json_value(part)
+            for entry, part in parts
+            if part is not None or not entry.metadata.get("optional")
+        }
+    if isinstance(value, Mapping):
+        return {str(key): json_value(part) for key, part in value.items()}
+    if hasattr(value, "tolist"):
+        return json_value(value.tolist())
+    if isinstance(value, list | tuple):
+        return [json_value(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 @cache

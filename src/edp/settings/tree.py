@@ -48,7 +48,7 @@ MOST_LISTED, MOST_KEY = 50, 100
 """Problems that a message lists, and characters of a key that it repeats."""
 
 
-def read_toml(path: str | Path) -> Table:
+def read_toml(path: str | Path) -> dict[str, object]:
     """Read a settings file.
 
     Raises:
@@ -57,7 +57,7 @@ def read_toml(path: str | Path) -> Table:
     return storage.read_toml(path, error=ConfigError)
 
 
-def parse_toml(text: str, where: str) -> Table:
+def parse_toml(text: str, where: str) -> dict[str, object]:
     """Parse settings from a text; error messages call the text `where`.
 
     Raises:
@@ -66,7 +66,7 @@ def parse_toml(text: str, where: str) -> Table:
     return storage.parse_toml(text, where, ConfigError)
 
 
-def merged(base: Table, change: Table) -> Table:
+def merged(base: Mapping[str, object], change: Mapping[str, object]) -> dict[str, object]:
     """Return `base` updated recursively with `change`. A table of another kind replaces the old table as a whole.
 
     A table that names no kind has options of whichever kind is named later.
@@ -74,16 +74,31 @@ def merged(base: Table, change: Table) -> Table:
     result = dict(base)
     for key, value in change.items():
         old = result.get(key)
-        same = (
-            isinstance(old, dict)
-            and isinstance(value, dict)
-            and ("kind" not in old or value.get("kind", old["kind"]) == old["kind"])
-        )
-        result[key] = merged(old, value) if same and isinstance(old, dict) else value
+        if isinstance(old, dict) and isinstance(value, dict):
+            same = "kind" not in old or value.get("kind", old["kind"]) == old["kind"]
+            result[key] = merged(old, value) if same else value
+        else:
+            result[key] = value
     return result
 
 
-def override(change: Change) -> Table:
+def value_at(table: object, path: str, default: Any = None) -> Any:
+    """Return the value at keys that are joined by points; a default where there is none."""
+    for key in path.split("."):
+        if not isinstance(table, Mapping) or key not in table:
+            return default
+        table = table[key]
+    return table
+
+
+def with_value(table: object, path: str, value: object) -> dict[str, object]:
+    """Return a table with another value at keys that are joined by points; missing tables on the way are added."""
+    key, _, rest = path.partition(".")
+    old = table if isinstance(table, Mapping) else {}
+    return {**old, key: with_value(old.get(key), rest, value) if rest else value}
+
+
+def override(change: Change) -> dict[str, object]:
     """Parse ``key.path=value`` into a table.
 
     A value that is not valid TOML becomes a string. A table is returned unchanged.
@@ -105,12 +120,12 @@ def override(change: Change) -> Table:
         return parse_toml(f'{key.strip()} = "{value.strip()}"', where)
 
 
-def combined(changes: Sequence[Table]) -> Table:
+def combined(changes: Sequence[Mapping[str, object]]) -> dict[str, object]:
     """All changes as one, before they are laid over settings: a kind and its options may be given in any order.
 
     Laid one by one, a kind that came last would take the options with it that came before.
     """
-    table: Table = {}
+    table: dict[str, object] = {}
     for change in changes:
         table = merged(table, change)
     return table
@@ -158,16 +173,16 @@ class SettingsTree:
             return [self.plain(item) for item in value]
         return str(value) if isinstance(value, Enum) else value
 
-    def _plain_fields(self, spec: Any) -> Table:
+    def _plain_fields(self, spec: Any) -> dict[str, object]:
         values = {entry.name: getattr(spec, entry.name) for entry in fields(spec)}
         return {name: self.plain(value, name) for name, value in values.items() if value is not None}
 
-    def build(self, cls: type[T], table: Mapping[str, object], where: str, path: str = "") -> T:
+    def build(self, cls: type[T], table: object, where: str, path: str = "") -> T:
         """Build a settings object from a table; missing keys take their defaults.
 
         Args:
             cls: dataclass of the tree's root.
-            table: nested plain values.
+            table: nested plain values by key.
             where: how messages call the file or the changes that the table is of.
             path: key of the table in that file; empty for the whole file.
 
@@ -189,7 +204,7 @@ class SettingsTree:
         path: str | Path | None,
         overrides: Sequence[str],
         of: str,
-        options: Table | None = None,
+        options: Mapping[str, object] | None = None,
     ) -> T:
         """Load a settings object from a file, then apply command options, then overrides.
 
@@ -203,8 +218,7 @@ class SettingsTree:
         Raises:
             ConfigError: names every unknown key, wrong type and impossible value at once.
         """
-        table: Table = {} if path is None else read_toml(path)
-        table = merged(table, options or {})
+        table = merged({} if path is None else read_toml(path), options or {})
         table = merged(table, combined([override(text) for text in overrides]))
         where = of if path is None else f"'{path}'"
         return self.build(cls, table, where + (" with --set" if overrides else ""))

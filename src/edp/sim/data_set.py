@@ -66,7 +66,7 @@ class SimulationOrder(DataSetSpec):
         scenario: str | Path | None = None,
         note: Callable[[str], None] | None = None,
         overrides: Sequence[str] = (),
-        **changes: Any,
+        **changes: object,
     ) -> SimulationOrder:
         """Create the order of a scenario file, or the default one; overrides and `changes` replace its values.
 
@@ -80,9 +80,10 @@ class SimulationOrder(DataSetSpec):
         """
         values: dict[str, Any] = {}
         if scenario is not None:
-            values = _flat(*read_scenario_file(scenario))
-        stated_changes = _flat(*scenario_changes(overrides))
-        stated_changes |= {key: value for key, value in changes.items() if value is not None}
+            values = read_scenario_file(scenario)
+        stated_changes = scenario_changes(overrides) | {
+            key: value for key, value in changes.items() if value is not None
+        }
         if stated_changes.get("family") and "machine" in stated_changes:
             raise ConfigError(
                 f"machine = {stated_changes['machine']} and family = {stated_changes['family']}: a family takes "
@@ -117,15 +118,9 @@ class SimulationOrder(DataSetSpec):
         return WriteOptions(mat_layout=self.layout or WriteOptions.mat_layout, truth=truth)
 
 
-def _flat(values: dict[str, Any], files: dict[str, str]) -> dict[str, Any]:
-    """Values of a data set and of how it is written, by the attributes of an order."""
-    suffix = {"suffix": suffix_of(files["format"])} if "format" in files else {}
-    return values | {key: value for key, value in files.items() if key != "format"} | suffix
-
-
-def _leave_out(values: dict[str, Any], changes: dict[str, Any]) -> Iterator[str]:
+def _leave_out(values: dict[str, object], changes: Mapping[str, object]) -> Iterator[str]:
     """Remove values of a file that the given ones make invalid; yields a message for each."""
-    suffix = changes.get("suffix", ".mat")
+    suffix = str(changes.get("suffix", ".mat"))
     if suffix != ".mat" and values.get("layout") and "layout" not in changes:
         yield f"layout '{values.pop('layout')}' is one of MAT files, and format {suffix[1:]} was asked for"
     if "machine" in changes and values.get("family"):
@@ -133,11 +128,6 @@ def _leave_out(values: dict[str, Any], changes: dict[str, Any]) -> Iterator[str]
     if not changes.get("family", values.get("family", 0)):
         values.pop("masses", None)
         values.pop("scatter", None)
-
-
-def suffix_of(form: str) -> str:
-    """``parquet`` or ``.parquet`` to ``.parquet``."""
-    return f".{form.lstrip('.')}"
 
 
 def simulate_data_set(
@@ -215,7 +205,7 @@ def write_log(identity: TrainingIdentity, where: Mapping[str, str]) -> dict[str,
     return {"name": scenario.name}
 
 
-def _bound(folder: Path, identity: dict[str, Any]) -> bool:
+def _bound(folder: Path, identity: Mapping[str, object]) -> bool:
     """Return whether a folder belongs to this order; False if it belongs to none."""
     manifest = folder / MANIFEST
     if not is_entry_at(manifest):
@@ -269,7 +259,8 @@ def find_data_set_limit(
     """
     spec = spec or LimitSpec()
     plan = order.scenarios()
-    key = _digest([identity_of(plan, WriteOptions()), asdict(spec)])
+    identity = json.dumps([identity_of(plan, WriteOptions()), asdict(spec)], sort_keys=True)
+    key = hashlib.blake2b(identity.encode(), digest_size=12).hexdigest()
     top = make_folder(folder)
     if is_entry_at(top / LimitFile.NAME):
         stored_limit = LimitFile.read(top)
@@ -283,20 +274,15 @@ def find_data_set_limit(
     return limit
 
 
-def _digest(value: Any) -> str:
-    return hashlib.blake2b(json.dumps(value, sort_keys=True).encode(), digest_size=12).hexdigest()
-
-
-def identity_of(plan: Sequence[Scenario], files: WriteOptions, suffix: str = ".parquet") -> dict[str, Any]:
+def identity_of(plan: Sequence[Scenario], files: WriteOptions, suffix: str = ".parquet") -> dict[str, object]:
     """Return the identity of a simulated data set in JSON types."""
-    identity: dict[str, Any] = {"schema": 1, "edp": __version__, "plan": [plain(entry) for entry in plan]}
+    identity: dict[str, object] = {"schema": 1, "edp": __version__, "plan": [plain(entry) for entry in plan]}
     # Only what departs from the usual: folders without these options keep their identity.
     if files != WriteOptions():
         identity["files"] = asdict(files)
     if suffix != ".parquet":
         identity["suffix"] = suffix
-    plain_identity: dict[str, Any] = json.loads(json.dumps(identity))
-    return plain_identity
+    return dict(json.loads(json.dumps(identity)))
 
 
 def bytes_needed(plan: Sequence[Scenario], suffix: str) -> int:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
 
 from edp.errors import ConfigError
-from edp.settings.tree import SettingsTree, Table, combined, merged, override
+from edp.settings.tree import SettingsTree, combined, merged, override
 from edp.sim.plan import DataSetSpec
 from edp.sim.predictability import LimitSpec
 from edp.storage import read_toml
@@ -47,8 +47,8 @@ _CHANGES = make_dataclass("ScenarioChanges", [(entry.name, _HINTS[entry.name], N
 """Some keys of a scenario file, without the checks of what belongs together: the file may hold the rest."""
 
 
-def read_scenario_file(path: str | Path) -> tuple[dict[str, object], dict[str, str]]:
-    """Read the stated values of a scenario file: fields of `DataSetSpec`, and the table ``[files]``.
+def read_scenario_file(path: str | Path) -> dict[str, object]:
+    """Read the stated values of a scenario file, by the attributes of `edp.sim.data_set.SimulationOrder`.
 
     Paths of machine and material files are relative to the scenario file.
 
@@ -60,7 +60,7 @@ def read_scenario_file(path: str | Path) -> tuple[dict[str, object], dict[str, s
     return _split_settings(settings, table)
 
 
-def scenario_changes(overrides: Sequence[str]) -> tuple[dict[str, object], dict[str, str]]:
+def scenario_changes(overrides: Sequence[str]) -> dict[str, object]:
     """Values of ``key.path=value`` overrides of a scenario file, in the form of `read_scenario_file`.
 
     Raises:
@@ -80,22 +80,30 @@ def limit_settings(path: str | Path | None, overrides: Sequence[str]) -> LimitSp
     return SettingsTree().build(LimitSpec, table.get("limit", {}), "[limit]", "limit")
 
 
-def _table(path: str | Path) -> Table:
+def _table(path: str | Path) -> dict[str, object]:
     source = Path(path)
     return _resolve_paths(read_toml(source, f"scenario file {source}", ConfigError), source.parent)
 
 
-def _merge_overrides(overrides: Sequence[str]) -> Table:
+def _merge_overrides(overrides: Sequence[str]) -> dict[str, object]:
     return combined([override(text) for text in overrides])
 
 
-def _split_settings(settings: Any, table: Table) -> tuple[dict[str, object], dict[str, str]]:
+def suffix_of(form: str) -> str:
+    """``parquet`` or ``.parquet`` to ``.parquet``."""
+    return f".{form.lstrip('.')}"
+
+
+def _split_settings(settings: Any, table: Mapping[str, object]) -> dict[str, object]:
     """Return the stated values of the data set and of the write options."""
     values = {key: getattr(settings, key) for key in table if key not in ("files", "limit")}
-    return values, SCENARIO_FILE.plain(settings.files) if settings.files is not None else {}
+    files = {} if settings.files is None else SCENARIO_FILE.plain(settings.files)
+    if "format" in files:
+        files["suffix"] = suffix_of(files.pop("format"))
+    return values | files
 
 
-def _resolve_paths(table: Table, folder: Path) -> Table:
+def _resolve_paths(table: Mapping[str, object], folder: Path) -> dict[str, object]:
     """Return the table with absolute paths of machine and material files."""
     resolved = dict(table)
     machine, materials = table.get("machine"), table.get("materials")

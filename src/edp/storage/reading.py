@@ -184,7 +184,7 @@ def read_toml(
     return parse_toml(text, where, error)
 
 
-def parse_toml(text: str, where: str, error: type[Exception] = StorageError) -> Table:
+def parse_toml(text: str, where: str, error: type[Exception] = StorageError) -> dict[str, object]:
     """Parse a TOML text.
 
     Raises:
@@ -209,7 +209,7 @@ def _refuse_mark(text: str) -> None:
         raise ValueError("it begins with a byte-order mark; save it as UTF-8 without one")
 
 
-def _distinct(pairs: Collection[tuple[str, Any]]) -> Table:
+def _distinct(pairs: Collection[tuple[str, object]]) -> dict[str, object]:
     table = dict(pairs)
     if len(table) < len(pairs):
         twice = next(name for name, count in Counter(name for name, _ in pairs).items() if count > 1)

@@ -45,7 +45,6 @@ from edp.recording import Recording
 from edp.report import build_report
 from edp.report.run.choice import FLOOR, note_test_result
 from edp.settings.provenance import Provenance, read_provenance
-from edp.settings.tree import Table
 from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.storage.headers import digests_of
 from edp.storage.ledger import TrainingIdentity, WithState
@@ -109,7 +108,7 @@ class StrategyFactory:
         frozen: names by digest of sessions that stay frozen for what comes of the run, beside those of its split.
     """
 
-    facts: Table
+    facts: Mapping[str, object]
     strategy: Callable[[Prepared], TrainingStrategy | DirectFit]
     frozen: Mapping[str, str] = field(default_factory=dict)
 
@@ -168,7 +167,7 @@ def train(
 
 
 def keep_fitted(
-    run: Run, source: DataSource, experiment: Experiment, data: Prepared, fitted: Fitted, facts: Table
+    run: Run, source: DataSource, experiment: Experiment, data: Prepared, fitted: Fitted, facts: Mapping[str, object]
 ) -> Bundle:
     """Write what `train` writes into an open run, for a training that took place elsewhere.
 
@@ -324,7 +323,7 @@ def _evaluate_models(
 
 
 def _unit(
-    label: str, does: Mapping[str, str | int], spec: JudgeSpec, digest: str, where: Mapping[str, Any]
+    label: str, does: Mapping[str, str | int], spec: JudgeSpec, digest: str, where: Mapping[str, object]
 ) -> WorkUnit:
     return WorkUnit(f"{__name__}:evaluate_unit", label, {**does, "judge": plain_tree(spec)}, digest, where)
 

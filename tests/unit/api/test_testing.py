@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 import edp
-from edp.config.experiment import load_experiment, plain_tree
+from edp.config.experiment import load_experiment
 from edp.errors import ConfigError, DataError, ExportError
 from edp.export import TARGETS
 from edp.logs.formats.base import RawLog, RawSignal, holds_truth_apart
@@ -23,6 +23,7 @@ from edp.networks.losses.base import Penalty
 from edp.networks.streaming import Cost, Streaming
 from edp.registry import Registry
 from edp.signals import Kind
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.modules import MODULES, add_modules, fitting
 
 
@@ -97,9 +98,9 @@ def test_a_sound_block_of_a_third_party_passes(monkeypatch):
     edp.testing.check_block(entered(monkeypatch, BLOCKS, "gain", block_of(Gain)))
     # A search screens it, with its options, and nothing but the registration told it so.
     assert MODULES["gain"].options == {"strength": [1.0, 2.0]}
-    settings = plain_tree(load_experiment(None, "quick", ["model.blocks=[]"]))
-    assert fitting(settings)[-1] == "gain"
-    assert add_modules(settings, ["gain"])["model"]["blocks"] == [{"kind": "gain"}]
+    arm = Arm.from_experiment(load_experiment(None, "quick", ["model.blocks=[]"]))
+    assert fitting(arm)[-1] == "gain"
+    assert add_modules(arm, ["gain"])["model.blocks"] == [{"kind": "gain"}]
 
 
 @pytest.mark.parametrize(

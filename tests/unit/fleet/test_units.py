@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from noted_progress import NotedProgress
+from read_progress_notes import NotedProgress
 
 from edp.errors import ConfigError, DataError, LostError
 from edp.jobs import IN_PROCESS, LocalPool, Workers

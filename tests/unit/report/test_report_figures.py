@@ -7,8 +7,8 @@ from edp.evaluation.scores_file import ModelScores
 from edp.report.common.chart import BLUE, GREY
 from edp.report.common.interactive import plots
 from edp.report.run import figures
-from edp.report.run.charts import run_charts
-from edp.report.run.facts import NETWORK, TRUTH, read_facts
+from edp.report.run.charts import learning_chart, run_charts
+from edp.report.run.facts import NETWORK, TRUTH, HistoryRow, read_facts
 
 
 def plots_of(facts):
@@ -93,10 +93,11 @@ def test_recordings_are_sorted_by_the_networks_error(facts):
 
 
 def test_the_best_epoch_is_the_last_one_marked(facts):
-    rows = ({"epoch": 1, "best": True}, {"epoch": 2, "best": True, "train_loss": float("nan")}, {"epoch": 3})
-    curves = figures.learning_curves(dataclasses.replace(facts, history=rows))
-    assert curves["best"] == [2.0]
-    assert curves["train_loss"] == [None, None, None]
+    tables = ({"epoch": 1, "best": True}, {"epoch": 2, "best": True, "train_loss": float("nan")}, {"epoch": "3"})
+    rows = tuple(map(HistoryRow.from_table, tables))
+    losses = learning_chart(dataclasses.replace(facts, history=rows)).panels[0].marks
+    assert losses[0].x == 2
+    assert (losses[1].x, losses[1].y) == ([1, 2, 3], [None, None, None])
 
 
 def test_log_ticks_cover_the_values():

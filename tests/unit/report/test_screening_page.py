@@ -22,6 +22,7 @@ from edp.data.screening import (
     Stability,
     Value,
 )
+from edp.evaluation.trials_file import FeatureSetTrial, PairedDifference, Trials
 from edp.report import build_screening_page, write_screening_pictures
 from edp.report.common.interactive import plots
 from edp.report.common.picture import write_pictures
@@ -78,22 +79,18 @@ def screening(names=NAMES):
     )  # fmt: skip
 
 
-TRIALS = {
-    "trials": [
-        {"name": "proposed", "channels": ["v", "u"], "parameters": 1200, "error": {"10": 4.2}, "difference": None},
-        {
-            "name": "all",
-            "channels": ["v"] * 4,
-            "parameters": 1300,
-            "error": {"10": 4.5},
-            "difference": {"10": {"mean": 0.3, "low": 0.1, "high": 0.5}},
-        },
-    ],
-    "persistence": {"10": 9.0},
-    "unit": "mm/s",
-    "held_out": ["r7"],
-    "notes": ["FG1 was not tried: the recordings lack BmUp"],
-}
+TRIALS = Trials(
+    (
+        FeatureSetTrial("proposed", ("v", "u"), 2, 1200, {"10": 4.2}, {"10": (4.2,)}, None, 1.0),
+        FeatureSetTrial(
+            "all", ("v",) * 4, 4, 1300, {"10": 4.5}, {"10": (4.5,)}, {"10": PairedDifference(0.3, 0.1, 0.5)}, 1.0
+        ),
+    ),
+    {"10": 9.0},
+    "mm/s",
+    ("r7",),
+    ("FG1 was not tried: the recordings lack BmUp",),
+)
 
 
 def figures_of(text):

@@ -5,10 +5,10 @@ import pytest
 from edp.config.experiment import load_experiment
 from edp.jobs.processes import LocalPool
 from edp.storage.ledger import Ledger, TrainingStatus
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.engine import Dispatcher, run_phases
 from edp.workflows.search.settings import IsolationSpec, SearchSpec
-from edp.workflows.search.trainings import settings_of
 
 CHANGES = (
     'task.targets=["speed"]',
@@ -29,7 +29,7 @@ class Stop(Exception):
 
 @pytest.fixture(scope="module")
 def context(lever_sessions):
-    base = settings_of(load_experiment(None, "quick", CHANGES))
+    base = Arm.from_experiment(load_experiment(None, "quick", CHANGES))
     names = tuple(f"s{number}" for number in range(5))
     return SearchContext(SPEC, base, lever_sessions.to_plain(), names[:4], names[4:], ("lever", "speed"))
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from noted_progress import NotedProgress
+from read_progress_notes import NotedProgress
 
 from edp.config.experiment import load_experiment, plain_tree
 from edp.data.frozen import SECOND_TEST_SET, ByFrozen, Session
@@ -31,7 +31,7 @@ from edp.workflows.compression import (
     search,
 )
 from edp.workflows.compression.quantise import quantise
-from edp.workflows.search.phases.compression import order_of, recipe_of, teacher_settings
+from edp.workflows.search.phases.compression import order_of, recipe_of, teacher_of
 from edp.workflows.search.plan import load_plan
 from edp.workflows.search.runner import Resources, run_search
 from edp.workflows.search.smaller import Recipe, before, make_smaller
@@ -306,19 +306,17 @@ def test_a_split_that_contradicts_itself_is_refused():
 
 def test_a_network_of_several_epochs_is_the_same_from_a_state_and_from_nothing(study, plan):
     context = replace(study.context, spec=replace(plan.spec, mode="thesis", epochs=3, updates=6, final_updates=6))
-    settings = teacher_settings(context)
     recipe = replace(recipe_of(context), units=2, rounded=True, final="w8a16")
-    order = order_of(context, settings, recipe, context.second)
+    order = order_of(context, teacher_of(context), recipe, context.second)
     assert (order.epochs, order.validation) == (3, context.validation)
     assert not set(order.train) & {*context.validation, *context.test, *context.second}
-    whole, state = make_smaller(order.to_json())
-    assert state is None
+    whole = make_smaller(order)
+    assert whole.state is None
     earlier = before(order)
     requests = [Recipe.from_json(one.recipe).order() for one in earlier]
     assert [request and request.name for request in requests] == ["u2_qat", "u2", None]
     assert not any(set(one.judged) & set(context.second) for one in earlier)
     for one in earlier:
-        found = make_smaller(order.to_json(), make_smaller(one.to_json())[1])[0]
-        assert {**found, "seconds": 0} == {**whole, "seconds": 0}
+        assert make_smaller(order, make_smaller(one).state) == whole
     experiment = Recipe.from_json(order.recipe).experiment(experiment_of(order))
     assert (experiment.training.epochs, experiment.training.updates) == (1, 1)

@@ -7,7 +7,7 @@ import signal
 import time
 
 import pytest
-from noted_progress import NotedProgress
+from read_progress_notes import NotedProgress
 
 import edp.storage
 from edp.config.experiment import load_experiment
@@ -26,13 +26,14 @@ from edp.storage.ledger import (
     read_state,
     state_path,
 )
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.engine import Dispatcher
 from edp.workflows.search.export import export_study
 from edp.workflows.search.jobs import job_of as job_of_order
 from edp.workflows.search.plan import load_plan
 from edp.workflows.search.runner import Resources, run_search
 from edp.workflows.search.study_log import look_at
-from edp.workflows.search.trainings import TrainingRequest, settings_of
+from edp.workflows.search.trainings import TrainingRequest
 
 TINY = (
     'task={targets=["speed"], horizons=[1]}',
@@ -94,7 +95,7 @@ CREW = Here(count=1)
 
 @pytest.fixture(scope="module")
 def order(lever_sessions):
-    settings = settings_of(load_experiment(None, "quick", [*TINY, 'task.features="all"']))
+    settings = Arm.from_experiment(load_experiment(None, "quick", [*TINY, 'task.features="all"'])).tables
     return TrainingRequest(settings, lever_sessions.to_plain(), ("s0", "s1", "s2"), ("s3", "s4"), seed=1, updates=12)
 
 

@@ -1,10 +1,9 @@
 """A whole search by the preset `thesis`, with a tiny network and budget: real trainings of several epochs."""
 
 import dataclasses
-import json
 
 import pytest
-from noted_progress import NotedProgress
+from read_progress_notes import NotedProgress
 
 from edp.config.experiment import load_experiment
 from edp.evaluation.study import read_study
@@ -12,6 +11,7 @@ from edp.jobs.perform import perform
 from edp.report import write_study_page
 from edp.storage.ledger import Ledger
 from edp.training.parts import fit_part
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.engine import Dispatcher
 from edp.workflows.search.jobs import job_of
 from edp.workflows.search.plan import load_plan
@@ -20,8 +20,6 @@ from edp.workflows.search.trainings import (
     TrainingRequest,
     experiment_of,
     prepared,
-    settings_of,
-    train_order,
     train_part,
 )
 
@@ -88,9 +86,8 @@ def plan():
 
 @pytest.fixture(scope="module")
 def order(lever_sessions, plan):
-    settings = settings_of(plan.experiment)
-    settings["task"]["features"] = "all"
-    settings["training"]["schedule"]["patience"] = 0
+    arm = Arm.from_experiment(plan.experiment)
+    settings = arm.with_value("task.features", "all").with_value("training.schedule.patience", 0).tables
     source = lever_sessions.to_plain()
     names = ("s0", "s1", "s2"), ("s3", "s4")
     return TrainingRequest(settings, source, *names, seed=1, updates=24, epochs=8, patience=3, validation=names[1])
@@ -100,25 +97,19 @@ def test_a_training_has_epochs_a_schedule_that_acts_and_an_early_stop(order):
     training = experiment_of(order).training
     assert (training.epochs, training.updates, training.patience, training.refit) == (8, 3, 3, "none")
     # A rate at which nothing gets better: the first epoch stays the best, and three more are waited for.
-    wild = json.loads(json.dumps(order.to_json()))
-    wild["settings"]["training"]["optimizer"]["learning_rate"] = 0.5
-    found = train_order(wild)
+    settings = Arm(order.settings).with_value("training.optimizer.learning_rate", 0.5).tables
+    wild = dataclasses.replace(order, settings=settings)
+    found = train_part(wild).result
     assert found["epochs"] == found["best_epoch"] + 3 < 8
     # What is judged is the best epoch: one that ends there and waits for nothing gives the same.
-    short = dataclasses.replace(
-        order, epochs=found["best_epoch"] + 1, updates=3 * (found["best_epoch"] + 1), patience=0
-    )
-    plain = short.to_json()
-    plain["settings"] = wild["settings"]
-    again = train_order(plain)
-    assert again["sessions"] == found["sessions"]
+    short = dataclasses.replace(wild, epochs=found["best_epoch"] + 1, updates=3 * (found["best_epoch"] + 1), patience=0)
+    assert train_part(short).result["sessions"] == found["sessions"]
 
 
 def test_the_plateau_lowers_the_rate(order):
-    settings = json.loads(json.dumps(order.settings))
-    settings["training"]["optimizer"]["learning_rate"] = 0.5
-    settings["training"]["schedule"] = {"kind": "plateau", "shrink": 0.5, "patience": 0, "threshold": 1e-4}
-    wild = dataclasses.replace(order, settings=settings, patience=0)
+    plateau = {"kind": "plateau", "shrink": 0.5, "patience": 0, "threshold": 1e-4}
+    arm = Arm(order.settings).with_value("training.optimizer.learning_rate", 0.5)
+    wild = dataclasses.replace(order, settings=arm.with_value("training.schedule", plateau).tables, patience=0)
     experiment = experiment_of(wild)
     fitted, _ = fit_part(prepared(wild, experiment), experiment.model, experiment.training, windowed=True)
     rates = [row["learning_rate"] for row in fitted.history]
@@ -127,30 +118,28 @@ def test_the_plateau_lowers_the_rate(order):
 
 
 def test_a_training_in_parts_of_epochs_is_the_training_without_them(order, tmp_path):
-    whole = train_order(order.to_json())
-    state, found = None, None
+    whole = train_part(order)
+    assert whole.state is None
+    state = None
     for stop in (1, 3, 6):
         part = dataclasses.replace(order, until=stop)
-        found, state = train_part(part.to_json(), state)
-        assert found["epochs"] <= stop
-        again, same = train_part(part.to_json())
-        assert same == state
-        assert {**again, "seconds": 0} == {**found, "seconds": 0}
-    found, nothing = train_part(order.to_json(), state)
-    assert nothing is None
-    assert {**found, "seconds": 0} == {**whole, "seconds": 0}
+        found = train_part(part, state)
+        assert found.result["epochs"] <= stop
+        assert train_part(part) == found
+        state = found.state
+    assert train_part(order, state) == whole
     with Ledger(tmp_path) as ledger:
         doing = Dispatcher(ledger, Inline(), "data")
         (first,) = doing([dataclasses.replace(order, until=3)])
         (last,) = doing([dataclasses.replace(order, stops=(3,))])
         assert first.status == last.status == "done"
-        assert last.result["sessions"] == whole["sessions"]
+        assert last.result["sessions"] == whole.result["sessions"]
 
 
 def test_the_judging_sessions_validate_and_predictions_are_made_window_by_window(order):
     """The same training judged as a stream of one epoch's length differs: there the state is carried on."""
     one = dataclasses.replace(order, epochs=1, updates=24, patience=0, validation=())
-    assert train_order(one.to_json())["sessions"] != train_order(order.to_json())["sessions"]
+    assert train_part(one).result["sessions"] != train_part(order).result["sessions"]
     identity = job_of(one, "data").identity
     assert "validation" not in identity.split
     assert "epochs" not in identity.config

@@ -264,7 +264,7 @@ def test_a_scenario_file_takes_tables(tmp_path):
         '[[faults]]\nkind = "internal_leak"\nsite = "boom"\nsize = 3\nunit = "L/min"\nonset_s = 1.5\n'
         '[[faults]]\nkind = "pressure_stuck"\nsite = "arm_rod"\non_s = 0.5\noff_s = 2\n'
     )
-    faults = read_scenario_file(file)[0]["faults"]
+    faults = read_scenario_file(file)["faults"]
     assert faults == faults_of(["internal_leak:boom:3L/min@1.5s", "pressure_stuck:arm_rod,on=0.5s,off=2s"], "here")
     assert all(
         scenario.faults == faults for scenario in DataSetSpec(minutes=0.1, recordings=2, faults=faults).scenarios()

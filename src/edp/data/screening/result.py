@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.storage.reading import Table
+from edp.settings.results import json_value
 
 Array = NDArray[np.float64]
 OnProgress = Callable[[str, float], None]
@@ -320,22 +319,6 @@ class ScreeningResult:
 
     def to_json(self) -> dict[str, object]:
         """Plain JSON values: arrays as lists, a number that is not finite as None."""
-        plain: Table = _plain(self)
-        plain["lag_table"] = _plain(self.lag_table())
-        plain["proposal"]["kept"] = list(self.proposal.kept)
-        plain["proposal"]["dropped"] = list(self.proposal.dropped)
-        return plain
-
-
-def _plain(value: Any) -> Any:
-    if is_dataclass(value):
-        return {entry.name: _plain(getattr(value, entry.name)) for entry in fields(value)}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+        proposal = {"kept": list(self.proposal.kept), "dropped": list(self.proposal.dropped)}
+        lag_table = json_value(self.lag_table())
+        return {**json_value(self), "proposal": {**json_value(self.proposal), **proposal}, "lag_table": lag_table}

@@ -14,7 +14,6 @@ from edp.errors import DataError, closest
 from edp.recording import Recording
 from edp.registry import Registry
 from edp.signals import TABLE_A1, TIME_UNITS, VOCABULARY, Kind, SignalMap
-from edp.storage.reading import Table
 
 Column = NDArray[np.float64]
 
@@ -112,7 +111,7 @@ class RawLog:
     rate_hz: float | None = None
     name: str | None = None
     source: str = ""
-    meta: Table = field(default_factory=dict)
+    meta: Mapping[str, object] = field(default_factory=dict)
     aliases: Mapping[str, str] = field(default_factory=dict)
     repeated: Mapping[str, Sequence[str]] = field(default_factory=dict)
     digest: str | None = None

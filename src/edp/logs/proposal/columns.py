@@ -201,7 +201,7 @@ def _look(path: Path, part: Path, note: str, experiment: str | None) -> LogLook:
         all(NAME_BY_PLACE.fullmatch(name) for name in raw.signals) and format_for(path).name == "csv",
         {reason: count for reason, count in left_out.items() if count},
         note,
-        tuple(raw.meta.get(EXPERIMENTS, ())),
+        _experiments(raw),
     )
 
 
@@ -209,6 +209,12 @@ def _drop_status_columns(raw: RawLog) -> RawLog:
     """Return the log without the status columns of the logging program, unless it has no others."""
     own = {name: signal for name, signal in raw.signals.items() if not name.startswith(_OF_THE_LOGGER)}
     return replace(raw, signals=own) if own else raw
+
+
+def _experiments(raw: RawLog) -> tuple[str, ...]:
+    """Return the names of the experiments that a file states."""
+    names = raw.meta.get(EXPERIMENTS)
+    return tuple(map(str, names)) if isinstance(names, list | tuple) else ()
 
 
 def _is_time_word(name: str) -> bool:
@@ -225,7 +231,7 @@ def _look_at_signals(path: Path, part: Path, note: str, signal_map: SignalMap) -
     except DataError:
         return None
     signals = [s for s in timed.signals.values() if s.time_s is not None and s.samples > 2]
-    experiments = tuple(timed.meta.get(EXPERIMENTS, ()))
+    experiments = _experiments(timed)
     if timed.rate_hz is not None or len({s.samples for s in signals}) < 2:
         return None
     texts = tuple(s.name for s in signals if not _is_numeric(s))

@@ -10,9 +10,10 @@ from functools import cache
 import numpy as np
 
 from edp.logs.quality.checks import Finding
-from edp.logs.quality.quality import QualityReport, plain, verdict_of
+from edp.logs.quality.quality import QualityReport, verdict_of
 from edp.logs.quality.repeats import Repeat, find_repeats
 from edp.logs.quality.sketches import Sketches
+from edp.settings.results import json_value
 from edp.signals import UNITS, Kind
 from edp.wording import typed
 
@@ -59,7 +60,7 @@ class DataQuality:
             "errors": self.errors,
             "recordings": [report.to_json() for report in self.reports],
             "repeats": [repeat.to_json() for repeat in self.repeats],
-            "cross_recording": [plain(vars(finding)) for finding in self.findings],
+            "cross_recording": [json_value(finding) for finding in self.findings],
         }
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from edp.logs.quality.checks import (
 )
 from edp.logs.quality.columns import columns
 from edp.recording import Recording
+from edp.settings.results import json_value
 from edp.signals import KINDS
 
 VERDICTS = {"error": "unusable", "warning": "check", "note": "good"}
@@ -112,8 +112,7 @@ class QualityReport:
 
     def to_json(self) -> dict[str, object]:
         """Plain JSON values; a number that is not finite becomes None."""
-        result: dict[str, object] = plain({**asdict(self), "verdict": self.verdict})
-        return result
+        return {**json_value(self), "verdict": self.verdict}
 
 
 def verdict_of(findings: Sequence[Finding]) -> str:
@@ -154,17 +153,6 @@ def inspect(
         tuple(facts),
         tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))),
     )
-
-
-def plain(value: Any) -> Any:
-    """Nested JSON values; a number that is not finite becomes None."""
-    if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 def _facts(looked: Looked, verdict: str) -> ChannelFacts:

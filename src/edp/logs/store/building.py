@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from edp.logs.assemble import Assembly, parts, prepare
 from edp.logs.buckets import RemoteFile, copied
 from edp.logs.detect import open_log
 from edp.logs.formats.names import name_of_file
-from edp.logs.repair import Repair
+from edp.logs.repair import Repair, repairs_of
 from edp.logs.resolve import resolve
 from edp.logs.store.index import (
     BATCH_BYTES,
@@ -67,7 +67,6 @@ from edp.storage.paths import (
     is_there,
     status_of,
 )
-from edp.storage.reading import Table
 
 KEY_SCHEMA = 1
 """Version of what `StoredLog.key` covers."""
@@ -170,7 +169,7 @@ def build_store(
         check_writable(make_folder(top / ROWS))
         remove_unfinished(top / ROWS)
         remove_unfinished(top)
-        return _build_index(_distinct(logs), top, workers, progress)
+        return _build_index({log.key: log for log in logs}, top, workers, progress)
     finally:
         release(top / LOCK, lock) if is_file_at(top / INDEX) else lock.close()
 
@@ -178,8 +177,8 @@ def build_store(
 def _build_index(logs: dict[str, StoredLog], top: Path, workers: Workers, progress: Progress) -> StoreIndex:
     before = read_index(top) if is_file_at(top / INDEX) else StoreIndex()
     index = _drop_replaced(_drop_lost(before, top), logs)
-    for record in _records_beside(top, index):
-        index = _add_record(index, record, logs)
+    for batch_index in _records_beside(top, index):
+        index = _add_record(index, batch_index, logs)
     stored = {entry.log_key for entry in index.recordings}
     index = replace(index, refused=())
     missing = {key: log for key, log in logs.items() if key not in stored}
@@ -188,20 +187,21 @@ def _build_index(logs: dict[str, StoredLog], top: Path, workers: Workers, progre
     read = progress.stage("log", len(logs))
     read.step(done)
     refused = 0
-    records: dict[int, Table] = {}
+    indices: dict[int, StoreIndex] = {}
     for number, result in workers.map([_unit(batch) for batch in batches]):
         batch = batches[number]
-        records[number] = parse_json((result.content or b"").decode(), f"record of {batch.label}", DataError)
-        if records[number]["recordings"] and not is_file_at(rows_path(top, batch.key)):
+        where = f"record of {batch.label}"
+        indices[number] = index_of(parse_json((result.content or b"").decode(), where, DataError), where)
+        if indices[number].recordings and not is_file_at(rows_path(top, batch.key)):
             raise StorageError(
                 f"{batch.label} was stored on another node, and is not in '{full_path(top)}' here; give a folder that "
                 "all nodes see under the same path"
             )
         done += len(batch.logs)
-        refused += len(records[number]["refused"])
+        refused += len(indices[number].refused)
         read.step(done, refused=refused)
     for number in range(len(batches)):
-        index = _add_record(index, records[number], logs)
+        index = _add_record(index, indices[number], logs)
     order = {key: number for number, key in enumerate(logs)}
     # As the logs are in order; those of earlier builds first.
     recordings = sorted(index.recordings, key=lambda entry: order.get(entry.log_key, -1))
@@ -222,11 +222,6 @@ def _sort_index(index: StoreIndex) -> StoreIndex:
         recordings.append(replace(entry, channels=number))
     rows = tuple(files[key] for key in used)
     return replace(index, lists=tuple(lists), files=rows, recordings=tuple(recordings))
-
-
-def _distinct(logs: Sequence[StoredLog]) -> dict[str, StoredLog]:
-    """Return the logs by key, without duplicates."""
-    return {log.key: log for log in logs}
 
 
 def _drop_replaced(index: StoreIndex, logs: dict[str, StoredLog]) -> StoreIndex:
@@ -262,7 +257,9 @@ def _batches(logs: dict[str, StoredLog], folder: Path) -> list[LogBatch]:
             left = bound
         groups[-1].append((key, log))
         left -= sizes[key]
-    return [LogBatch(folder, _batch_key([key for key, _ in group]), tuple(group)) for group in groups]
+    keys = ("".join(key for key, _ in group) for group in groups)
+    digests = (hashlib.blake2b(key.encode(), digest_size=16).hexdigest() for key in keys)
+    return [LogBatch(folder, digest, tuple(group)) for digest, group in zip(digests, groups, strict=True)]
 
 
 def _unit(batch: LogBatch) -> WorkUnit:
@@ -287,11 +284,7 @@ def read_batch(identity: TrainingIdentity, where: Mapping[str, LogBatch]) -> Wit
     return WithState({}, json.dumps(store_batch(batch)).encode())
 
 
-def _batch_key(keys: Sequence[str]) -> str:
-    return hashlib.blake2b("".join(keys).encode(), digest_size=16).hexdigest()
-
-
-def store_batch(batch: LogBatch) -> Table:
+def store_batch(batch: LogBatch) -> dict[str, object]:
     """Read the logs of a batch into one data file, in a separate process.
 
     Returns:
@@ -304,7 +297,7 @@ def store_batch(batch: LogBatch) -> Table:
         for key, log in batch.logs:
             at = stream.tell()
             try:
-                with _copy_locally(log) as near:
+                with nullcontext(log.path) if log.remote is None else copied(log.remote) as near:
                     entry, channels = _store_log(replace(log, path=near), key, batch.key, first, stream.write)
                 # What a recording says of its source must not be the copy, which is gone.
                 entry = replace(
@@ -338,11 +331,6 @@ def store_batch(batch: LogBatch) -> Table:
     return record
 
 
-def _copy_locally(log: StoredLog) -> AbstractContextManager[Path]:
-    """Return the log as a local file."""
-    return nullcontext(log.path) if log.remote is None else copied(log.remote)
-
-
 def _store_log(
     log: StoredLog, key: str, rows: str, first: int, write: Callable[[Any], object]
 ) -> tuple[StoreEntry, tuple[Channel, ...]]:
@@ -354,7 +342,7 @@ def _store_log(
     assembly = prepare(raw, sources, log.signal_map, log.repair, log.rows)
     channels = tuple(entry.channel for entry in sources)
     digest = Digest(assembly.rate_hz, channels)
-    meta: Table = dict(raw.meta)
+    meta = dict(raw.meta)
     source = str(log.path)
     name = log.name or raw.name or name_of_file(raw.path)
     for part in parts(assembly, PART_SAMPLES, name):
@@ -380,10 +368,10 @@ def _store_log(
     return entry, channels
 
 
-def _merge_meta(meta: Table, part: Any) -> Table:
+def _merge_meta(meta: Mapping[str, object], part: Mapping[str, object]) -> dict[str, object]:
     """Merge the metadata of a log with those of one more part; each repair occurs once."""
-    repairs = list(meta.get("repairs", []))
-    repairs += [repair for repair in part.get("repairs", []) if repair not in repairs]
+    repairs = repairs_of(meta)
+    repairs += [repair for repair in repairs_of(part) if repair not in repairs]
     return {**meta, **part, **({"repairs": repairs} if repairs else {})}
 
 
@@ -395,7 +383,7 @@ def _check_digest(assembly: Assembly, digest: str) -> None:
         )
 
 
-def _records_beside(top: Path, index: StoreIndex) -> Iterator[Table]:
+def _records_beside(top: Path, index: StoreIndex) -> Iterator[StoreIndex]:
     """Yield the batch records of an earlier build that are not in the index. Logs of damaged records are read again."""
     present = {file.key for file in index.files}
     for path in entries_of(top / ROWS, "*.json"):
@@ -409,12 +397,11 @@ def _records_beside(top: Path, index: StoreIndex) -> Iterator[Table]:
             batch = index_of(record, where)
             check_places(batch, where)
             if [(file.key, file.bytes) for file in batch.files] == [(path.stem, _size(rows_path(top, path.stem)))]:
-                yield record
+                yield batch
 
 
-def _add_record(index: StoreIndex, record: dict[str, object], logs: dict[str, StoredLog]) -> StoreIndex:
+def _add_record(index: StoreIndex, batch: StoreIndex, logs: dict[str, StoredLog]) -> StoreIndex:
     """Return the index extended by the requested recordings of a batch."""
-    batch = index_of(record, "record of a batch of the store")
     lists = list(index.lists)
     recordings = list(index.recordings)
     there = {entry.log_key for entry in recordings}

@@ -192,7 +192,7 @@ def check_seal(table: dict[str, object], where: str) -> dict[str, object]:
     return plain
 
 
-def index_of(table: dict[str, object], where: str) -> StoreIndex:
+def index_of(table: object, where: str) -> StoreIndex:
     """Build an index from JSON types, checking each type.
 
     Raises:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import replace
 
 from edp.report.common.chart import (
     BLUE,
@@ -17,13 +17,13 @@ from edp.report.common.chart import (
     GuideLine,
     Mark,
     Panel,
+    Symbol,
     Texts,
     append_unit,
 )  # fmt: skip
 from edp.report.compare.paired import Comparison
-from edp.report.compare.runs import FREE, ComparedRun, Measure
+from edp.report.compare.runs import FREE, ComparedRun
 from edp.report.run.figures import log_ticks
-from edp.storage.reading import Table
 from edp.wording import figure, short_labels
 
 MOST_ROWS = 40
@@ -36,23 +36,22 @@ def compare_charts(comparison: Comparison) -> list[Chart]:
     return [chart for chart in (maker(comparison) for maker in makers) if chart is not None]
 
 
-def _looks(comparison: Comparison) -> list[Table]:
-    """Return name, colour and symbol of each run; the first one, the reference, is dark grey."""
+def _all_series(comparison: Comparison) -> list[DataSeries]:
+    """Return the series of each run without points; the first run, the reference, is dark grey."""
     names = short_labels(run.name for run in comparison.runs)
     colours = (GREY, BLUE, *MUTED)
+    symbols: tuple[Symbol, ...] = ("circle", *SYMBOLS)
     return [
-        {
-            "name": name,
-            "colour": colours[position % len(colours)],
-            "symbol": ("circle", *SYMBOLS)[position % (1 + len(SYMBOLS))],
-            "rank": position,
-        }
+        DataSeries(
+            x=(),
+            y=(),
+            name=name,
+            colour=colours[position % len(colours)],
+            symbol=symbols[position % len(symbols)],
+            rank=position,
+        )
         for position, name in enumerate(names)
     ]
-
-
-def _choice(measures: Sequence[Measure]) -> Control:
-    return Control("measure", "Error", tuple((str(i), measure.text()) for i, measure in enumerate(measures)))
 
 
 def change_chart(comparison: Comparison) -> Chart | None:
@@ -61,12 +60,13 @@ def change_chart(comparison: Comparison) -> Chart | None:
     rows = [measure.text() for measure in comparison.measures]
     marks.append(DataSeries(x=[0.0] * len(rows), y=rows, hover=None))
     by_measure = [comparison.differences(measure) for measure in comparison.measures]
-    for run, look in list(zip(comparison.runs, _looks(comparison), strict=True))[1:]:
+    for run, series in list(zip(comparison.runs, _all_series(comparison), strict=True))[1:]:
         own = [differences[run.name] for differences in by_measure]
-        marks.append(DataSeries(
-            x=[100 * d.change for d in own], y=rows, low=[100 * (d.change if d.low is None else d.low) for d in own],
+        marks.append(replace(
+            series, x=[100 * d.change for d in own], y=rows,
+            low=[100 * (d.change if d.low is None else d.low) for d in own],
             high=[100 * (d.change if d.high is None else d.high) for d in own], size=8, hover="{label}",
-            labels=[d.text() for d in own], **look,
+            labels=[d.text() for d in own],
         ))  # fmt: skip
     marks.append(GuideLine(x=0.0))
     across = ChartAxis(f"Error against {short_labels([comparison.runs[0].name])[0]} [%]", grid=True)
@@ -90,9 +90,9 @@ def horizon_chart(comparison: Comparison) -> Chart | None:
         if min(len(x) for x, _ in curves) < 2:
             continue
         shown.append(output)
-        for (x, y), look in zip(curves, _looks(comparison), strict=True):
-            marks.append(DataSeries(x=x, y=y, width=2.0, size=0 if free else 7, when={"output": output},
-                                    **(look | ({"symbol": ""} if free else {}))))  # fmt: skip
+        for (x, y), series in zip(curves, _all_series(comparison), strict=True):
+            line = replace(series, symbol="", size=0) if free else series
+            marks.append(replace(line, x=x, y=y, width=2.0, when={"output": output}))
     if not shown:
         return None
     unit = next(m.unit for m in comparison.measures)
@@ -120,30 +120,32 @@ def recording_chart(comparison: Comparison) -> Chart | None:
     for position, measure in enumerate(measures):
         when = {"measure": str(position)}
         marks.append(DataSeries(x=[None] * len(order), y=list(labels.values()), when=when, hover=None))
-        for run, look in zip(comparison.runs, _looks(comparison), strict=True):
+        for run, series in zip(comparison.runs, _all_series(comparison), strict=True):
+            series = replace(series, size=9, when=when, labels=order, hover="{label}: {x:.4g}")
             errors = [run.errors[measure].get(name) for name in order]
-            marks.append(DataSeries(x=errors, y=list(labels.values()), size=9, when=when, labels=order,
-                                    hover="{label}: {x:.4g}", **look))  # fmt: skip
+            marks.append(replace(series, x=errors, y=list(labels.values())))
     across = ChartAxis(append_unit("Error", comparison.measures[0].unit), from_zero=True, grid=True)
     panel = Panel(tuple(marks), across, ChartAxis(kind="names", upside_down=True, grid=True))
-    return Chart("recordings", (panel,), choices=(_choice(measures),), height=110 + 24 * len(order))
+    choice = Control("measure", "Error", tuple((str(i), measure.text()) for i, measure in enumerate(measures)))
+    return Chart("recordings", (panel,), choices=(choice,), height=110 + 24 * len(order))
 
 
 def learning_chart(comparison: Comparison) -> Chart | None:
     """Return the validation error of each run against epochs, or against training time."""
     marks: list[Mark] = []
     values: list[float | None] = []
-    for run, look in zip(comparison.runs, _looks(comparison), strict=True):
-        for way, key in (("epoch", "epoch"), ("seconds", "seconds")):
-            points = [
-                (row.get(key, row.get("update")), row.get("validation_mae", row.get("validation")))
-                for row in run.history
-            ]
-            pairs = [(x, y) for x, y in points if isinstance(x, int | float) and isinstance(y, int | float)]
+    for run, series in zip(comparison.runs, _all_series(comparison), strict=True):
+        errors = [row.validation if row.validation_mae is None else row.validation_mae for row in run.history]
+        for way, ends in (
+            ("epoch", [row.epoch for row in run.history]),
+            ("seconds", [row.seconds for row in run.history]),
+        ):
+            spots = [row.update if end is None else end for row, end in zip(run.history, ends, strict=True)]
+            pairs = [(x, y) for x, y in zip(spots, errors, strict=True) if x is not None and y is not None]
             if pairs:
                 x, y = zip(*pairs, strict=True)
                 values += y
-                marks.append(DataSeries(x=x, y=y, width=1.8, size=5, when={"way": way}, **look))
+                marks.append(replace(series, x=x, y=y, width=1.8, size=5, when={"way": way}))
     if not marks:
         return None
     free = comparison.runs[0].kind == FREE
@@ -165,11 +167,11 @@ def cost_chart(comparison: Comparison) -> Chart | None:
         return None
     measure = comparison.measures[0]
     marks: list[Mark] = []
-    for run, look in zip(comparison.runs, _looks(comparison), strict=True):
+    for run, series in zip(comparison.runs, _all_series(comparison), strict=True):
         for position, cost in enumerate(costs):
             at, error, when = [run.costs[cost]], [comparison.error(run, measure)], {"cost": str(position)}
-            marks.append(DataSeries(x=at, y=error, size=11, when=when, hover="{y:.4g} with {x:,}", **look))
-            marks.append(Texts(x=at, y=error, texts=[str(look["name"])], raised=True, when=when))
+            marks.append(replace(series, x=at, y=error, size=11, when=when, hover="{y:.4g} with {x:,}"))
+            marks.append(Texts(x=at, y=error, texts=[series.name], raised=True, when=when))
     choice = Control("cost", "Cost", tuple((str(position), cost) for position, cost in enumerate(costs)), alone=True)
     across = ChartAxis("Cost", kind="log", ticks=ROUND_TICKS)
     up = ChartAxis(append_unit("Error", measure.unit), from_zero=True)

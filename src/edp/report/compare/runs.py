@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +13,12 @@ from numpy.typing import NDArray
 from edp.errors import ConfigError, DataError, count_of
 from edp.evaluation.controller import Budget
 from edp.evaluation.free_run_file import TWIN, ChannelErrors
-from edp.report.run.facts import NETWORK, TRUTH, Facts, label_of, read_facts, read_history
+from edp.report.run.facts import NETWORK, TRUTH, Facts, HistoryRow, label_of, read_facts, read_history
 from edp.report.twin.facts import holds_free_runs, read_free_runs
 from edp.settings.provenance import Provenance
+from edp.settings.tree import value_at
 from edp.storage import read_object
 from edp.storage.paths import full_path, is_file_at
-from edp.storage.reading import Table
 from edp.storage.runs import describe_unfinished
 from edp.wording import figure, unit_text
 
@@ -84,7 +83,7 @@ class ComparedRun:
     label: str
     errors: Mapping[Measure, Mapping[str, float]]
     curves: Mapping[str, tuple[Sequence[float], Sequence[float | None]]] = field(default_factory=dict)
-    history: tuple[Mapping[str, Any], ...] = ()
+    history: tuple[HistoryRow, ...] = ()
     costs: Mapping[str, float] = field(default_factory=dict)
     digest: str = ""
     predictions: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
@@ -123,7 +122,10 @@ def read_runs(folders: Sequence[str | Path]) -> list[ComparedRun]:
     for position, path in enumerate(real):
         if path in real[:position]:
             raise ConfigError(f"'{paths[position]}' came twice; name each run once")
-    runs = [_read(path, name) for path, name in zip(paths, _names(real), strict=True)]
+    runs = [
+        _twin(path, name) if holds_free_runs(path) else _network(path, name)
+        for path, name in zip(paths, _names(real), strict=True)
+    ]
     if len({run.kind for run in runs}) > 1:
         free = [run.name for run in runs if run.kind == FREE]
         raise DataError(
@@ -141,10 +143,6 @@ def _names(paths: Sequence[Path]) -> list[str]:
         if len(set(names)) == len(names):
             return names
     return [str(path) for path in paths]
-
-
-def _read(path: Path, name: str) -> ComparedRun:
-    return _twin(path, name) if holds_free_runs(path) else _network(path, name)
 
 
 def _network(path: Path, name: str) -> ComparedRun:
@@ -175,7 +173,7 @@ def _network(path: Path, name: str) -> ComparedRun:
         errors=errors,
         history=whole.history,
         costs=_costs(whole),
-        digest=_digest(facts.provenance),
+        digest=(facts.provenance or Provenance()).origin.digest or "",
         predictions=facts.predictions,
         targets=tuple((target.name, target.factor) for target in facts.targets),
         horizons=facts.horizons,
@@ -190,10 +188,6 @@ def _outputs(facts: Facts) -> list[tuple[str, str]]:
     if len(outputs) == 1:
         return outputs
     return [(MEAN, facts.unit), *outputs] if facts.averaged else outputs
-
-
-def _digest(provenance: Provenance | None) -> str:
-    return "" if provenance is None else provenance.origin.digest or ""
 
 
 def _costs(facts: Facts) -> dict[str, float]:
@@ -212,10 +206,6 @@ def _costs(facts: Facts) -> dict[str, float]:
     return _positive(costs)
 
 
-def _table(value: Any) -> Table:
-    return value if isinstance(value, dict) else {}
-
-
 def _positive(values: Mapping[str, object]) -> dict[str, float]:
     numbers = {name: value for name, value in values.items() if isinstance(value, int | float) and value is not True}
     return {name: float(value) for name, value in numbers.items() if 0 < value < math.inf}
@@ -232,21 +222,18 @@ def _twin(path: Path, name: str) -> ComparedRun:
     horizons = twin.by_horizon
     curves = {output: (horizons.seconds, values) for output, values in horizons.strokes.by_channel.items()}
     history = path / "history.jsonl"
+    header = read_object(path / HEADER) if is_file_at(path / HEADER) else {}
     return ComparedRun(
         name=name,
         folder=path,
         kind=FREE,
-        label=str(_table(read_object(path / HEADER).get("twin")).get("kind", TWIN)) if _has_header(path) else TWIN,
+        label=str(value_at(header, "twin.kind", TWIN)),
         errors=errors,
         curves=curves,
         history=read_history(history) if is_file_at(history) else (),
         costs=_positive({"Parameters": facts.provenance.more.get("parameters")}),
-        digest=_digest(facts.provenance),
+        digest=facts.provenance.origin.digest or "",
     )
-
-
-def _has_header(path: Path) -> bool:
-    return is_file_at(path / HEADER)
 
 
 def _add(errors: dict[Measure, dict[str, float]], row: ChannelErrors, recording: str, what: str, at: float) -> None:

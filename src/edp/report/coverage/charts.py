@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.data.coverage import Coverage, JointHistogram, Occupancy
+from edp.data.coverage import Coverage, Occupancy
 from edp.data.spectrum import FLAT_DB
 from edp.report.common.chart import (
     DASHES,
@@ -133,9 +133,10 @@ def joint_chart(coverage: Coverage, group: str) -> Chart | None:
     for joint, share in zip(joints, shares, strict=True):
         x, y = _middles(joint.x_range, share.shape[1]), _middles(joint.y_range, share.shape[0])
         cells = _cells(x, y, share, top, "% of the samples", "{x:.4g}, {y:.4g}: {label:.3f} %")
+        title = f"correlation {joint.correlation:.2f}, {joint.information:.2f} nat".replace("-", "−")
         panels.append(Panel(
             (replace(cells, barred=len(panels) == 0),), ChartAxis(append_unit(names[joint.x], joint.x_unit)),
-            ChartAxis(append_unit(names[joint.y], joint.y_unit), grid=False), _title(joint),
+            ChartAxis(append_unit(names[joint.y], joint.y_unit), grid=False), title,
         ))  # fmt: skip
     height = 60 + 270 * -(-len(joints) // columns)
     return Chart(GROUPS[group], tuple(panels), columns=columns, height=height, legend="none")
@@ -150,10 +151,6 @@ def _cells(x: list[float], y: list[float], share: NDArray[np.float64], top: floa
         x=x, y=y, values=np.where(share > 0, level, np.nan), shown=share, scale=SCALE, ends=(0.0, float(DECADES)),
         unit=unit.replace(" of", "\nof"), ticks=ticks, hover=hover, remark="",
     )  # fmt: skip
-
-
-def _title(joint: JointHistogram) -> str:
-    return f"correlation {joint.correlation:.2f}, {joint.information:.2f} nat".replace("-", "−")
 
 
 def _centres(occupancy: Occupancy, axis: int) -> list[float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from edp.errors import count_of
-from edp.logs import DataQuality, Finding, QualityReport
+from edp.logs import DataQuality, Finding
 from edp.report.common.page import Fold, Section
 from edp.table import Column, Table
 from edp.wording import MISSING, count_text, figure, number, percent
@@ -40,7 +40,7 @@ def recordings_table(quality: DataQuality) -> Table:
             number(report.jitter, 3),
             count_text(sum(clock.gaps for clock in report.clocks)),
             count_text(sum(channel.missing for channel in report.channels)),
-            _count(report, "warning"),
+            count_text(sum(finding.severity == "warning" for finding in report.findings)),
             report.verdict,
         )
         for report in quality.reports
@@ -115,10 +115,6 @@ def findings_table(quality: DataQuality) -> Table:
 
 def _key(finding: Finding) -> tuple[str, str, str, str]:
     return finding.severity, finding.channel or "", finding.what, finding.advice
-
-
-def _count(report: QualityReport, severity: str) -> str:
-    return count_text(sum(finding.severity == severity for finding in report.findings))
 
 
 def _where(names: list[str]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
 
 from edp import __version__
 
@@ -58,7 +57,7 @@ class MachineAlarms:
     first: tuple[str, ...] = ()
     failed: str = ""
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain JSON values."""
         if self.failed:
             return {"failed": self.failed}
@@ -106,7 +105,7 @@ class ReportedMachine:
     errors: MachineErrors | None = None
     failed: str = ""
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain JSON values."""
         head = {"machine": self.machine, "minutes": self.minutes}
         if self.errors is None:
@@ -137,6 +136,7 @@ class FleetReport:
     """Every machine of a store under one network.
 
     Attributes:
+        edp: version that evaluated them.
         network: of the fleet.
         store: path of the store.
         deltas: folder of deltas; None without them.
@@ -145,9 +145,9 @@ class FleetReport:
         rate_hz: samples per second.
         targets: outputs.
         machines: in the order of the store.
-        edp: version that evaluated them.
     """
 
+    edp: str = __version__
     network: ReportedNetwork
     store: str
     deltas: str | None
@@ -156,19 +156,8 @@ class FleetReport:
     rate_hz: float
     targets: tuple[ReportedTarget, ...]
     machines: tuple[ReportedMachine, ...] = ()
-    edp: str = __version__
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the content of ``fleet_report.json``."""
-        return {
-            "schema": SCHEMA,
-            "edp": self.edp,
-            "network": asdict(self.network),
-            "store": self.store,
-            "deltas": self.deltas,
-            "monitor": self.monitor,
-            "horizon": self.horizon,
-            "rate_hz": self.rate_hz,
-            "targets": [asdict(target) for target in self.targets],
-            "machines": [machine.to_json() for machine in self.machines],
-        }
+        machines = [machine.to_json() for machine in self.machines]
+        return {"schema": SCHEMA, **asdict(self), "machines": machines}

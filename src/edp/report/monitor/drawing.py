@@ -34,6 +34,7 @@ MOST_EVIDENCE = 10
 MOST_ROWS = 120
 """Recordings of the overview."""
 MARKS = {"stop": "#b3261e", "warning": "#8f5c10", "note": "#2f7566"}
+TINTS = {"stop": "#f7dcda", "warning": "#f8ead6", "note": "#e0efeb"}
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ def timeline(trace: RecordingTrace, facts: MonitorFacts) -> Drawing:
     for alarm in alarms:
         left, right = across(max(alarm.since_s, 0.0)), across(min(alarm.raised_s, seconds))
         text = f"{alarm.severity}: {alarm.sentence}"
-        boxes.append(Box(left, 8, max(right - left, 1.0), PLOT_HEIGHT - 8, _tint(alarm.severity), text))
+        boxes.append(Box(left, 8, max(right - left, 1.0), PLOT_HEIGHT - 8, TINTS[alarm.severity], text))
         boxes.append(Box(right - 1.5, 8, 3.0, PLOT_HEIGHT - 8, MARKS[alarm.severity], text))
     rows, row_labels = _group_rows(trace, facts, across)
     bottom = PLOT_HEIGHT + 12 + ROW * len(facts.traces.groups)
@@ -250,7 +251,3 @@ def _ticks(seconds: float, across: Across, bottom: float, trace: RecordingTrace 
     step = next((value for value in steps if seconds / value <= 10), steps[-1])
     times = np.arange(0.0, seconds + 1e-9, step)[:40]
     return [Label(across(float(time)), bottom + 16, clock(float(time), start), "middle") for time in times]
-
-
-def _tint(severity: str) -> str:
-    return {"stop": "#f7dcda", "warning": "#f8ead6", "note": "#e0efeb"}[severity]

@@ -26,12 +26,12 @@ from edp.report.common.chart import (
     Mark,
     Panel,
     Range,
+    Symbol,
     append_unit,
 )  # fmt: skip
 from edp.report.run import figures
 from edp.report.run.facts import INPUTS, NETWORK, TRUTH, Facts, horizon_text, label_of, main_horizon
 from edp.signals import display_offset
-from edp.storage.reading import Table
 from edp.wording import figure, label_by_name, short_labels
 
 MOST_PANELS, MOST_SERIES = 6, 7
@@ -75,18 +75,20 @@ def interval_name(facts: Facts) -> str:
     return f"{100 * coverages[nearest_to_shown(coverages)]:.0f} % interval" if coverages else "Interval"
 
 
-def _look(facts: Facts, model: str) -> Table:
-    """Name, line, symbol and legend place of a model in the figures of errors."""
+def _series(facts: Facts, model: str) -> DataSeries:
+    """Return the series of a model without points, as it looks in the figures of errors."""
     network = model == NETWORK
-    return {
-        "name": name_of(facts, model),
-        "colour": colour(facts, model),
-        "width": 2.6 if network else 1.4,
+    return DataSeries(
+        x=(),
+        y=(),
+        name=name_of(facts, model),
+        colour=colour(facts, model),
+        width=2.6 if network else 1.4,
         # Colour is never the only difference.
-        "symbol": "circle" if network else SYMBOLS[_place(facts, model) % len(SYMBOLS)],
-        "size": 8 if network else 7,
-        "rank": 1 if network else 10 + _place(facts, model),
-    }
+        symbol="circle" if network else SYMBOLS[_place(facts, model) % len(SYMBOLS)],
+        size=8 if network else 7,
+        rank=1 if network else 10 + _place(facts, model),
+    )
 
 
 def _error_axis(facts: Facts, of: str = MEASURE_NAME) -> ChartAxis:
@@ -188,7 +190,7 @@ def horizon_chart(facts: Facts) -> Chart | None:
     marks = []
     for name in _network_last(curves):
         x, y = zip(*curves[name], strict=True)
-        marks.append(DataSeries(x=x, y=y, **_look(facts, name)))
+        marks.append(replace(_series(facts, name), x=x, y=y))
     across = ChartAxis("Horizon [ms]" if facts.rate_hz else "Horizon [samples]", from_zero=True)
     return Chart("horizon", (Panel(tuple(marks), across, _error_axis(facts)),), height=340, together=True)
 
@@ -208,11 +210,8 @@ def speed_chart(facts: Facts) -> Chart | None:
         bands, when = figures.speed_bands(facts, horizon), {"horizon": str(horizon)}
         for name in _network_last(bands):
             labels = [_band(row) for row in bands[name]]
-            errors.append(
-                DataSeries(
-                    x=labels, y=[row.mae if row.count else None for row in bands[name]], when=when, **_look(facts, name)
-                )
-            )
+            maes = [row.mae if row.count else None for row in bands[name]]
+            errors.append(replace(_series(facts, name), x=labels, y=maes, when=when))
         rows = next(iter(bands.values()))
         total = sum(row.count for row in rows) or 1
         counts.append(Bars(
@@ -243,13 +242,13 @@ def recording_chart(facts: Facts) -> Chart | None:
         marks += [DataSeries(x=[0.0] * len(first), y=first, when=when, hover=None)] if dots else []
         for name in _network_last(errors):
             network = name == NETWORK
-            look = _look(facts, name) | {"size": (11 if network else 8) if dots else 5}
-            look |= {"width": 0.0} if dots or not network else {"symbol": ""}
-            coordinates: Table = (
-                {"x": errors[name], "y": order} if dots else {"x": list(range(1, len(order) + 1)), "y": errors[name]}
-            )
-            hover = "{label}: {x:.4g}" if dots else "{label}: {y:.4g}"
-            marks.append(DataSeries(**coordinates, labels=order, hover=hover, when=when, **look))
+            series = replace(_series(facts, name), labels=order, when=when)
+            if dots:
+                series = replace(series, x=errors[name], y=order, hover="{label}: {x:.4g}", size=11 if network else 8)
+            else:
+                ranks = list(range(1, len(order) + 1))
+                series = replace(series, x=ranks, y=errors[name], hover="{label}: {y:.4g}", size=5)
+            marks.append(replace(series, symbol="") if network and not dots else replace(series, width=0.0))
     choices = (_horizons(facts, horizons),)
     if dots:
         rows = ChartAxis(kind="names", upside_down=True, grid=True)
@@ -261,20 +260,24 @@ def recording_chart(facts: Facts) -> Chart | None:
 
 def learning_chart(facts: Facts) -> Chart | None:
     """Return loss and validation error by epoch; a dotted line marks the epoch of the kept weights."""
-    curves = figures.learning_curves(facts)
-    if not curves["epoch"]:
+    rows = facts.history
+    if not rows:
         return None
-    symbol = "circle" if len(curves["epoch"]) < 30 else ""
-    rates = ["" if rate is None else f" (learning rate {rate:.2g})" for rate in curves["learning_rate"]]
-    shared: Table = {"x": curves["epoch"], "width": 2, "symbol": symbol, "size": 5, "labels": rates}
-    shared["hover"] = "{y:.4g}{label}"
-    best_epoch: tuple[Mark, ...] = (GuideLine(x=curves["best"][0], colour=INK, dash="dot"),) if curves["best"] else ()
-    loss = (
-        DataSeries(y=curves["train_loss"], name="Training loss", colour=MUTED[3], **shared),
-        DataSeries(y=curves["validation_loss"], name="Validation loss", colour=BLUE, **shared),
+    epochs = [number if row.epoch is None else row.epoch for number, row in enumerate(rows, 1)]
+    symbol: Symbol = "circle" if len(epochs) < 30 else ""
+    rates = ["" if row.learning_rate is None else f" (learning rate {row.learning_rate:.2g})" for row in rows]
+    curve = DataSeries(
+        x=epochs, y=(), colour=BLUE, width=2, symbol=symbol, size=5, labels=rates, hover="{y:.4g}{label}"
     )
-    error = DataSeries(y=curves["validation_mae"], remark="Validation error", colour=BLUE, **shared)
-    ticks = figures.log_ticks([*curves["train_loss"], *curves["validation_loss"]])
+    best = [epoch for epoch, row in zip(epochs, rows, strict=True) if row.best][-1:]
+    best_epoch = [GuideLine(x=epoch, colour=INK, dash="dot") for epoch in best]
+    train_losses, validation_losses = [row.train_loss for row in rows], [row.validation_loss for row in rows]
+    loss = (
+        replace(curve, y=train_losses, name="Training loss", colour=MUTED[3]),
+        replace(curve, y=validation_losses, name="Validation loss"),
+    )
+    error = replace(curve, y=[row.validation_mae for row in rows], remark="Validation error")
+    ticks = figures.log_ticks([*train_losses, *validation_losses])
     up = ChartAxis(kind="log" if ticks else "linear", ticks=tuple((tick, figure(tick)) for tick in ticks))
     panels = (
         Panel((*best_epoch, *loss), ChartAxis("Epoch"), up, "Loss"),

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,8 @@ from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, parse_toml, read
 from edp.storage.headers import check_files
 from edp.storage.paths import is_file_at, is_folder_at
 from edp.storage.provenance import PROVENANCE
-from edp.storage.reading import Table
 from edp.storage.runs import describe_unfinished
-from edp.storage.seals import HASH, check_sealed_line, is_sealed_line
+from edp.storage.seals import check_sealed_line, is_sealed_line
 from edp.wording import decimals_for, figure, interval, interval_decimals, listed, number, percent, unit_text
 
 NETWORK = "network"
@@ -47,6 +46,37 @@ METRICS = ("rmse", "mae", "p95", "p99", "r2", "bias", "composite")
 
 
 @dataclass(frozen=True)
+class HistoryRow:
+    """Epoch of a training, or check of a twin's training; None where a finite number is not stated.
+
+    Attributes:
+        epoch, update: number of the epoch, or of the update.
+        seconds: of training so far.
+        train_loss, validation_loss, validation_mae: of a network; `validation` is the loss of a twin.
+        learning_rate: base rate.
+        best: whether these weights were kept.
+    """
+
+    epoch: float | None = None
+    update: float | None = None
+    seconds: float | None = None
+    train_loss: float | None = None
+    validation_loss: float | None = None
+    validation_mae: float | None = None
+    validation: float | None = None
+    learning_rate: float | None = None
+    best: bool = False
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, object]) -> HistoryRow:
+        """Return the row of a line of ``history.jsonl``; other values are left out."""
+        names = {entry.name for entry in fields(cls)} - {"best"}
+        numbers = {name: value for name, value in table.items() if name in names and isinstance(value, int | float)}
+        finite = {name: value for name, value in numbers.items() if math.isfinite(value)}
+        return cls(**finite, best=bool(table.get("best")))
+
+
+@dataclass(frozen=True)
 class Facts:
     """Content of a run folder; a missing part is None or empty, and `absent` names its file.
 
@@ -61,7 +91,7 @@ class Facts:
     folder: Path
     config: str | None = None
     provenance: Provenance | None = None
-    history: tuple[Mapping[str, Any], ...] = ()
+    history: tuple[HistoryRow, ...] = ()
     scores: ScoresFile | None = None
     footprint: FootprintFile | None = None
     predictions: Mapping[str, Mapping[str, NDArray[np.floating]]] = field(default_factory=dict)
@@ -165,7 +195,7 @@ def read_settings(path: Path) -> str:
     return text
 
 
-def read_history(path: Path) -> tuple[Mapping[str, Any], ...]:
+def read_history(path: Path) -> tuple[HistoryRow, ...]:
     """Return the epochs of a history file; a last line that a kill cut off is left out.
 
     Where one line has a hash, each must have it; files of earlier versions have none.
@@ -176,7 +206,7 @@ def read_history(path: Path) -> tuple[Mapping[str, Any], ...]:
     text = read_text(path, JSON_BYTES)
     lines = [(row, line) for row, line in enumerate(text.splitlines(), 1) if line.strip()]
     sealed = any(is_sealed_line(line) for _, line in lines)
-    epochs: list[Table] = []
+    epochs: list[HistoryRow] = []
     for row, line in lines:
         where = f"'{path}' line {row}"
         if sealed:
@@ -189,7 +219,7 @@ def read_history(path: Path) -> tuple[Mapping[str, Any], ...]:
             raise
         if not isinstance(epoch, dict):
             raise StorageError(f"{where} holds {line[:40]!r}; each line must be one JSON object")
-        epochs.append({name: value for name, value in epoch.items() if name != HASH})
+        epochs.append(HistoryRow.from_table(epoch))
     return tuple(epochs)
 
 

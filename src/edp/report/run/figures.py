@@ -252,20 +252,6 @@ def recording_errors(facts: Facts, horizon: int) -> tuple[list[str], dict[str, l
     return order, {name: [error(model, recording) for recording in order] for name, model in scored.items()}
 
 
-def learning_curves(facts: Facts) -> dict[str, list[float | None]]:
-    """Return columns of the training history; `best` holds the epoch of the kept weights, if it is stated."""
-    names = ("epoch", "train_loss", "validation_loss", "validation_mae", "learning_rate")
-    columns: dict[str, list[float | None]] = {name: [] for name in (*names, "best")}
-    for row_number, row in enumerate(facts.history, 1):
-        for name in names:
-            value = row.get(name, row_number if name == "epoch" else None)
-            usable = isinstance(value, int | float) and math.isfinite(value)
-            columns[name].append(float(value) if usable else None)
-        if row.get("best"):
-            columns["best"] = [columns["epoch"][-1]]
-    return columns
-
-
 def log_ticks(values: Sequence[float | None]) -> list[float]:
     """Return ticks of a logarithmic axis: 1, 2 and 5 per decade, or 1 for many decades; none with a value <= 0."""
     present = [value for value in values if value is not None]

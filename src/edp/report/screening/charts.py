@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -41,7 +42,6 @@ from edp.report.screening.views import (
     stability_views,
     value_views,
 )
-from edp.storage.reading import Table
 from edp.wording import figure, label_by_name
 
 if TYPE_CHECKING:
@@ -103,20 +103,15 @@ def lag_chart(views: Sequence[LagView], rate_hz: float) -> Chart | None:
         for rank, curve in enumerate(view.curves):
             label = f"{labels[curve.channel]} ({curve.best:+d})".replace("-", "−")
             best = f"{curve.channel}, best {curve.best}{'' if curve.certain else ', not certain'}"
-            look: Table = {
-                "colour": LINES[rank % len(LINES)],
-                "name": label,
-                "when": {"target": view.target},
-                "remark": best,
-            }
-            marks.append(DataSeries(
-                x=curve.lags.tolist(), y=np.round(curve.correlation, 4).tolist(), width=2.2 if rank == 0 else 1.5,
-                dash=DASHES[rank // len(LINES) % len(DASHES)], hover="lag {x}: {y:.3f}", **look,
+            series = DataSeries(
+                x=[curve.best], y=[finite(curve.value)], colour=LINES[rank % len(LINES)], name=label,
+                when={"target": view.target}, remark=best, hover="lag {x}: {y:.3f}",
+            )  # fmt: skip
+            marks.append(replace(
+                series, x=curve.lags.tolist(), y=np.round(curve.correlation, 4).tolist(),
+                width=2.2 if rank == 0 else 1.5, dash=DASHES[rank // len(LINES) % len(DASHES)],
             ))  # fmt: skip
-            marks.append(DataSeries(
-                x=[curve.best], y=[finite(curve.value)], symbol="circle" if curve.certain else "x",
-                hover="lag {x}: {y:.3f}", **look,
-            ))  # fmt: skip
+            marks.append(replace(series, symbol="circle" if curve.certain else "x"))
     lags = views[0].curves[0].lags
     across = ChartAxis(
         f"Lag [samples of {figure(1e3 / rate_hz)} ms]; left: the channel leads",

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from markupsafe import Markup
 
@@ -20,6 +20,7 @@ from edp.wording import count_text, duration, figure, listed, number, setting_te
 
 if TYPE_CHECKING:
     from edp.data.screening import ScreeningResult
+    from edp.evaluation.trials_file import Trials
 
 FLAGS_TEXT = Markup(
     "A negative lag means that the channel shows the value that the other will have that many samples later; a leak of "
@@ -32,7 +33,7 @@ def build_screening_page(
     screening: ScreeningResult,
     title: str,
     quality: DataQuality | None = None,
-    trials: Mapping[str, object] | None = None,
+    trials: Trials | None = None,
     notes: Sequence[str] = (),
 ) -> Page:
     """Return the page of a screening.
@@ -41,7 +42,7 @@ def build_screening_page(
         screening: the screening.
         title: name of the data set.
         quality: how good its recordings are.
-        trials: errors of a network on several feature sets (`edp.workflows.feature_selection.trials.Trials.to_json`).
+        trials: errors of a network on several feature sets.
         notes: what a reader must know of how the data were read.
     """
     charts = {chart.name: chart for chart in screening_charts(screening)}
@@ -160,15 +161,15 @@ def build_screening_page(
     )
 
 
-def _trials_section(trials: Mapping[str, Any]) -> Section:
+def _trials_section(trials: Trials) -> Section:
     return Section(
         "trials",
         "Held-out errors of the sets",
         [
             "The same network with the same budget, trained on each set and judged on recordings that neither it nor "
-            f"its early stopping saw ({', '.join(trials['held_out'])}).",
+            f"its early stopping saw ({', '.join(trials.held_out)}).",
             tables.trials_table(trials),
-            *(Paragraph(f"{note}.", "quiet") for note in trials["notes"]),
+            *(Paragraph(f"{note}.", "quiet") for note in trials.notes),
         ],
         "Proof",
     )

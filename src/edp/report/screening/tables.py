@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from edp.report.screening.views import lag_ranges
 from edp.table import Column, Table
 from edp.wording import MISSING, count_text, duration, interval, number, percent
 
 if TYPE_CHECKING:
-    from edp.data.screening import ChannelVerdict, Flag, LagCurve, ScreeningResult
+    from edp.data.screening import ChannelVerdict, LagCurve, ScreeningResult
+    from edp.evaluation.trials_file import Trials
 
 FLAG_WORDS = {
     "leak of the future": "leak of the future",
@@ -64,8 +64,8 @@ def _lag(screening: ScreeningResult, choice: ChannelVerdict) -> str:
 
 def flags_table(screening: ScreeningResult) -> Table:
     """Return the faults of channels, leaks of the future first."""
-    order = list(FLAG_WORDS)
-    ranked = sorted(screening.flags, key=lambda flag: (_place(order, flag), flag.channel))
+    order = {kind: rank for rank, kind in enumerate(FLAG_WORDS)}
+    ranked = sorted(screening.flags, key=lambda flag: (order.get(str(flag.kind), len(order)), flag.channel))
     rows = tuple(
         (
             flag.channel,
@@ -84,11 +84,6 @@ def flags_table(screening: ScreeningResult) -> Table:
         Column("Evidence", is_text=True),
     )
     return Table("Flags", columns, rows)
-
-
-def _place(order: list[str], flag: Flag) -> int:
-    kind = str(flag.kind)
-    return order.index(kind) if kind in order else len(order)
 
 
 def ranges_table(screening: ScreeningResult) -> Table:
@@ -144,31 +139,21 @@ def clusters_table(screening: ScreeningResult) -> Table:
     return Table("Channels that go together", columns, rows)
 
 
-def trials_table(trials: Mapping[str, Any]) -> Table:
-    """Held-out error of one network on each feature set, as `edp.workflows.feature_selection.trials.Trials.to_json`
-    gives it.
-    """
-    horizons = list(trials["persistence"])
-    unit = str(trials["unit"])
+def trials_table(trials: Trials) -> Table:
+    """Return the held-out error of one network on each feature set."""
     rows = []
-    for trial in trials["trials"]:
+    for trial in trials.trials:
         cells = []
-        for horizon in horizons:
-            gap = (trial["difference"] or {}).get(horizon)
-            cells.append(number(trial["error"][horizon], 3))
-            cells.append(MISSING if gap is None else interval(gap["low"], gap["high"], signed=True))
-        rows.append((trial["name"], count_text(len(trial["channels"])), count_text(trial["parameters"]), *cells))
-    rows.append(
-        (
-            "persistence",
-            MISSING,
-            MISSING,
-            *(c for h in horizons for c in (number(trials["persistence"][h], 3), MISSING)),
-        )
-    )
+        for horizon in trials.persistence:
+            gap = (trial.difference or {}).get(horizon)
+            cells.append(number(trial.error[horizon], 3))
+            cells.append(MISSING if gap is None else interval(gap.low, gap.high, signed=True))
+        rows.append((trial.name, count_text(len(trial.channels)), count_text(trial.parameters), *cells))
+    still = (cell for error in trials.persistence.values() for cell in (number(error, 3), MISSING))
+    rows.append(("persistence", MISSING, MISSING, *still))
     columns: tuple[Column, ...] = (Column("Feature set"), Column("Channels"), Column("Parameters"))
-    for horizon in horizons:
-        columns += (Column(f"MAE, {horizon} ahead", unit), Column("Against the first", "95 % interval"))
+    for horizon in trials.persistence:
+        columns += (Column(f"MAE, {horizon} ahead", trials.unit), Column("Against the first", "95 % interval"))
     return Table("Held-out error of one network on each set", columns, tuple(rows), frozenset({0}))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 from edp.evaluation.study import StudyFile
 from edp.report.common.chart import (
@@ -74,11 +73,13 @@ def variance_chart(arms: Sequence[ArmView], unit: str) -> Chart | None:
         # None breaks the line between two runs.
         seeds_x = [value for spot, seeds in zip(x, arm.scores) for value in (*[spot] * len(seeds), None)]
         seeds_y = [score for seeds in arm.scores for score in (*sorted(seeds), None)]
-        shared: dict[str, Any] = {"colour": colour, "hover": "{y:.4g}", "remark": arm.features, "group": arm.features}
-        marks.append(DataSeries(x=seeds_x, y=seeds_y, width=1, symbol="circle", size=4, opacity=0.6, **shared))
+        series = DataSeries(
+            x=seeds_x, y=seeds_y, colour=colour, hover="{y:.4g}", remark=arm.features, group=arm.features
+        )
+        marks.append(replace(series, width=1, symbol="circle", size=4, opacity=0.6))
         means = [sum(seeds) / len(seeds) for seeds in arm.scores]
         symbol: Symbol = "circle" if arm.chosen else "diamond"
-        marks.append(DataSeries(x=x, y=means, symbol=symbol, size=8, name=arm.features, **shared))
+        marks.append(replace(series, x=x, y=means, symbol=symbol, size=8, name=arm.features))
     ticks = tuple((float(index), _arm_text(arm)) for index, arm in enumerate(arms))
     return Chart(
         "variance", (Panel(tuple(marks), ChartAxis(limits=(-0.6, len(arms) - 0.4), ticks=ticks), _score_axis(unit)),),

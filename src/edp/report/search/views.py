@@ -200,15 +200,11 @@ class Forest:
 
 def forests(study: StudyFile) -> tuple[Forest, ...]:
     """Return the decided effects of phases 3 and 2; in the thesis's mode phase 3 by metric."""
-    candidates = (*_view_confirmation(study), *_view_screening(study))
+    candidates = (*_sound(study), *_thesis(study), *_view_screening(study))
     return tuple(forest for forest in candidates if forest.effects)
 
 
 CHANGE = "Change of the baseline's mean score [%]; left is better"
-
-
-def _view_confirmation(study: StudyFile) -> tuple[Forest, ...]:
-    return (*_sound(study), *_thesis(study))
 
 
 @require_phase(SoundConfirmation, ())

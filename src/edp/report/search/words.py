@@ -161,7 +161,7 @@ def caveats(study: StudyFile) -> list[str]:
         f"Sessions: {len(sessions.development)} that train and judge in turn, {len(sessions.test)} set apart"
         + (f", {len(sessions.second)} more for phase 6" if sessions.second else "")
         + ". Intervals and p-values speak of sessions like these, not of another machine.",
-        *_power(study),
+        *(_sound_power if study.mode == "sound" else _thesis_power)(study),
         "Modules are tried on one baseline with one feature set; on another network they may do otherwise.",
         f"Winners were tuned further than the baseline ({count_of(int(spec['joint_trials']), 'more question')} in "
         f"phase 4, {count_text(int(spec['free_trials']))} in phase 5), so part of their gain may be "
@@ -185,10 +185,6 @@ def _length(study: StudyFile, updates: int) -> str:
         return f"{count_text(updates)} updates"
     each = f"{count_text(updates // epochs)} updates" if updates else "one pass over the data"
     return f"at most {epochs} epochs of {each}"
-
-
-def _power(study: StudyFile) -> tuple[str, ...]:
-    return (_sound_power if study.mode == "sound" else _thesis_power)(study)
 
 
 @require_phase(SoundPlanning, ())

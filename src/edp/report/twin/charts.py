@@ -51,16 +51,13 @@ def twin_charts(facts: FreeRunFacts) -> list[Chart]:
     return [*runs, horizon_chart(facts), *([] if steps is None else [steps])]
 
 
-def _labels(facts: FreeRunFacts) -> dict[str, str]:
-    return label_by_name(channel.name for part in PARTS for channel in facts.channels(part))
-
-
 def runs_chart(facts: FreeRunFacts, part: str) -> Chart:
     """Return measured channels and the twin's answers with their intervals; one row per channel of a part."""
     seconds, half = facts.shown["seconds"], facts.shown.get("half_width")
     # Shown runs are thinned out evenly, so a start and a step are all that a line needs.
     time_s = Evenly(round(float(seconds[0]), 6), round(float((seconds[-1] - seconds[0]) / (len(seconds) - 1)), 6))
-    panels, labels = [], _labels(facts)
+    labels = label_by_name(channel.name for one in PARTS for channel in facts.channels(one))
+    panels = []
     for channel, column in zip(facts.channels(part), facts.columns(part), strict=True):
         marks: list[Mark] = []
         for name in facts.names:

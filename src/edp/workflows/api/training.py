@@ -16,7 +16,7 @@ from edp.logs.source import DataSource
 from edp.logs.write import write_recording
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
-from edp.settings.tree import Table, merged, read_toml
+from edp.settings.tree import merged, read_toml, value_at, with_value
 from edp.storage import make_folder
 from edp.storage.paths import is_there
 from edp.training import Diverged
@@ -128,16 +128,16 @@ def _experiment(
     own = _table(settings)
     preset = preset or ("standard" if {"model", "training"} & own.keys() else AUTO)
     table = preset_table(preset)
-    task: Table = {"targets": list(targets), "horizons": list(horizons)}
+    task: dict[str, object] = {"targets": list(targets), "horizons": list(horizons)}
     if features is not None:
         task["features"] = features if isinstance(features, str) else {"name": "own", "channels": list(features)}
-    elif "features" not in own.get("task", {}):
-        usual = FEATURE_SETS.get(str(table["task"]["features"]))
-        whole = usual is not None and set(usual.inputs) <= set(data.names)
-        task["features"] = table["task"]["features"] if whole else "all"
+    elif value_at(own, "task.features") is None:
+        name = value_at(table, "task.features")
+        usual = FEATURE_SETS.get(str(name))
+        task["features"] = name if usual is not None and set(usual.inputs) <= set(data.names) else "all"
     # Arguments and settings could contradict each other in silence; one of them is asked for.
     for key in ("targets", "horizons"):
-        if key in own.get("task", {}):
+        if value_at(own, f"task.{key}") is not None:
             raise ConfigError(f"settings: task.{key} is the argument `{key}` of edp.train; leave it out")
     table = merged(table, {"task": task})
     if tests is not None:
@@ -155,7 +155,7 @@ def _experiment(
     return experiment
 
 
-def _table(settings: Mapping[str, object] | str | Path | None) -> Table:
+def _table(settings: Mapping[str, object] | str | Path | None) -> dict[str, object]:
     if settings is None:
         return {}
     if isinstance(settings, Mapping):
@@ -163,16 +163,12 @@ def _table(settings: Mapping[str, object] | str | Path | None) -> Table:
     return embed_feature_set(read_toml(settings), Path(settings).parent)
 
 
-def _nest_keys(settings: Mapping[str, object]) -> Table:
+def _nest_keys(settings: Mapping[str, object]) -> dict[str, object]:
     """Dotted keys as tables, in the order given."""
-    table: Table = {}
+    table: dict[str, object] = {}
     for key, value in settings.items():
-        # Keys are built up from the innermost part.
-        first, *others = reversed(str(key).split("."))
-        change: Table = {first: _nest_keys(value) if isinstance(value, Mapping) else _plain(value)}
-        for part in others:
-            change = {part: change}
-        table = merged(table, change)
+        plain = _nest_keys(value) if isinstance(value, Mapping) else _plain(value)
+        table = merged(table, with_value({}, str(key), plain))
     return table
 
 

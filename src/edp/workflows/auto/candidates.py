@@ -6,16 +6,23 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
-from edp.config.experiment import plain_tree
+from edp.data.chunks import ChunkSpec
 from edp.data.prepared import Prepared
 from edp.errors import ConfigError
-from edp.networks.backbones import CommitteeSpec
+from edp.networks.activations import Identity
+from edp.networks.backbones import CommitteeSpec, HybridSpec
+from edp.networks.blocks import TemporalDifference
+from edp.networks.heads import LinearHead, MlpHead
+from edp.networks.losses import Huber, MeanSquared
+from edp.networks.predictor import ModelSpec
 from edp.recording import Recording
 from edp.registry import Registry
-from edp.settings.tree import Table
+from edp.training.averages import Exponential
 from edp.training.bagging.radial import JUDGED_ROWS, LENGTHS
 from edp.training.bagging.spec import BaggingSpec
 from edp.training.bundle import weights_digest
+from edp.training.optimizers import Soap
+from edp.training.schedules import OneCycle
 from edp.training.spec import TrainingSpec
 from edp.training.strategy import TrainingStrategy
 from edp.training.transfer.centring import Centred
@@ -109,6 +116,14 @@ LEAST_UPDATES = 120
 """Of a fine-tuning, where ten passes over the recordings are fewer: those of the measured ones (docs/results.md)."""
 
 
+@dataclass(frozen=True)
+class NetworkPlan:
+    """Settings of a network and of its training."""
+
+    model: ModelSpec
+    training: TrainingSpec
+
+
 @dataclass(frozen=True, eq=False)
 class Foundation:
     """A network to begin with, as ``auto.foundation`` names it.
@@ -127,7 +142,7 @@ class Foundation:
         return self.source.predictor.spec.window
 
     @property
-    def facts(self) -> Table:
+    def facts(self) -> dict[str, str]:
         """Return its identity."""
         return {"weights": weights_digest(self.source.predictor)}
 
@@ -176,8 +191,8 @@ class Foundation:
         check_units(data, self.source.predictor.front)
         check_signs(data, None)
 
-    def tables(self, rows: int, affordable: float, seed: int, threads: int) -> Table:
-        """Return the tables ``model`` and ``training`` of the candidate.
+    def plan(self, rows: int, affordable: float, seed: int, threads: int) -> NetworkPlan:
+        """Return the network and the training of the candidate.
 
         Args:
             rows: ticks to train on.
@@ -188,8 +203,7 @@ class Foundation:
         rounds = FinetuneSpec().rounds
         updates = int(min(affordable, max(LEAST_UPDATES, rounds * rows / self.ticks))) // rounds
         training = replace(self._training(max(1, updates), threads), seed=seed)
-        experiment = replace(self.source.experiment, model=self.source.predictor.spec, training=training)
-        return {part: plain_tree(experiment)[part] for part in ("model", "training")}
+        return NetworkPlan(self.source.predictor.spec, training)
 
     def _training(self, updates: int, threads: int) -> TrainingSpec:
         """Return the training of `edp finetune --method full` with this number of updates per epoch."""
@@ -299,11 +313,11 @@ class Candidate:
 
     Attributes:
         label: how sentences call it.
-        tables: gives the tables ``model`` and ``training``; None where it does not suit the data.
+        plan: returns the network and its training; None where it does not suit the data.
     """
 
     label: str
-    tables: Callable[[Amount], Table | None]
+    plan: Callable[[Amount], NetworkPlan | None]
 
 
 CANDIDATES: Registry[Candidate] = Registry("candidate")
@@ -418,46 +432,54 @@ def tree_plan(amount: Amount) -> TreePlan:
     return TreePlan(0, len(TREE_MODELS), TREE_ROWS[-1], fewest)
 
 
-def _committee(amount: Amount) -> Table:
-    plan = tree_plan(amount)
-    activations = ["tanh", "relu"]
-    parts = {
-        "activations": activations,
-        "centres": min(CENTRES, amount.rows // ROWS_PER_CENTRE),
-        "near": _list_near_spans(amount),
-        "trees": plan.trees,
-        "tree_depth": TREE_DEPTH,
-    }
-    trees = {"tree_models": plan.models, "tree_rows": plan.rows, "tree_folds": plan.folds, "tree_rate": plan.rate}
-    steps = _steps(amount, len(activations))
-    return _tables(amount, parts, {"steps": steps, "robust_width": ROBUST, **trees})
+def linear_plan(amount: Amount) -> NetworkPlan:
+    """Return the linear model, which suits every amount."""
+    return _plan(amount, _bank(amount), BaggingSpec(folds=FOLDS, batch=BATCH))
 
 
-def _tables(amount: Amount, parts: Table, bagging: Table) -> Table:
+def _committee(amount: Amount) -> NetworkPlan:
+    plan, activations = tree_plan(amount), ("tanh", "relu")
+    backbone = replace(
+        _bank(amount),
+        activations=activations,
+        centres=min(CENTRES, amount.rows // ROWS_PER_CENTRE),
+        near=tuple(_list_near_spans(amount)),
+        trees=plan.trees,
+        tree_depth=TREE_DEPTH,
+    )
+    bagging = BaggingSpec(
+        folds=FOLDS,
+        batch=BATCH,
+        steps=_steps(amount, len(activations)),
+        robust_width=ROBUST,
+        tree_models=plan.models,
+        tree_rows=plan.rows,
+        tree_folds=plan.folds,
+        tree_rate=plan.rate,
+    )
+    return _plan(amount, backbone, bagging)
+
+
+def _bank(amount: Amount) -> CommitteeSpec:
+    """Return a committee of linear members on the feature bank of an amount."""
     spans = spans_of(amount)
-    bank = {"lags": spans.lags, "smoothed": spans.smoothed, "bounded": True}
-    backbone = {"kind": "committee", **bank, "members": MEMBERS, "units": UNITS, "layers": 2}
-    return {
-        "model": {
-            "window": amount.window,
-            "backbone": {**backbone, **parts},
-            "head": {"kind": "linear", "dead_band": amount.changes},
-            "activation": {"kind": "identity"},
-        },
-        "training": {
-            "loss": {"kind": "mse"},
-            "seed": amount.seed,
-            "threads": amount.threads,
-            "bagging": {"folds": FOLDS, "batch": BATCH, **bagging},
-        },
-    }
+    bank = CommitteeSpec(lags=tuple(spans.lags), smoothed=tuple(spans.smoothed), bounded=True)
+    return replace(bank, members=MEMBERS, units=UNITS, layers=2, activations=())
 
 
-CANDIDATES.register("linear")(Candidate("the linear model", lambda amount: _tables(amount, {"activations": []}, {})))
+def _plan(amount: Amount, backbone: CommitteeSpec, bagging: BaggingSpec) -> NetworkPlan:
+    head = LinearHead(dead_band=amount.changes)
+    return NetworkPlan(
+        ModelSpec(window=amount.window, backbone=backbone, head=head, activation=Identity()),
+        TrainingSpec(loss=MeanSquared(), seed=amount.seed, threads=amount.threads, bagging=bagging),
+    )
+
+
+CANDIDATES.register("linear")(Candidate("the linear model", linear_plan))
 CANDIDATES.register("committee")(Candidate("the committee", _committee))
 
 
-def _recurrent(amount: Amount) -> Table | None:
+def _recurrent(amount: Amount) -> NetworkPlan | None:
     """Return the network of the preset ``quick`` with as many updates as the budget holds."""
     # Its trainer refuses validation stretches that end within burn-in and horizon.
     shortest = max(RECURRENT_CHUNK, RECURRENT_BURN_IN + amount.horizon + 1)
@@ -468,38 +490,32 @@ def _recurrent(amount: Amount) -> Table | None:
     trained = 1 if amount.foundation is None else 2
     affordable = amount.seconds("recurrent") / trained * OPERATIONS_PER_S / (tick * epochs)
     useful = ROW_PASSES * amount.rows // (RECURRENT_LANES * RECURRENT_CHUNK * epochs)
-    return {
-        "model": {
-            "window": amount.window,
-            "backbone": {"kind": "hybrid", "channels": [64], "kernel": 5, "units": 64},
-            "head": {"kind": "mlp", "hidden": 32, "layers": 1},
-            "activation": {"kind": "identity"},
-            "blocks": [{"kind": "temporal_difference"}],
-        },
-        "training": {
-            "seed": amount.seed,
-            "threads": amount.threads,
-            "epochs": epochs,
-            "updates": int(max(1, min(affordable, useful))),
-            "patience": 0,
-            "average": {"kind": "ema", "decay": 0.995},
-            "chunks": {
-                "regime": "chunk",
-                "length": RECURRENT_CHUNK,
-                "batch": RECURRENT_LANES,
-                "burn_in": RECURRENT_BURN_IN,
-            },
-            "loss": {"kind": "huber", "delta": 0.3},
-            "optimizer": {"kind": "soap", "learning_rate": 6e-3, "weight_decay": 1e-4},
-            "schedule": {"kind": "one_cycle", "rise": 0.2},
-        },
-    }
+    model = ModelSpec(
+        window=amount.window,
+        backbone=HybridSpec(channels=(64,), kernel=5, units=64),
+        head=MlpHead(hidden=32, layers=1),
+        activation=Identity(),
+        blocks=(TemporalDifference(),),
+    )
+    training = TrainingSpec(
+        seed=amount.seed,
+        threads=amount.threads,
+        epochs=epochs,
+        updates=int(max(1, min(affordable, useful))),
+        patience=0,
+        average=Exponential(decay=0.995),
+        chunks=ChunkSpec(length=RECURRENT_CHUNK, batch=RECURRENT_LANES, burn_in=RECURRENT_BURN_IN),
+        loss=Huber(delta=0.3),
+        optimizer=Soap(learning_rate=6e-3, weight_decay=1e-4),
+        schedule=OneCycle(rise=0.2),
+    )
+    return NetworkPlan(model, training)
 
 
 CANDIDATES.register("recurrent")(Candidate("the recurrent network", _recurrent))
 
 
-def _foundation(amount: Amount) -> Table | None:
+def _foundation(amount: Amount) -> NetworkPlan | None:
     """Return a pretrained network whose weights are all trained."""
     start = amount.foundation
     if start is None:
@@ -507,7 +523,7 @@ def _foundation(amount: Amount) -> Table | None:
     trained = 1 if _recurrent(amount) is None else 2
     seconds = amount.seconds("recurrent") / trained
     affordable = seconds * OPERATIONS_PER_S / (PASSES * start.weights * start.ticks)
-    return start.tables(amount.rows, affordable, amount.seed, amount.threads)
+    return start.plan(amount.rows, affordable, amount.seed, amount.threads)
 
 
 CANDIDATES.register("foundation")(Candidate("the pretrained network", _foundation))

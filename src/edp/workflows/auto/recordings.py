@@ -16,9 +16,13 @@ from edp.data.splits import ByRecording, ByTime
 from edp.data.task import TargetMode
 from edp.errors import ConfigError, DataError
 from edp.logs.source import DataSource
+from edp.networks.backbones import CommitteeSpec
+from edp.networks.heads import LinearHead
+from edp.networks.predictor import ModelSpec
 from edp.recording import FloatArray, Recording
 from edp.signals import Kind
 from edp.storage.memory import check_setting
+from edp.training.spec import TrainingSpec
 from edp.wording import typed
 from edp.workflows.auto.candidates import LEAST_SPAN, Amount, Foundation
 from edp.workflows.auto.settings import AutoSettings
@@ -148,8 +152,8 @@ def prepare(source: ReadOnce, settings: AutoSettings, foundation: Foundation | N
     """Return the data, cut for the common window of the candidates, and their amount."""
 
     def cut(window: int) -> tuple[Prepared, Amount]:
-        model = {"model": {"window": window, "backbone": {"kind": "committee"}, "head": {"kind": "linear"}}}
-        data = prepare_data(source, settings.experiment(model))
+        model = ModelSpec(window=window, backbone=CommitteeSpec(), head=LinearHead())
+        data = prepare_data(source, settings.experiment(model, TrainingSpec()))
         reach = data.task.max_horizon
         # A stretch that ends within the horizon holds nothing to predict; the digest stays that of all recordings.
         train, validation = (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,15 +11,16 @@ from edp.config.experiment import (
     Experiment,
     TaskSettings,
     build,
-    plain_tree,
     preset_table,
     read_layers,
 )
 from edp.data.splits import ByRecording, SplitSpec
 from edp.errors import ConfigError
 from edp.evaluation.judge import JudgeSpec
+from edp.networks.predictor import ModelSpec
 from edp.settings.bounds import MIN_MINUTES, MOST_THREADS, SEED, check_bounds, integer, span
-from edp.settings.tree import Table, merged, override, read_toml
+from edp.settings.tree import merged, override, read_toml
+from edp.training.spec import TrainingSpec
 
 MOST_MINUTES = 10_000.0
 CHOSEN = ("model", "training")
@@ -64,10 +65,9 @@ class AutoSettings:
     auto: Portfolio = field(default_factory=Portfolio)
     judge: JudgeSpec = field(default_factory=JudgeSpec)
 
-    def experiment(self, model_and_training: Table) -> Experiment:
-        """Return the experiment of a candidate from its tables ``model`` and ``training``."""
-        plain = {part: values for part, values in plain_tree(self).items() if part != "auto"}
-        return build(Experiment, merged(plain, model_and_training), "of a candidate of the automatic preset")
+    def experiment(self, model: ModelSpec, training: TrainingSpec) -> Experiment:
+        """Return the experiment of a candidate."""
+        return Experiment(task=self.task, split=self.split, model=model, training=training, judge=self.judge)
 
 
 def usual_preset(path: str | Path | None = None, overrides: Sequence[str] = ()) -> str:
@@ -96,7 +96,7 @@ def load_auto(path: str | Path | None = None, overrides: Sequence[str] = ()) -> 
     return auto_settings(table, where)
 
 
-def auto_settings(table: Table, where: str) -> AutoSettings:
+def auto_settings(table: Mapping[str, object], where: str) -> AutoSettings:
     """Return the settings of a table.
 
     Raises:

@@ -22,7 +22,7 @@ from edp.storage.runs import FINISHED, Run, check_claimable, run_key, state_of
 from edp.training import Bundle, load_bundle, make_bundle, save_bundle
 from edp.training.blas import one_blas_thread
 from edp.wording import percent
-from edp.workflows.auto.candidates import CANDIDATES, Amount, read_foundation
+from edp.workflows.auto.candidates import CANDIDATES, Amount, linear_plan, read_foundation
 from edp.workflows.auto.promise import (
     PortfolioChoice,
     Promise,
@@ -187,7 +187,7 @@ def _make_choice_file(
         for name, one in trained.items()
     }
     promise, floor = trained[choice.name].promise, trained.get(FLOOR)
-    still = _persistence(settings, data, amount)
+    still = _persistence(data, amount)
     unchanged = to_report_units(still.last(len(promise.rows)).error(), data)
     tested = sum(max(0, part.samples - data.task.max_horizon) for part in data.test)
     against = still if floor is None or choice.name == FLOOR else floor.promise
@@ -215,11 +215,10 @@ def _make_choice_file(
     )
 
 
-def _persistence(settings: AutoSettings, data: Prepared, amount: Amount) -> Promise:
+def _persistence(data: Prepared, amount: Amount) -> Promise:
     """Return the errors of the present value, or of the mean in absolute mode."""
     # Any network with the scaling of the data: the kept one may have that of other machines.
-    model = settings.experiment(CANDIDATES["linear"].tables(amount) or {}).model
-    net = build_model(data.task, model, data.scaler(), 0)
+    net = build_model(data.task, linear_plan(amount).model, data.scaler(), 0)
     truth = standard_truth(net, data)  # zero is no change, or in absolute mode the mean
     blocks, _ = blocks_of(data, amount.window)
     return promise_of([np.zeros_like(one) for one in truth], truth, blocks)

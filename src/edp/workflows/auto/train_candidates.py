@@ -189,15 +189,15 @@ def _unit(job: CandidateTraining) -> WorkUnit:
         "experiment": plain_tree(job.experiment),
         "trial": job.trial,
         "blocks": blocks,
-        "foundation": None if job.foundation is None else dict(job.foundation.facts),
+        "foundation": None if job.foundation is None else job.foundation.facts,
         "folder": str(placed.folder),
     }
     return WorkUnit(f"{__name__}:train_unit", job.label, arguments, job.data.digest, {"job": placed})
 
 
-def train_unit(identity: TrainingIdentity, where: Table) -> WithState | dict[str, str]:
+def train_unit(identity: TrainingIdentity, where: Mapping[str, CandidateTraining]) -> WithState | dict[str, str]:
     """Train a candidate into its folder, and note there how far the training is."""
-    job: CandidateTraining = where["job"]
+    job = where["job"]
     note = make_folder(job.folder) / NOTE
 
     def tell(event: TrainingProgress) -> None:
@@ -352,8 +352,10 @@ def _experiments(settings: AutoSettings, amount: Amount) -> dict[str, Experiment
     names = settings.auto.candidates or tuple(CANDIDATES)
     chosen = [name for name in CANDIDATES if name in names]
     _ = [CANDIDATES[name] for name in names]  # an unknown name is answered with the closest
-    tables = {name: CANDIDATES[name].tables(amount) for name in chosen}
-    experiments = {name: settings.experiment(table) for name, table in tables.items() if table is not None}
+    plans = {name: CANDIDATES[name].plan(amount) for name in chosen}
+    experiments = {
+        name: settings.experiment(plan.model, plan.training) for name, plan in plans.items() if plan is not None
+    }
     if not experiments:
         raise ConfigError(
             f"auto.candidates = {list(names)}: none of them suits {amount.rows:,} ticks of training; add 'linear' or "

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from edp.config.experiment import Change, Experiment, Table, load_experiment, plain_tree
+from edp.config.experiment import Change, Experiment, load_experiment, plain_tree
 from edp.data.frozen import keep_frozen, list_frozen, refuse_frozen
 from edp.data.prepared import Prepared
 from edp.data.series import Series
@@ -179,7 +179,7 @@ def _run_folder(run: str | Path) -> Path:
     return folder.parent if inside else folder
 
 
-def order_facts(order: CompressionRequest) -> Table:
+def order_facts(order: CompressionRequest) -> dict[str, object]:
     """Return the plain values that determine what a request trains."""
     spec = order.distillation
     plain = None if spec is None else asdict(spec) | {"soft": _loss(spec)}

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from edp.config.experiment import Table, build, plain_tree
+from edp.config.experiment import build, plain_tree
 from edp.data.prepared import Prepared
 from edp.errors import ExportError
 from edp.evaluation.compression import CompressedRow, Scores
@@ -51,7 +51,7 @@ class NetworkResult:
     left_out: Mapping[str, str]
     recordings: Mapping[str, Mapping[str, ByHorizon]] = field(default_factory=dict)
 
-    def to_json(self) -> Table:
+    def to_json(self) -> dict[str, object]:
         """Return plain values with lists, equal to those that are read from a record."""
         formats = {name: plain_tree(result) for name, result in self.formats.items()}
         for table in formats.values():

@@ -108,7 +108,7 @@ def _content(experiment: ControlExperiment, tasks: Sequence[ControlTask], result
         sentence=_sentence(summary, CONTROLLERS.name_of(experiment.controller), plain["task"]["kind"], len(results)),
         task=plain["task"],
         controller=plain["controller"],
-        machine=results[0].recording.meta["machine"],
+        machine=str(results[0].recording.meta["machine"]),
         plant=results[0].recording.source.removeprefix("loop:"),
         summary=summary,
         loops=tuple(_loop(task, result) for task, result in zip(tasks, results, strict=True)),

@@ -13,6 +13,7 @@ from edp.data.feature_files import set_text
 from edp.data.features import FEATURE_SETS, FeatureSet
 from edp.data.screening import FlagKind, OnProgress, ScreeningResult, ScreeningSpec, screen
 from edp.errors import DataError, closest, count_of
+from edp.evaluation.trials_file import Trials
 from edp.jobs import IN_PROCESS, Workers
 from edp.logs import DataQuality, Repair, common_channels, open_log
 from edp.logs.formats.base import is_truth
@@ -25,7 +26,7 @@ from edp.signals import VOCABULARY, SignalMap
 from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.storage.provenance import command_line
 from edp.workflows.feature_selection.changes import add_changes
-from edp.workflows.feature_selection.trials import OnTrial, Trials, TrialSpec, add_differences, try_feature_sets
+from edp.workflows.feature_selection.trials import OnTrial, TrialSpec, add_differences, try_feature_sets
 
 PROPOSED, DIFFERENCES, CHANGES, ALL = "proposed", "proposed + differences", "proposed + changes", "all candidates"
 # The file stays readable; the whole list is in `screening.json`.
@@ -119,7 +120,9 @@ def select_features(
     order, listeners = order or SelectionOrder(), listeners or Listeners()
     folder = check_writable(out)
     # Without a map all channels are read under the names of the files: a screening may judge each of them.
-    mapped = source if source.signal_map is not None or _lists_maps(source) else _read_all_columns(source)
+    mapped = source
+    if source.signal_map is None and not source.stored and not _lists_maps(source):
+        mapped = replace(source, signal_map=SignalMap(others=True))
     quality = mapped.inspect(listeners.logs, workers)
     recordings, notes = _read(mapped, quality)
     spec, more = _candidates(recordings[0], order)
@@ -138,8 +141,7 @@ def select_features(
         write_screening_pictures(screening, folder / "pictures")
         files["pictures"] = folder / "pictures"
     title = source.short_name
-    tried = None if trials is None else trials.to_json()
-    files["page"] = build_screening_page(screening, title, quality, tried, notes).write(folder / "report.html")
+    files["page"] = build_screening_page(screening, title, quality, trials, notes).write(folder / "report.html")
     return Selection(screening, quality, tuple(notes), sets, files, trials)
 
 
@@ -155,10 +157,6 @@ def _note_sampling(recordings: Sequence[Recording], screening: ScreeningResult) 
 def _lists_maps(source: DataSource) -> bool:
     """Test whether a data-set file names its own maps."""
     return source.path.suffix == ".toml" and any(log.signal_map is not None for log in source.logs())
-
-
-def _read_all_columns(source: DataSource) -> DataSource:
-    return source if source.stored else replace(source, signal_map=SignalMap(others=True))
 
 
 def _read(source: DataSource, quality: DataQuality) -> tuple[list[Recording], list[str]]:

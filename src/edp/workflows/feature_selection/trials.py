@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from edp.data.features import FEATURE_SETS, Derived
 from edp.data.task import TargetMode
 from edp.errors import ConfigError, closest
 from edp.evaluation.scores_file import MEAN, ScoresFile, metric
+from edp.evaluation.trials_file import FeatureSetTrial, PairedDifference, Trials
 from edp.jobs import IN_PROCESS, Workers
 from edp.jobs.workers import WorkUnit
 from edp.logs.source import DataSource
@@ -28,7 +29,7 @@ from edp.networks.streaming import parameters_of
 from edp.recording import Recording
 from edp.settings.bounds import SEED, check_bounds, check_count, integer
 from edp.signals import Kind
-from edp.storage import make_folder, write_json
+from edp.storage import make_folder
 from edp.storage.ledger import TrainingIdentity
 from edp.storage.paths import full_path
 from edp.training import Bundle, Diverged, TrainingProgress
@@ -36,7 +37,6 @@ from edp.workflows.train_evaluate import evaluate, train
 
 Sets = Mapping[str, str | FeatureSettings]
 OnTrial = Callable[[str, int, int, TrainingProgress | None], None]
-FILE = "trials.json"
 COVERAGE = 0.95
 MOST_SETS = 1_000
 """Random sets, or seeds: each of them is a training."""
@@ -66,64 +66,6 @@ class TrialSpec:
         check_count("trials", "seeds", self.seeds, MOST_SETS)
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise ConfigError(f"trials: seeds = {list(self.seeds)}; at least one seed, each once, must hold")
-
-
-@dataclass(frozen=True)
-class PairedDifference:
-    """Difference of an error from that of the first set, report unit, with its 95 % interval."""
-
-    mean: float
-    low: float
-    high: float
-
-
-@dataclass(frozen=True)
-class FeatureSetTrial:
-    """Judged feature set.
-
-    Attributes:
-        name: name of the set.
-        channels: logged channels that it reads.
-        features: inputs of the network, including derived channels.
-        parameters: trainable numbers of the network.
-        error: mean absolute error by horizon, mean over targets, seeds and ticks of the held-out recordings.
-        by_seed: errors of each seed.
-        difference: difference to the first set by horizon, paired over the held-out recordings; None for the first set,
-            and with a single recording.
-        seconds: training time of all seeds, s.
-    """
-
-    name: str
-    channels: tuple[str, ...]
-    features: int
-    parameters: int
-    error: dict[str, float]
-    by_seed: dict[str, tuple[float, ...]]
-    difference: dict[str, PairedDifference] | None
-    seconds: float
-
-
-@dataclass(frozen=True)
-class Trials:
-    """All trials in the given order.
-
-    Attributes:
-        trials: the first one is what the others are compared with.
-        persistence: error of taking the present value, by horizon.
-        unit: report unit of the errors.
-        held_out: names of the recordings that judged.
-        notes: sets that could not be tried, and why; channels that had to be added.
-    """
-
-    trials: tuple[FeatureSetTrial, ...]
-    persistence: dict[str, float]
-    unit: str
-    held_out: tuple[str, ...]
-    notes: tuple[str, ...]
-
-    def to_json(self) -> dict[str, object]:
-        """Plain values: the content of ``trials.json``."""
-        return {"schema": 1, **asdict(self)}
 
 
 def try_feature_sets(
@@ -178,7 +120,7 @@ def try_feature_sets(
         bundle = _train_trial(source, trial, partial(tell, trial.name, done, len(planned)))
         finished.setdefault(trial.name, []).append(_Finished.of(bundle, trial.run))
     trials = _tabulate_trials(finished, notes, experiment.task.horizons)
-    write_json(folder / FILE, trials.to_json())
+    trials.write(folder)
     return trials
 
 

@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from edp.errors import ConfigError, DataError
 from edp.logs.source import DataSource
@@ -51,7 +50,7 @@ class StoredMachine:
     minutes: float
 
 
-def machine_of(meta: Mapping[str, Any]) -> str:
+def machine_of(meta: Mapping[str, object]) -> str:
     """Return the name of the recorded machine; empty if it is not stated."""
     return str(meta.get(MACHINE, "")).strip()
 

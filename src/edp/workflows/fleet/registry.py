@@ -21,7 +21,6 @@ from edp.evaluation.scores_file import MEAN, ScoresFile, metric
 from edp.networks.predictor import describe
 from edp.settings.provenance import DataPart, Provenance, read_provenance
 from edp.settings.results import ResultFile
-from edp.settings.tree import Table
 from edp.storage import (
     check_writable,
     hold,
@@ -196,7 +195,7 @@ def _base_of(provenance: Provenance) -> str:
     return str(weights or "")
 
 
-def _data_of(provenance: Provenance) -> Table:
+def _data_of(provenance: Provenance) -> dict[str, object]:
     data = provenance.data
     if data is None:
         return {}
@@ -215,7 +214,7 @@ def _recordings(parts: Sequence[DataPart]) -> int:
     return len(names) or sum(part.recordings for part in parts)
 
 
-def _judge_of(folder: Path, bundle: Bundle) -> Table:
+def _judge_of(folder: Path, bundle: Bundle) -> dict[str, object]:
     """Return the errors of the run's own test part and the best baseline's, from ``scores.json``."""
     file = folder / SCORES
     if not is_file_at(file):

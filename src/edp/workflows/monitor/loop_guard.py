@@ -116,7 +116,7 @@ def suspected(alarm: MonitorAlarm, judged: Mapping[str, tuple[str, ...]]) -> tup
     residuals deviates: one that explains all, and has no residual that stays quiet, scores highest.
 
     Args:
-        alarm: alarm with its evidence.
+        alarm: with its evidence.
         judged: see `list_evaluated_channels`.
     """
     squares: dict[str, float] = {}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from edp import __version__
 from edp.config.experiment import Experiment, plain_tree
@@ -20,7 +22,6 @@ from edp.networks.predictor import Predictor
 from edp.progress import SILENT, Progress
 from edp.storage.ledger import TrainingIdentity
 from edp.storage.paths import full_path
-from edp.storage.reading import Table
 from edp.storage.runs import Run, check_claimable, check_visible
 from edp.training import Diverged, load_bundle
 from edp.training.bundle import weights_digest
@@ -102,7 +103,7 @@ def pretrain(
     experiment = _carrying(experiment, method.episodic, data.task.rate_hz)
     strategy_factory = None
     if strategy is not None:
-        facts: Table = {"method": order.method, "start": None if begun is None else weights_digest(begun)}
+        facts: dict[str, object] = {"method": order.method, "start": None if begun is None else weights_digest(begun)}
         facts |= {"meta": asdict(order.meta)} if method.episodic else {}
         chosen = strategy
         strategy_factory = StrategyFactory(facts, lambda prepared: chosen, frozen)
@@ -135,7 +136,7 @@ def _pretrain_on_node(source: DataSource, experiment: Experiment, order: Pretrai
         check_visible(out)
 
 
-def pretrain_unit(identity: TrainingIdentity, where: Table) -> dict[str, str]:
+def pretrain_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str, str]:
     """Train one network for many machines, or continue; the folder records a diverged run."""
     try:
         pretrain(where["source"], where["experiment"], where["order"], where["out"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import tomli_w
@@ -14,7 +14,6 @@ from edp.logs.source import map_of_table
 from edp.settings.tree import parse_toml
 from edp.signals import VOCABULARY, Kind, SignalMap
 from edp.storage.paths import full_path
-from edp.storage.reading import Table
 
 MAP, SETTINGS, DATA = "map.toml", "settings.toml", "data.toml"
 MOST_FEATURES = 48
@@ -67,7 +66,7 @@ def remarks_of(paths: Sequence[Path], proposal: MapProposal) -> list[str]:
     return lines
 
 
-def toml_text(table: Table, remarks: Iterable[str] = ()) -> str:
+def toml_text(table: Mapping[str, object], remarks: Iterable[str] = ()) -> str:
     """TOML with comments above; a comment ends at no character of a name."""
     visible = ["".join(letter if letter.isprintable() else "?" for letter in line) for line in remarks]
     return "".join(f"# {line}\n" for line in visible) + tomli_w.dumps(table)
@@ -100,7 +99,9 @@ def name_paths(paths: Sequence[Path]) -> list[tuple[Path, str]]:
     return list(zip(usable, unique_names([path.stem for path in usable], usable)))
 
 
-def data_set_text(recordings: list[Table], map_file: str | None = None, repair: dict[str, str] | None = None) -> str:
+def data_set_text(
+    recordings: Sequence[Mapping[str, object]], map_file: str | None = None, repair: dict[str, str] | None = None
+) -> str:
     """Return a data set as in a file.
 
     Raises:

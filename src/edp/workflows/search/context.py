@@ -10,10 +10,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.config.experiment import Table
 from edp.errors import ConfigError, DataError, closest
 from edp.evaluation.study import Decision, facts_of_kind
 from edp.stats.folds import repeated_folds, repeated_splits
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.modules import add_modules
 from edp.workflows.search.settings import SearchSpec
 from edp.workflows.search.space import WIDTHS, Candidate
@@ -29,7 +29,7 @@ class SearchContext:
 
     Attributes:
         spec: the settings of the search.
-        base: settings of the network and its training from which everything starts (`settings_of`).
+        base: settings of the network and its training from which everything starts.
         source: where the recordings are, plain.
         development: names of the sessions that train and judge in all phases.
         test: names of the sessions set apart.
@@ -40,8 +40,8 @@ class SearchContext:
     """
 
     spec: SearchSpec
-    base: Table
-    source: Table
+    base: Arm
+    source: Mapping[str, object]
     development: tuple[str, ...]
     test: tuple[str, ...]
     channels: tuple[str, ...] = ()
@@ -87,21 +87,21 @@ class SearchContext:
         # Whole repeats of the folds, cut to the runs: every session is judged once before any is judged twice.
         return repeated_folds(sessions, folds, -(-runs // folds), self.spec.seed)[:runs]
 
-    def shaped(self, settings: Table) -> Table:
-        """Return settings with this search's widths of networks."""
-        return WIDTHS[self.spec.widths](settings)
+    def shaped(self, arm: Arm) -> Arm:
+        """Return an arm with this search's widths of networks."""
+        return WIDTHS[self.spec.widths](arm)
 
-    def network(self, settings: Table, names: Sequence[str] = (), options: Candidate | None = None) -> Table:
-        """Return settings with modules and toggles added, and this search's widths."""
-        return add_modules(settings, names, self.channels, options, self.shaped)
+    def network(self, arm: Arm, names: Sequence[str] = (), options: Candidate | None = None) -> Arm:
+        """Return an arm with modules and toggles added, and this search's widths."""
+        return add_modules(arm, names, self.channels, options, self.shaped)
 
-    def orders(self, settings: Table, runs: Sequence[int], seed: int = 0) -> list[TrainingRequest]:
+    def orders(self, arm: Arm, runs: Sequence[int], seed: int = 0) -> list[TrainingRequest]:
         """Return one request per run: the same folds and seeds for every arm (common random numbers).
 
         Trainings of several epochs are validated by the sessions that judge them, as in the thesis.
 
         Args:
-            settings: of the arm.
+            arm: what to train.
             runs: their numbers, from 0.
             seed: number of the seed within a run.
         """
@@ -113,12 +113,12 @@ class SearchContext:
             train, judged = (tuple(names[rows].tolist()) for rows in (~mask[run], mask[run]))
             # A seed a run and not an arm: common random numbers make differences between arms smaller.
             seed_of_run = self.seed("run", run, seed)
-            requests.append(self.order(settings, train, judged, seed_of_run, self.spec.updates, judged))
+            requests.append(self.order(arm, train, judged, seed_of_run, self.spec.updates, judged))
         return requests
 
     def order(
         self,
-        settings: Table,
+        arm: Arm,
         train: tuple[str, ...],
         judged: tuple[str, ...],
         seed: int,
@@ -126,11 +126,10 @@ class SearchContext:
         validation: tuple[str, ...],
     ) -> TrainingRequest:
         """Request a training; sessions of `validation` select the best of several epochs, and nothing for one epoch."""
-        sessions = (settings, self.source, train, judged)
-        if self.spec.epochs == 1:
-            return TrainingRequest(*sessions, seed, updates)
         epochs, patience = self.spec.epochs, self.spec.patience
-        return TrainingRequest(*sessions, seed, updates, epochs=epochs, patience=patience, validation=validation)
+        chosen_by = validation if epochs > 1 else ()
+        sessions = (arm.tables, self.source, train, judged)
+        return TrainingRequest(*sessions, seed, updates, epochs=epochs, patience=patience, validation=chosen_by)
 
     def seed(self, *parts: object) -> int:
         """Return a seed for each purpose, derived from the root."""

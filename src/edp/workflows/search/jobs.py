@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
-from edp.config.experiment import Table
 from edp.jobs.base import START, Job
 from edp.storage.ledger import TrainingIdentity, WithState, code_version, read_state
 from edp.storage.provenance import environment
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.smaller import make_smaller
 from edp.workflows.search.trainings import TrainingRequest, experiment_of, train_part
 
@@ -30,8 +30,8 @@ def job_of(
         ConfigError: settings that cannot be built, or an unknown machine.
     """
     # Threads are part of a result: sums change their order with them.
-    settings = {**order.settings, "training": {**order.settings.get("training", {}), "threads": threads}}
-    config: Table = {"settings": settings, "updates": order.updates}
+    arm = Arm(order.settings).with_value("training.threads", threads)
+    config: dict[str, object] = {"settings": arm.tables, "updates": order.updates}
     sessions = {"train": list(order.train), "judged": list(order.judged)}
     # One epoch leaves these out, so that keys of earlier studies stay what they were.
     if order.epochs > 1:
@@ -41,7 +41,7 @@ def job_of(
         config["until"] = order.until
     if order.recipe is not None:
         config["recipe"] = order.recipe
-    if settings.get("model", {}).get("physics"):
+    if arm.get("model.physics"):
         physics = experiment_of(order).model.physics
         config["machine"] = None if physics is None else physics.digest()  # its file may change, and its name stays
     identity = TrainingIdentity(
@@ -60,8 +60,8 @@ def job_of(
 _environment = cache(environment)  # looking up versions takes as long as a record
 
 
-def train(identity: TrainingIdentity, where: Mapping[str, Any]) -> Table | WithState:
-    """Do the order; what differs from repeat to repeat is left to the record's measures.
+def train(identity: TrainingIdentity, where: Mapping[str, Any]) -> object:
+    """Do the order, and return its result, with the state from which a later part continues.
 
     Where the file of a state cannot be read any more, it is trained from the beginning.
 
@@ -70,7 +70,5 @@ def train(identity: TrainingIdentity, where: Mapping[str, Any]) -> Table | WithS
     """
     plain = {**identity.config, **identity.split, "seed": identity.seed, "source": where["source"]}
     part = train_part if identity.config.get("recipe") is None else make_smaller
-    result, state = part(plain, read_state(where[START]) if START in where else None)
-    # Seconds differ from run to run; equal trainings give equal results.
-    del result["seconds"]
-    return result if state is None else WithState(result, state)
+    trained = part(TrainingRequest.from_json(plain), read_state(where[START]) if START in where else None)
+    return trained.result if trained.state is None else WithState(trained.result, trained.state)

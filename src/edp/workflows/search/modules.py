@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any, TypeAlias, cast
 
-from edp.config.experiment import Experiment, Table, build, merged, plain_tree
+from edp.config.experiment import plain_tree
 from edp.errors import ConfigError, closest
 from edp.networks.blocks import BLOCKS, BlockSpec
 from edp.networks.heads import GluHead
 from edp.networks.losses import Correlation
 from edp.networks.predictor import check_combination
 from edp.registry import Registry
+from edp.settings.tree import value_at, with_value
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.space import Choice, Value
 
 
@@ -24,18 +25,18 @@ class Module:
 
     Attributes:
         title: what the thesis calls it; a block beyond the thesis bears its name.
-        change: settings laid over the baseline's.
+        change: settings laid over those of the baseline.
         block: a block that is appended to the baseline's; None for none.
         options: values to search where the module is on, by the place of the setting: keys joined by points, or
             the name of an option of the block.
-        alter: changes settings in place, where what changes depends on them; None for nothing.
+        alter: returns the changed arm, where what changes depends on its settings; None for nothing.
     """
 
     title: str
-    change: Table = field(default_factory=dict)
-    block: Table | None = None
+    change: Mapping[str, object] = field(default_factory=dict)
+    block: Mapping[str, object] | None = None
     options: Mapping[str, Sequence[Any]] = field(default_factory=dict)
-    alter: Callable[[Table], None] | None = None
+    alter: Callable[[Arm], Arm] | None = None
 
 
 class _Modules(Mapping[str, Module]):
@@ -73,8 +74,8 @@ MODULES = _Modules()
 TOGGLES: Registry[Module] = Registry("toggle")
 """Parts of the training that thesis Table 4.6 lists among what phases 4 and 5 may switch on; no module of Table 4.5."""
 
-Shape: TypeAlias = Callable[[Table], Table]
-"""Gives settings the widths that follow from others (`edp.workflows.search.space.WIDTHS`)."""
+Shape: TypeAlias = Callable[[Arm], Arm]
+"""Gives an arm the widths that follow from others (`edp.workflows.search.space.WIDTHS`)."""
 
 
 def _space(name: str) -> Mapping[str, Sequence[Any]]:
@@ -89,7 +90,7 @@ def _block(name: str, title: str, **fixed: Any) -> None:
 
 
 def _change(
-    name: str, title: str, part: str, change: Table, options: Mapping[str, Sequence[Any]] | None = None
+    name: str, title: str, part: str, change: Mapping[str, object], options: Mapping[str, Sequence[Any]] | None = None
 ) -> None:
     placed = {f"model.{part}.{key}": values for key, values in (options or {}).items()}
     THESIS_MODULES.register(name)(Module(title, {"model": {part: change}}, options=placed))
@@ -111,18 +112,20 @@ _change("glu_head", "GLU Head", "head", {"kind": "glu"}, {"hidden": GluHead.spac
 _change("stanh", "STanh Activation", "activation", {"kind": "stanh"})
 
 
-def _correlation(settings: Table) -> None:
+def _correlation(arm: Arm) -> Arm:
     """Add the correlation term with its weight, unless the training has one."""
-    terms = settings["training"].get("terms", [])
-    if all(term["kind"] != "correlation" for term in terms):
-        settings["training"]["terms"] = [*terms, *plain_tree((Correlation(),), "terms")]
+    terms = arm.get("training.terms", [])
+    if any(term["kind"] == "correlation" for term in terms):
+        return arm
+    return arm.with_value("training.terms", [*terms, *plain_tree((Correlation(),), "terms")])
 
 
-def _focal(settings: Table) -> None:
+def _focal(arm: Arm) -> Arm:
     """Weight the loss by the size of the error; a squared loss gets a threshold that no error reaches."""
-    loss = settings["training"]["loss"]
-    if loss["kind"] != "focal":
-        settings["training"]["loss"] = {"kind": "focal", "gamma": 2.0, "delta": loss.get("delta", NO_THRESHOLD)}
+    if arm["training.loss.kind"] == "focal":
+        return arm
+    delta = arm.get("training.loss.delta", NO_THRESHOLD)
+    return arm.with_value("training.loss", {"kind": "focal", "gamma": 2.0, "delta": delta})
 
 
 NO_THRESHOLD = 1e6
@@ -148,16 +151,16 @@ def title_of(name: str) -> str:
 
 
 def add_modules(
-    settings: Table,
+    arm: Arm,
     names: Iterable[str],
     channels: Sequence[str] = (),
     options: Mapping[str, Value] | None = None,
     shape: Shape | None = None,
-) -> Table:
-    """Return settings with these modules added in the order of the registry, so that equal sets give equal settings.
+) -> Arm:
+    """Return an arm with these modules added in the order of the registry, so that equal sets give equal arms.
 
     Args:
-        settings: a whole experiment as plain tables (`edp.config.experiment.plain_tree`).
+        arm: with all settings of an experiment.
         names: registered modules and toggles.
         channels: of the recordings, for the feature set ``all``.
         options: values of `options_of` for some of the modules; those that a module has anyway change nothing.
@@ -168,79 +171,80 @@ def add_modules(
     """
     # Sets, so that the order of names cannot make two keys of one network.
     module_names = set(names)
-    reasons = conflicts(settings, module_names, channels)
+    reasons = conflicts(arm, module_names, channels)
     if reasons:
         raise ConfigError("modules: " + "; ".join(reasons))
-    changed_settings = _add_modules(settings, module_names)
+    changed = _add_modules(arm, module_names)
     if shape is not None:
-        changed_settings = shape(changed_settings)
+        changed = shape(changed)
     for name in (name for name in MODULES if name in module_names):
-        for key, option in _options(settings, name, shape).items():
+        for key, option in _options(arm, name, shape).items():
             # What is not chosen keeps its present value, which is always among the options.
             label = (options or {}).get(key, option.present)
             if label not in option.values:
                 raise ConfigError(f"modules: {key} = {label!r}; one of {list(option.values)} must hold")
             if label != option.present:
-                option.put(changed_settings, option.values[label])
-    return changed_settings
+                changed = option.put(changed, option.values[label])
+    return changed
 
 
-def options_of(settings: Table, name: str, shape: Shape | None = None) -> dict[str, Choice]:
+def options_of(arm: Arm, name: str, shape: Shape | None = None) -> dict[str, Choice]:
     """Return the options of an active module that may vary, as dimensions ``module.option``.
 
     Args:
-        settings: to which the module would be added; what it would have there is one of the values.
+        arm: to which the module would be added; what it would have there is one of the values.
         name: of the module, or of a toggle, which has none.
         shape: as in `add_modules`.
     """
-    options = {key: tuple(option.values) for key, option in _options(settings, name, shape).items()}
+    options = {key: tuple(option.values) for key, option in _options(arm, name, shape).items()}
     return {key: Choice(values) for key, values in options.items() if len(values) > 1}
 
 
-def present_options(settings: Table, names: Iterable[str], shape: Shape | None = None) -> dict[str, Value]:
+def present_options(arm: Arm, names: Iterable[str], shape: Shape | None = None) -> dict[str, Value]:
     """Return the present options of these modules, before any choice."""
-    return {key: option.present for name in names for key, option in _options(settings, name, shape).items()}
+    return {key: option.present for name in names for key, option in _options(arm, name, shape).items()}
 
 
 @dataclass(frozen=True)
 class _Option:
-    """A setting of a module: its values by the label that a sampler sees, the label of the present one, where it is."""
+    """A setting of a module: its values by the label that a sampler sees, the label of the present one, where it is.
+
+    Without a `kind` of block the path begins at the whole experiment.
+    """
 
     values: Mapping[Value, Any]
     present: Value
-    keys: tuple[str, ...]
-    kind: str | None
+    path: str
+    kind: object
 
-    def put(self, settings: Table, value: Any) -> None:
-        """Set it, in place."""
-        table = settings
-        if self.kind is not None:
-            table = next(block for block in settings["model"]["blocks"] if block["kind"] == self.kind)
-        for key in self.keys[:-1]:
-            table = table[key]
-        table[self.keys[-1]] = list(value) if isinstance(value, tuple) else value
+    def put(self, arm: Arm, value: Any) -> Arm:
+        """Return an arm with another value of the setting."""
+        plain = list(value) if isinstance(value, tuple) else value
+        if self.kind is None:
+            return arm.with_value(self.path, plain)
+        blocks = list(arm["model.blocks"])
+        index = next(i for i, block in enumerate(blocks) if block["kind"] == self.kind)
+        blocks[index] = with_value(blocks[index], self.path, plain)
+        return arm.with_value("model.blocks", blocks)
 
 
-def _options(settings: Table, name: str, shape: Shape | None = None) -> dict[str, _Option]:
+def _options(arm: Arm, name: str, shape: Shape | None = None) -> dict[str, _Option]:
     module, options = part_of(name), {}
     if not module.options:
         return {}  # a search asks for those of every module thousands of times
-    plain = plain_tree(build(Experiment, _add_modules(settings, {name}), f"with {name}"))
+    whole = Arm(plain_tree(_add_modules(arm, {name}).experiment(f"with {name}")))
     if shape is not None:
-        plain = shape(plain)
-    for joined_key, values in module.options.items():
-        keys, present_value = tuple(joined_key.split(".")), plain
-        kind = None if module.block is None else str(module.block["kind"])
-        if kind is not None:
-            present_value = next(block for block in plain["model"]["blocks"] if block["kind"] == kind)
-        for key in keys:
-            present_value = present_value[key]
-        present = _label(present_value)
+        whole = shape(whole)
+    part, kind = whole.tables, None if module.block is None else module.block["kind"]
+    if kind is not None:
+        part = next(block for block in whole["model.blocks"] if block["kind"] == kind)
+    for path, values in module.options.items():
+        present = _label(value_at(part, path))
         # A value of the settings outside of the searched ones stays possible.
         labelled = {_label(value): value for value in values}
         if present not in labelled:
-            labelled = {present: present_value, **labelled}
-        options[f"{name}.{keys[-1]}"] = _Option(labelled, present, keys, kind)
+            labelled = {present: value_at(part, path), **labelled}
+        options[f"{name}.{path.rpartition('.')[2]}"] = _Option(labelled, present, path, kind)
     return options
 
 
@@ -252,7 +256,7 @@ def _label(value: Any) -> Value:
     return scalar
 
 
-def conflicts(settings: Table, names: Iterable[str], channels: Sequence[str] = ()) -> list[str]:
+def conflicts(arm: Arm, names: Iterable[str], channels: Sequence[str] = ()) -> list[str]:
     """Why these modules cannot be used together on this network; empty where they can.
 
     Two modules contradict one another where they set the same value differently, and all of them where the parts of
@@ -266,17 +270,15 @@ def conflicts(settings: Table, names: Iterable[str], channels: Sequence[str] = (
     reasons = []
     for (one, first), (other, second) in combinations(chosen, 2):
         mine, theirs = dict(_leaves(first.change)), dict(_leaves(second.change))
-        both = sorted(".".join(path) for path in mine.keys() & theirs.keys() if mine[path] != theirs[path])
+        both = sorted(path for path in mine.keys() & theirs.keys() if mine[path] != theirs[path])
         if both:
             reasons.append(f"'{one}' and '{other}' both set {', '.join(both)}; keep one of them")
     if reasons:
         return reasons
     try:
         # Building the experiment is the rule: every part knows its own conflicts.
-        experiment = build(
-            Experiment,
-            _add_modules(settings, module_names),
-            "with " + (", ".join(sorted(module_names)) or "no modules"),
+        experiment = _add_modules(arm, module_names).experiment(
+            "with " + (", ".join(sorted(module_names)) or "no modules")
         )
         # Conflicts do not depend on the rate; 100 Hz is the thesis's.
         task = experiment.task.resolve(100.0, channels, physics=experiment.model.physics)
@@ -286,44 +288,41 @@ def conflicts(settings: Table, names: Iterable[str], channels: Sequence[str] = (
     return []
 
 
-def fitting(settings: Table, channels: Sequence[str] = (), among: Sequence[str] = ()) -> tuple[str, ...]:
+def fitting(arm: Arm, channels: Sequence[str] = (), among: Sequence[str] = ()) -> tuple[str, ...]:
     """Modules that this network can have, in the order of the registry, and does not have already.
 
     Args:
-        settings: of the network.
+        arm: with the network.
         channels: of the recordings, for the feature set ``all``.
         among: names of those that are asked about; empty for all.
     """
-    free = (name for name in MODULES if (not among or name in among) and _add_modules(settings, {name}) != settings)
-    return tuple(name for name in free if not conflicts(settings, (name,), channels))
+    free = (name for name in MODULES if (not among or name in among) and _add_modules(arm, {name}) != arm)
+    return tuple(name for name in free if not conflicts(arm, (name,), channels))
 
 
-def contradicting(settings: Table, names: Iterable[str], channels: Sequence[str] = ()) -> frozenset[frozenset[str]]:
+def contradicting(arm: Arm, names: Iterable[str], channels: Sequence[str] = ()) -> frozenset[frozenset[str]]:
     """Pairs of modules that fit alone, but not together."""
     pairs = combinations(sorted(set(names)), 2)
-    return frozenset(frozenset(pair) for pair in pairs if conflicts(settings, pair, channels))
+    return frozenset(frozenset(pair) for pair in pairs if conflicts(arm, pair, channels))
 
 
-def _add_modules(settings: Table, names: set[str]) -> Table:
-    changed_settings = copy.deepcopy(settings)
+def _add_modules(arm: Arm, names: set[str]) -> Arm:
     for name, module in (*MODULES.items(), *TOGGLES.items()):
         if name not in names:
             continue
-        changed_settings = merged(changed_settings, copy.deepcopy(dict(module.change)))
+        arm = arm.merged(module.change)
         # A block of the same kind with other options is replaced, not doubled.
-        if module.block is not None and dict(module.block) not in changed_settings["model"]["blocks"]:
-            other_blocks = [
-                block for block in changed_settings["model"]["blocks"] if block["kind"] != module.block["kind"]
-            ]
-            changed_settings["model"]["blocks"] = [*other_blocks, dict(module.block)]
+        if module.block is not None and module.block not in arm["model.blocks"]:
+            others = [block for block in arm["model.blocks"] if block["kind"] != module.block["kind"]]
+            arm = arm.with_value("model.blocks", [*others, module.block])
         if module.alter is not None:
-            module.alter(changed_settings)
-    return changed_settings
+            arm = module.alter(arm)
+    return arm
 
 
-def _leaves(table: Mapping[str, object], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+def _leaves(table: Mapping[str, object], before: str = "") -> Iterator[tuple[str, object]]:
     for key, value in table.items():
         if isinstance(value, Mapping):
-            yield from _leaves(value, (*path, key))
+            yield from _leaves(value, f"{before}{key}.")
         else:
-            yield (*path, key), value
+            yield f"{before}{key}", value

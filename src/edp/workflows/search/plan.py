@@ -11,7 +11,6 @@ from typing import Any
 from edp.config.experiment import (
     Experiment,
     FeatureSettings,
-    Table,
     build,
     embed_feature_set,
     merged,
@@ -24,12 +23,13 @@ from edp.data.feature_files import is_set_file, read_set_table
 from edp.data.features import FEATURE_SETS
 from edp.errors import ConfigError, closest
 from edp.evaluation.controller import load_budget
-from edp.settings.tree import combined
+from edp.settings.bounds import shown
+from edp.settings.tree import combined, value_at, with_value
 from edp.storage import parse_toml
-from edp.workflows.search.phases.isolation import DEFAULT_BACKBONE, arm_settings
+from edp.workflows.search.arms import Arm
+from edp.workflows.search.phases.isolation import DEFAULT_BACKBONE, arm_of
 from edp.workflows.search.settings import MOVED, SearchSpec
 from edp.workflows.search.space import DIMENSIONS, THESIS, WIDTHS, Choice, Range, Real, Space, applicable, apply
-from edp.workflows.search.trainings import settings_of
 
 PRESETS = ("quick", "standard", "thesis")
 
@@ -48,10 +48,10 @@ class SearchPlan:
     experiment: Experiment
     preset: str = ""
 
-    def to_plain(self) -> Table:
+    def to_plain(self) -> dict[str, object]:
         """Return the identity of a study, in parts that a message can name."""
         spec = plain_spec(self.spec)
-        return {"space": spec.pop("space"), "search": spec, "network": settings_of(self.experiment)}
+        return {"space": spec.pop("space"), "search": spec, "network": Arm.from_experiment(self.experiment).tables}
 
 
 def load_plan(path: str | Path | None = None, preset: str = "quick", overrides: Sequence[str] = ()) -> SearchPlan:
@@ -77,12 +77,12 @@ def load_plan(path: str | Path | None = None, preset: str = "quick", overrides: 
     base, search = table.pop("base", "quick"), table.pop("search", {})
     if not isinstance(search, Mapping):
         raise ConfigError(f"settings {where}: search = {search!r}; expected a table")
-    experiment = build(Experiment, merged(preset_table(base), table), where)
+    experiment = build(Experiment, merged(preset_table(str(base)), table), where)
     for key in search:
         if key in MOVED:
             raise ConfigError(f"settings {where}: 'search.{key}' is now called 'search.{MOVED[key]}'")
     spec = _spec(_use_task(dict(search), table, experiment), where)
-    _check_parts(spec, settings_of(experiment), f"settings {where}: search")
+    _check_parts(spec, Arm.from_experiment(experiment), f"settings {where}: search")
     # Scores exist for the horizons of the task only.
     if spec.horizon not in experiment.task.horizons:
         horizons = ", ".join(map(str, experiment.task.horizons))
@@ -93,11 +93,10 @@ def load_plan(path: str | Path | None = None, preset: str = "quick", overrides: 
     return SearchPlan(spec, experiment, preset)
 
 
-def _use_task(search: Table, table: Table, experiment: Experiment) -> Table:
+def _use_task(search: Mapping[str, object], table: Mapping[str, object], experiment: Experiment) -> dict[str, object]:
     """Use the feature set and the horizon of the task if ``[search]`` does not set them."""
-    completed, task = {**search}, table.get("task")
-    if "features" not in search and isinstance(task, Mapping) and "features" in task:
-        features = task["features"]
+    completed, features = dict(search), value_at(table, "task.features")
+    if "features" not in search and features is not None:
         own = features if isinstance(features, str) else experiment.task.features
         completed["features"] = [own if isinstance(own, str) else plain_tree(own)]
     horizons = experiment.task.horizons
@@ -106,28 +105,22 @@ def _use_task(search: Table, table: Table, experiment: Experiment) -> Table:
     return completed
 
 
-def _read_named_files(table: Table, folder: Path) -> Table:
+def _read_named_files(table: Mapping[str, object], folder: Path) -> dict[str, object]:
     """`table` with the feature sets and the budget that it names by files."""
-    resolved, search = embed_feature_set(table, folder), table.get("search")
-    if not isinstance(search, Mapping):
-        return resolved
-    compression = search.get("compression")
-    if isinstance(compression, Mapping) and isinstance(compression.get("budget"), str):
-        search = {
-            **search,
-            "compression": {**compression, "budget": asdict(load_budget(folder / compression["budget"]))},
-        }
-        resolved = {**resolved, "search": search}
-    if not isinstance(search.get("features"), list):
-        return resolved
-    sets = [
-        build(FeatureSettings, read_set_table(folder / one), f"'{folder / one}'") if is_set_file(one) else one
-        for one in search["features"]
-    ]
-    return {**resolved, "search": {**search, "features": sets}}
+    resolved = embed_feature_set(table, folder)
+    budget, features = (value_at(table, f"search.{key}") for key in ("compression.budget", "features"))
+    if isinstance(budget, str):
+        resolved = with_value(resolved, "search.compression.budget", asdict(load_budget(folder / budget)))
+    if isinstance(features, list):
+        sets = [
+            build(FeatureSettings, read_set_table(folder / one), f"'{folder / one}'") if is_set_file(one) else one
+            for one in features
+        ]
+        resolved = with_value(resolved, "search.features", sets)
+    return resolved
 
 
-def _check_parts(spec: SearchSpec, settings: Table, where: str) -> None:
+def _check_parts(spec: SearchSpec, base: Arm, where: str) -> None:
     """Every backbone, feature set and value of the space makes an experiment; otherwise the first that does not."""
     for name in spec.backbones:
         if name not in DEFAULT_BACKBONE:
@@ -143,22 +136,22 @@ def _check_parts(spec: SearchSpec, settings: Table, where: str) -> None:
             )
     for backbone in spec.backbones:
         # One feature set suffices: values of the space act on backbone and training.
-        arm = arm_settings(settings, backbone, next(iter(spec.feature_sets.values())))
+        arm = arm_of(base, backbone, next(iter(spec.feature_sets.values())))
         for key, space in (("space", applicable(spec.space, arm)), ("deferred", spec.deferred)):
             _check_values(space, arm, f"{where}.{key}", backbone, spec.widths)
 
 
-def _check_values(space: Space, arm: Table, where: str, backbone: str, widths: str) -> None:
+def _check_values(space: Space, arm: Arm, where: str, backbone: str, widths: str) -> None:
     for name, range_ in space.items():
         # Ends of a range suffice: parts refuse values beyond a bound, not between two good ones.
         for value in range_.options if isinstance(range_, Choice) else (range_.low, range_.high):
             try:
-                build(Experiment, WIDTHS[widths](apply(arm, {name: value})), "of the search")
+                WIDTHS[widths](apply(arm, {name: value})).experiment("of the search")
             except (ConfigError, KeyError, TypeError, ValueError) as error:
                 raise ConfigError(f"{where}.{name} = {value!r} cannot be for {backbone}: {error}") from error
 
 
-def _spec(table: Table, where: str) -> SearchSpec:
+def _spec(table: dict[str, object], where: str) -> SearchSpec:
     space = space_of(table.pop("space", {}), THESIS, where)
     deferred = space_of(table.pop("deferred", {}), None, where, "deferred")
     if not space:
@@ -167,15 +160,17 @@ def _spec(table: Table, where: str) -> SearchSpec:
 
 
 def space_of(
-    table: Table, over: Space | None = None, where: str = "of a study", key: str = "space"
+    entries: object, over: Space | None = None, where: str = "of a study", key: str = "space"
 ) -> dict[str, Range]:
     """Return a space from its form in a settings file, merged over another one; `key` is its name there.
 
     Raises:
-        ConfigError: an unknown dimension, or a range that holds nothing.
+        ConfigError: no table, an unknown dimension, or a range that holds nothing.
     """
+    if not isinstance(entries, Mapping):
+        raise ConfigError(f"settings {where}: search.{key} = {shown(entries)}; expected a table of dimensions")
     space = dict(over or {})
-    for name, entry in dict(table).items():
+    for name, entry in entries.items():
         if name not in DIMENSIONS:
             raise ConfigError(f"settings {where}: unknown dimension 'search.{key}.{name}'{closest(name, DIMENSIONS)}")
         # `false` takes a dimension out of the preset's space.
@@ -200,19 +195,18 @@ def _range(entry: Any, where: str) -> Range:
     )
 
 
-def plain_spec(spec: SearchSpec) -> Table:
+def plain_spec(spec: SearchSpec) -> dict[str, object]:
     """Return a spec as plain values, with the keys that the identity of a study has (`MOVED`)."""
-    table: Table = plain_tree(spec)
+    table = plain_tree(spec)
     for key, moved in MOVED.items():
         phase, name = moved.split(".")
         table[key] = table[phase].pop(name)
     for phase in {moved.partition(".")[0] for moved in MOVED.values()}:
         table |= {f"{phase}.{name}": value for name, value in table.pop(phase).items()}
-    table["space"], table["deferred"] = plain_space(spec.space), plain_space(spec.deferred)
-    return table
+    return {**table, "space": plain_space(spec.space), "deferred": plain_space(spec.deferred)}
 
 
-def plain_space(space: Space) -> Table:
+def plain_space(space: Space) -> dict[str, object]:
     """Return a space as in a settings file."""
     return {
         name: list(dimension.options)

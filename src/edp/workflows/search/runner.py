@@ -12,7 +12,7 @@ from pathlib import Path
 
 import tomli_w
 
-from edp.config.experiment import Experiment, build, plain_tree
+from edp.config.experiment import plain_tree
 from edp.data.frozen import SECOND_TEST_SET, ByFrozen
 from edp.errors import ConfigError, DataError
 from edp.evaluation.study import Decision, SessionSets, StudyData, StudyFile, facts_of_kind
@@ -26,6 +26,7 @@ from edp.signals import KINDS
 from edp.storage import make_folder, write_bytes
 from edp.storage.ledger import Ledger, Record, check_uncoordinated
 from edp.wording import typed
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.context import SearchContext, is_enough, set_apart
 from edp.workflows.search.engine import Dispatcher, run_phases
 from edp.workflows.search.networks import freeze_split, write_networks
@@ -33,7 +34,7 @@ from edp.workflows.search.phases import PHASES
 from edp.workflows.search.plan import SearchPlan, plain_spec
 from edp.workflows.search.sessions import SESSIONS_FILE, divide_logs
 from edp.workflows.search.study_log import StudyLog
-from edp.workflows.search.trainings import Outcome, TrainingRequest, settings_of
+from edp.workflows.search.trainings import Outcome, TrainingRequest
 
 TEST_SET = "test sessions"
 TEACHER = "teacher.toml"
@@ -118,7 +119,9 @@ def run_search(
     check_uncoordinated(Path(folder) / "ledger")
     # Before anything is made on disk: what is refused leaves no folder.
     recordings = source.read()
-    parts = None if is_enough(len(recordings), plan.spec) else divide_logs(source, recordings, _gap(plan))
+    # Samples that a prediction reads and looks ahead.
+    reach = plan.experiment.model.window + max(plan.experiment.task.horizons)
+    parts = None if is_enough(len(recordings), plan.spec) else divide_logs(source, recordings, reach)
     data = _Data.of(recordings if parts is None else parts.recordings, plan)
     development, test, second = set_apart(data.names, data.families, plan.spec)
     target = make_folder(folder)
@@ -137,9 +140,9 @@ def run_search(
         ledger.bind({"data": data.digest, **plan.to_plain()})
         if parts is not None:
             write_bytes(source.path, parts.data_set().encode())
-        settings = settings_of(plan.experiment)
+        base = Arm.from_experiment(plan.experiment)
         context = SearchContext(
-            plan.spec, settings, source.to_plain(), development, test, data.channels, data.unit, second=second
+            plan.spec, base, source.to_plain(), development, test, data.channels, data.unit, second=second
         )
         study_log = StudyLog(target, _study(plan, data, source, context), context)
         executor = open_things.enter_context(resources.open())
@@ -199,11 +202,6 @@ class _Data:
         hours = sum(recording.duration_s for recording in recordings) / 3600
         digests = {recording.name: recording.digest for recording in recordings}
         return _Data(names, families, recordings[0].channel_names, state.hexdigest(), hours, unit, digests)
-
-
-def _gap(plan: SearchPlan) -> int:
-    """Return the samples that a prediction reads and looks ahead: window plus largest horizon."""
-    return plan.experiment.model.window + max(plan.experiment.task.horizons)
 
 
 class _Observer:
@@ -279,9 +277,8 @@ def _check_channels(recordings: Sequence[Recording], plan: SearchPlan) -> str:
         # Recordings of equal channels need one check.
         kinds.setdefault(recording.channel_names, recording)
     for name, features in plan.spec.feature_sets.items():
-        settings = settings_of(plan.experiment)
-        settings["task"] = {**settings["task"], "features": features}
-        experiment = build(Experiment, settings, "of the search")
+        arm = Arm.from_experiment(plan.experiment).with_value("task.features", features)
+        experiment = arm.experiment("of the search")
         for recording in kinds.values():
             try:
                 names = recordings[0].channel_names

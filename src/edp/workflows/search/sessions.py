@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import tomli_w
 
-from edp.config.experiment import Table, plain_tree
+from edp.config.experiment import plain_tree
 from edp.logs.read import unique_names
 from edp.logs.source import DataSource, Log
 from edp.recording import Recording
@@ -77,9 +77,9 @@ def divide_logs(source: DataSource, recordings: Sequence[Recording], gap: int) -
     return LogParts(named, read, min(recording.duration_s for recording in read))
 
 
-def _entry(log: Log) -> Table:
+def _entry(log: Log) -> dict[str, object]:
     """Return a log as an entry of a data-set file."""
-    entry: Table = {"path": str(log.path), "name": log.name, "rows": list(log.rows or ())}
+    entry: dict[str, object] = {"path": str(log.path), "name": log.name, "rows": list(log.rows or ())}
     if log.signal_map is not None:
         entry["map"] = plain_tree(log.signal_map)
     if log.repair is not None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-from edp.config.experiment import FeatureSettings, Table, plain_tree
+from edp.config.experiment import FeatureSettings, plain_tree
 from edp.errors import ConfigError, closest
 from edp.evaluation.controller import Budget
 from edp.evaluation.study import MODES
@@ -335,7 +336,7 @@ class SearchSpec:
             raise ConfigError("search: " + "; ".join(wrong) + " must hold")
 
     @property
-    def feature_sets(self) -> dict[str, str | Table]:
+    def feature_sets(self) -> dict[str, str | Mapping[str, object]]:
         """Return the values of ``task.features`` by name: a name of a set, or a plain table."""
         return {
             feature_set if isinstance(feature_set, str) else feature_set.name: feature_set

@@ -7,13 +7,13 @@ comes with the state of an earlier order, or is trained again from the same orde
 from __future__ import annotations
 
 import base64
-import time
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 
 from safetensors.torch import load, save
 from torch import Tensor
 
-from edp.config.experiment import Experiment, Table, build
+from edp.config.experiment import Experiment, build
 from edp.data.prepared import Prepared
 from edp.data.task import Task
 from edp.errors import DataError
@@ -27,7 +27,14 @@ from edp.training.spec import TrainingSpec
 from edp.workflows.compression.bench import TUNING_EPOCHS, Bench, CompressionRequest
 from edp.workflows.compression.pipeline import TEACHER, Evaluator, formats_of
 from edp.workflows.compression.variants import make_rounded_request
-from edp.workflows.search.trainings import TrainingRequest, experiment_of, mean_scores, prepared, session_scores
+from edp.workflows.search.trainings import (
+    TrainedPart,
+    TrainingRequest,
+    experiment_of,
+    mean_scores,
+    prepared,
+    session_scores,
+)
 
 Weights = dict[str, Tensor]
 
@@ -74,13 +81,13 @@ class Recipe:
         training = shortened(order, experiment.training, self.updates)
         return replace(experiment, model=order.model(experiment.model), training=training)
 
-    def to_json(self) -> Table:
+    def to_json(self) -> dict[str, object]:
         """Plain values."""
         lists = {"formats": list(self.formats), "validation": list(self.validation)}
         return {**vars(self), **lists, "budget": asdict(self.budget)}
 
     @staticmethod
-    def from_json(plain: Table) -> Recipe:
+    def from_json(plain: Mapping[str, object]) -> Recipe:
         """Return the recipe from the result of `to_json`.
 
         Raises:
@@ -103,30 +110,27 @@ def before(order: TrainingRequest) -> list[TrainingRequest]:
     return [replace(order, judged=one.validation, recipe=replace(one, final="").to_json()) for one in chain]
 
 
-def make_smaller(plain: Table, start: bytes | None = None) -> tuple[Table, bytes | None]:
+def make_smaller(order: TrainingRequest, start: bytes | None = None) -> TrainedPart:
     """Make the network of an order with a recipe, and evaluate it.
 
     Args:
-        plain: of `TrainingRequest.to_json`.
+        order: with a recipe.
         start: the state of one of the orders of `before`; it saves time and changes nothing else.
 
     Returns:
-        What `edp.workflows.search.trainings.train_order` returns, with the parts of
-        `edp.workflows.compression.pipeline.NetworkResult`; for a recipe with `final`, ``weights``: its tensors as
-        base64 of safetensors. And the state that later orders continue from; None for one with `final`.
+        The result has the parts of `edp.workflows.compression.pipeline.NetworkResult`, too, and for a recipe with
+        `final` ``weights``: its tensors as base64 of safetensors. A recipe with `final` leaves no state.
 
     Raises:
         ConfigError: settings that contradict one another or the data, or a network that cannot be pruned.
         DataError: a session is missing or cannot be read, or one that compares would train.
         Diverged: the loss was not finite any more.
     """
-    order = TrainingRequest.from_json(plain)
-    recipe = Recipe.from_json(plain["recipe"])
+    recipe = Recipe.from_json(order.recipe or {})
     # Checked again here: an order may come from anywhere.
     both = sorted(set(order.train) & {*recipe.validation, *order.judged})
     if both:
         raise DataError(f"phase 6: {', '.join(both)} would train and judge; each session must do one of the two")
-    began = time.perf_counter()
     experiment = experiment_of(order)
     data = prepared(order, experiment)
     weights: dict[str, Weights] = {} if start is None else unpack(start)
@@ -142,11 +146,11 @@ def make_smaller(plain: Table, start: bytes | None = None) -> tuple[Table, bytes
         "scores": mean_scores(sessions),
         "parameters": counted.parameters,
         "macs_tick": counted.macs_tick,
-        "seconds": round(time.perf_counter() - began, 3),
-    } | evaluated.to_json()
+        **evaluated.to_json(),
+    }
     if recipe.final:
-        return result | {"weights": base64.b64encode(save(_weights(network))).decode()}, None
-    return result, pack(weights)
+        return TrainedPart({**result, "weights": base64.b64encode(save(_weights(network))).decode()})
+    return TrainedPart(result, pack(weights))
 
 
 def network_of(weights: str, task: Task, model: ModelSpec) -> Predictor:

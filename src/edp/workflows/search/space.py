@@ -1,19 +1,18 @@
-"""Dimensions of a search apart from modules: each has a range and changes an experiment's settings."""
+"""Dimensions of a search apart from modules: each has a range and gives an arm a value."""
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from edp.config.experiment import Table
 from edp.errors import ConfigError
 from edp.networks.convolution import receptive_field
 from edp.networks.heads import HEADS
 from edp.networks.losses import Smoothness
 from edp.registry import Registry
 from edp.settings.bounds import MOST_NAMES, check_bounds, check_count, span
+from edp.workflows.search.arms import Arm
 
 Value = float | int | str
 REAL = span(-1e30, 1e30)
@@ -85,58 +84,56 @@ class Choice:
 Range = Real | Choice
 Space = Mapping[str, Range]
 Candidate = Mapping[str, Value]
+UNITS, CHANNELS, KERNEL = "model.backbone.units", "model.backbone.channels", "model.backbone.kernel"
 
-DIMENSIONS: Registry[Callable[[Table, Any], None]] = Registry("dimension")
-"""By name, what sets a value in settings, in place."""
+DIMENSIONS: Registry[Callable[[Arm, Any], Arm]] = Registry("dimension")
+"""By name, what gives an arm a value."""
 
 
 @DIMENSIONS.register("learning_rate")
-def _learning_rate(settings: Table, value: float) -> None:
-    settings["training"]["optimizer"]["learning_rate"] = float(value)
+def _learning_rate(arm: Arm, value: float) -> Arm:
+    return arm.with_value("training.optimizer.learning_rate", float(value))
 
 
 @DIMENSIONS.register("weight_decay")
-def _weight_decay(settings: Table, value: float) -> None:
-    settings["training"]["optimizer"]["weight_decay"] = float(value)
+def _weight_decay(arm: Arm, value: float) -> Arm:
+    return arm.with_value("training.optimizer.weight_decay", float(value))
 
 
 @DIMENSIONS.register("dropout")
-def _dropout(settings: Table, value: float) -> None:
-    settings["model"]["backbone"]["dropout"] = float(value)
+def _dropout(arm: Arm, value: float) -> Arm:
+    return arm.with_value("model.backbone.dropout", float(value))
 
 
 @DIMENSIONS.register("units")
-def _units(settings: Table, value: int) -> None:
+def _units(arm: Arm, value: int) -> Arm:
     """Hidden unit capacity C: recurrent units, and channels of every convolution."""
-    backbone = settings["model"]["backbone"]
-    if "units" in backbone:
-        backbone["units"] = int(value)
-    if "channels" in backbone:
-        backbone["channels"] = [int(value)] * len(backbone["channels"])
+    if UNITS in arm:
+        arm = arm.with_value(UNITS, int(value))
+    if CHANNELS in arm:
+        arm = arm.with_value(CHANNELS, [int(value)] * len(arm[CHANNELS]))
+    return arm
 
 
 @DIMENSIONS.register("layers")
-def _layers(settings: Table, value: int) -> None:
+def _layers(arm: Arm, value: int) -> Arm:
     """Layer depth L: convolutions where the backbone has them, else recurrent layers."""
-    backbone = settings["model"]["backbone"]
-    if "channels" in backbone:
-        backbone["channels"] = [backbone["channels"][-1]] * int(value)
-    else:
-        backbone["layers"] = int(value)
+    if CHANNELS in arm:
+        return arm.with_value(CHANNELS, [arm[CHANNELS][-1]] * int(value))
+    return arm.with_value("model.backbone.layers", int(value))
 
 
 @DIMENSIONS.register("kernel")
-def _kernel(settings: Table, value: int) -> None:
-    settings["model"]["backbone"]["kernel"] = int(value)
+def _kernel(arm: Arm, value: int) -> Arm:
+    return arm.with_value(KERNEL, int(value))
 
 
 @DIMENSIONS.register("loss")
-def _loss(settings: Table, value: str) -> None:
-    if settings["training"]["loss"]["kind"] != value:
-        settings["training"]["loss"] = {"kind": str(value)}
+def _loss(arm: Arm, value: str) -> Arm:
+    return arm if arm["training.loss.kind"] == value else arm.with_value("training.loss", {"kind": str(value)})
 
 
-SCHEDULES: dict[str, Table] = {
+SCHEDULES: dict[str, dict[str, float | str]] = {
     # Factor, patience and threshold of appendix B.1.1.
     "plateau": {"kind": "plateau", "shrink": 0.5, "patience": 5, "threshold": 1e-4},
     # Annealed to zero, as PyTorch's schedule does by default; B.1.1 has no warm-up.
@@ -146,31 +143,30 @@ SCHEDULES: dict[str, Table] = {
 
 
 @DIMENSIONS.register("schedule")
-def _schedule(settings: Table, value: str) -> None:
-    if settings["training"]["schedule"]["kind"] != value:
-        settings["training"]["schedule"] = dict(SCHEDULES[value])
+def _schedule(arm: Arm, value: str) -> Arm:
+    same = arm["training.schedule.kind"] == value
+    return arm if same else arm.with_value("training.schedule", SCHEDULES[value])
 
 
 @DIMENSIONS.register("patience")
-def _patience(settings: Table, value: int) -> None:
+def _patience(arm: Arm, value: int) -> Arm:
     """Set the patience of a plateau in epochs; other schedules have none."""
-    if settings["training"]["schedule"]["kind"] == "plateau":
-        settings["training"]["schedule"]["patience"] = int(value)
+    is_plateau = arm["training.schedule.kind"] == "plateau"
+    return arm.with_value("training.schedule.patience", int(value)) if is_plateau else arm
 
 
 @DIMENSIONS.register("smoothness")
-def _smoothness(settings: Table, value: float) -> None:
+def _smoothness(arm: Arm, value: float) -> Arm:
     """Set the weight of the smoothness term; with it, windows are drawn in runs that have second differences."""
-    training = settings["training"]
-    training["terms"] = [term for term in training["terms"] if term["kind"] != "smoothness"]
+    terms = [term for term in arm["training.terms"] if term["kind"] != "smoothness"]
     if not value:
-        return
-    training["terms"].append({"kind": "smoothness", "weight": float(value)})
-    chunks = training["chunks"]
-    if chunks["regime"] == "window" and chunks.get("consecutive", 1) < Smoothness.span:
-        batch = int(chunks["batch"])
+        return arm.with_value("training.terms", terms)
+    arm = arm.with_value("training.terms", [*terms, {"kind": "smoothness", "weight": float(value)}])
+    if arm["training.chunks.regime"] == "window" and arm.get("training.chunks.consecutive", 1) < Smoothness.span:
+        batch = int(arm["training.chunks.batch"])
         fitting = (size for size in range(Smoothness.span, batch + 1) if batch % size == 0)
-        chunks["consecutive"] = next(fitting, Smoothness.span)
+        arm = arm.with_value("training.chunks.consecutive", next(fitting, Smoothness.span))
+    return arm
 
 
 THESIS: Space = {
@@ -188,55 +184,50 @@ ELASTIC = {"learning_rate": 1.0, "weight_decay": 1.0, "dropout": 0.15}
 """Reach of the window around the calibrated baseline in phase 2, thesis 3.3.3: decades, decades, rate."""
 
 
-def apply(settings: Table, candidate: Candidate) -> Table:
-    """Return settings with the values of a candidate.
+def apply(arm: Arm, candidate: Candidate) -> Arm:
+    """Return an arm with the values of a candidate.
 
     Raises:
         ConfigError: an unknown dimension.
     """
-    changed_settings = copy.deepcopy(settings)
-    # The order of the registry, whatever the order of the candidate: equal candidates give equal settings.
-    for name in DIMENSIONS:  # depth after width, whatever the order of the candidate
+    # The order of the registry, depth after width: equal candidates give equal arms.
+    for name in DIMENSIONS:
         if name in candidate:
-            DIMENSIONS[name](changed_settings, candidate[name])
+            arm = DIMENSIONS[name](arm, candidate[name])
     unknown = [name for name in candidate if name not in DIMENSIONS]
     if unknown:
         _ = DIMENSIONS[unknown[0]]
-    return changed_settings
+    return arm
 
 
-def applicable(space: Space, settings: Table) -> Space:
-    """Return the dimensions that affect these settings: a pure LSTM has no kernel."""
-    backbone = settings["model"]["backbone"]
-    return {name: dimension for name, dimension in space.items() if name != "kernel" or "kernel" in backbone}
+def applicable(space: Space, arm: Arm) -> Space:
+    """Return the dimensions that affect this arm: a pure LSTM has no kernel."""
+    return {name: dimension for name, dimension in space.items() if name != "kernel" or KERNEL in arm}
 
 
-def halved(settings: Table) -> Table:
-    """Return settings with the widths of the thesis's printed parameter counts (Tables B.1, 4.8 and 4.9).
+def halved(arm: Arm) -> Arm:
+    """Return an arm with the widths of the thesis's printed parameter counts (Tables B.1, 4.8 and 4.9).
 
     Channels start at C and halve from level to level. The hidden layers of a head are C / 2 wide where there is one of
     them and C / 4 where there are more. A pure TCN gets as many levels as its receptive field needs for the window
     (R >= W, thesis 3.2.3.2).
     """
-    halved_settings = copy.deepcopy(settings)
-    backbone, head = halved_settings["model"]["backbone"], halved_settings["model"]["head"]
-    width = int(backbone.get("units", (backbone.get("channels") or [1])[0]))
-    if "channels" in backbone:
-        levels = len(backbone["channels"])
-        while (
-            backbone["kind"] == "tcn"
-            and receptive_field(levels, backbone["kernel"]) < halved_settings["model"]["window"]
-        ):
-            if backbone["kernel"] < 2:
+    channels = arm.get(CHANNELS) or [1]
+    width = int(arm.get(UNITS, channels[0]))
+    if CHANNELS in arm:
+        levels = len(arm[CHANNELS])
+        while arm["model.backbone.kind"] == "tcn" and receptive_field(levels, arm[KERNEL]) < arm["model.window"]:
+            if arm[KERNEL] < 2:
                 break  # which sees one sample, however many levels there are
             levels += 1
-        backbone["channels"] = [max(1, width >> level) for level in range(levels)]
-    if hasattr(HEADS[head["kind"]], "hidden"):
-        head["hidden"] = max(1, width // (2 if head.get("layers", 1) == 1 else 4))
-    return halved_settings
+        arm = arm.with_value(CHANNELS, [max(1, width >> level) for level in range(levels)])
+    if hasattr(HEADS[arm["model.head.kind"]], "hidden"):
+        part = 2 if arm.get("model.head.layers", 1) == 1 else 4
+        arm = arm.with_value("model.head.hidden", max(1, width // part))
+    return arm
 
 
-WIDTHS: dict[str, Callable[[Table], Table]] = {"equal": lambda settings: settings, "halved": halved}
+WIDTHS: dict[str, Callable[[Arm], Arm]] = {"equal": lambda arm: arm, "halved": halved}
 """How widths follow from the hidden unit capacity: as they are, or as in the thesis."""
 
 

@@ -20,8 +20,8 @@ import numpy as np
 from edp.errors import ConfigError
 from edp.evaluation.study_facts import TrialRow
 from edp.settings.bounds import MOST_NAMES, check_bounds, integer
-from edp.settings.tree import Table
 from edp.storage import replacing
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.space import Candidate, Choice, Range, Real, Space, check, names
 from edp.workflows.search.trainings import Outcome, TrainingRequest
 
@@ -40,7 +40,7 @@ class Trial:
         number: from 0 in the order of asking.
         values: of the dimensions of the space.
         modules: switches that are on, such as modules; `options`: values of their options.
-        settings: the experiment that it stands for.
+        arm: what it stands for.
         costs: analytic costs of its network, by name; none if its values make no network.
         requests: whole trainings, one a run; none if it is not trained for its costs.
         outcomes: of the last part of each.
@@ -53,7 +53,7 @@ class Trial:
     values: Candidate
     modules: tuple[str, ...] = ()
     options: Candidate = field(default_factory=dict)
-    settings: Table = field(default_factory=dict)
+    arm: Arm = field(default_factory=Arm)
     costs: Mapping[str, float] = field(default_factory=dict)
     requests: list[TrainingRequest] = field(default_factory=list)
     outcomes: list[Outcome] = field(default_factory=list)

@@ -8,13 +8,13 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from edp.config.experiment import Table
 from edp.errors import StorageError
 from edp.evaluation.study import FILE, Decision, PhaseRow, StudyFile, TrainingCounts, TrainingRow, read_study
 from edp.progress import Progress
 from edp.storage import find_holder, write_json
 from edp.storage.ledger import Opening, Record, digest_of
 from edp.storage.paths import entries_of
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.modules import MODULES, title_of
 from edp.workflows.search.phases import PHASES
@@ -86,7 +86,7 @@ class StudyLog:
             # A training in parts is one row, so its key is that of the whole.
             if self._row_of[key] not in self.rows:
                 phase = replace(phase, trainings=phase.trainings + 1)
-                row = TrainingRow(phase=phase.name, number=len(self.rows), label=label_of(order.settings))
+                row = TrainingRow(phase=phase.name, number=len(self.rows), label=label_of(Arm(order.settings)))
                 self.rows[self._row_of[key]] = row
         self.phases[phase.name] = phase
 
@@ -227,7 +227,7 @@ class StudyStatus:
     holder: str | None
     running: int
 
-    def to_json(self) -> Table:
+    def to_json(self) -> dict[str, object]:
         """Return plain values."""
         return self.study.to_json() | {"holder": self.holder, "running": self.running}
 
@@ -248,22 +248,20 @@ def look_at(folder: str | Path) -> StudyStatus:
     return StudyStatus(study, holder, len(claims))
 
 
-def label_of(settings: Table) -> str:
+def label_of(arm: Arm) -> str:
     """Return a short name of a training: backbone, feature set, and further modules."""
-    task, model = settings["task"], settings["model"]
-    features = task["features"] if isinstance(task["features"], str) else task["features"]["name"]
-    backbone = model["backbone"]
-    cell = backbone.get("cell", {}).get("kind", "lstm")
+    features = arm["task.features"]
+    cell, head = arm.get("model.backbone.cell.kind", "lstm"), arm.get("model.head.kind", "mlp")
+    activation = arm.get("model.activation.kind", "identity")
     extra = [] if cell == "lstm" else [cell]
-    extra += [block["kind"] for block in model["blocks"]]
-    extra += [part for part in ("physics",) if model.get(part)]
-    extra += ["zoneout"] if backbone.get("zoneout") else []
-    head = model.get("head", {})
-    extra += [f"{head['kind']} head"] if head.get("kind", "mlp") != "mlp" else []
-    extra += ["deeper head"] if head.get("layers", 1) > 1 else []
-    activation = model.get("activation", {}).get("kind", "identity")
+    extra += [block["kind"] for block in arm["model.blocks"]]
+    extra += ["physics"] if arm.get("model.physics") else []
+    extra += ["zoneout"] if arm.get("model.backbone.zoneout") else []
+    extra += [f"{head} head"] if head != "mlp" else []
+    extra += ["deeper head"] if arm.get("model.head.layers", 1) > 1 else []
     extra += [] if activation == "identity" else [activation]
-    return " + ".join([f"{backbone['kind']} {features}", *extra])
+    name = features if isinstance(features, str) else features["name"]
+    return " + ".join([f"{arm['model.backbone.kind']} {name}", *extra])
 
 
 def _now() -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
@@ -12,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from edp.config.experiment import Experiment, Table, build, plain_tree
+from edp.config.experiment import Experiment, build, plain_tree
 from edp.data.prepared import Prepared, prepare
 from edp.data.splits import ByRecording, Split, Stretch
 from edp.errors import ConfigError, DataError
@@ -28,6 +27,7 @@ from edp.settings.bounds import MOST_EPOCHS, MOST_UPDATES, SEED, check_bounds, i
 from edp.storage.ledger import Record
 from edp.training.bundle import blank_scaler
 from edp.training.parts import fit_part
+from edp.workflows.search.arms import Arm
 
 SCORES = ("mae", "rmse", "p95", "p99", "composite")
 SessionScores = dict[str, dict[str, dict[str, float]]]
@@ -39,7 +39,7 @@ class TrainingRequest:
     """Training to perform and judge; equal requests give equal records.
 
     Attributes:
-        settings: the whole experiment as plain tables; its split is not used.
+        settings: the whole experiment as plain tables (`edp.workflows.search.arms.Arm`); its split is not used.
         source: what `DataSource.to_plain` gave.
         train: names of the sessions that train.
         judged: names of the sessions that judge; none of them trains, and with one epoch none chooses anything.
@@ -56,8 +56,8 @@ class TrainingRequest:
             phases.
     """
 
-    settings: Table
-    source: Table
+    settings: Mapping[str, object]
+    source: Mapping[str, object]
     train: tuple[str, ...]
     judged: tuple[str, ...]
     seed: int
@@ -67,7 +67,7 @@ class TrainingRequest:
     epochs: int = 1
     patience: int = 0
     validation: tuple[str, ...] = ()
-    recipe: Table | None = None
+    recipe: Mapping[str, object] | None = None
 
     def __post_init__(self) -> None:
         both = sorted(set(self.train) & {*self.judged, *self.validation})
@@ -105,13 +105,12 @@ class TrainingRequest:
         """Return the training of which this is a part."""
         return replace(self, until=None, stops=())
 
-    def to_json(self) -> Table:
+    def to_json(self) -> dict[str, object]:
         """Plain values, from which `from_json` makes the same order."""
-        plain: Table = plain_tree(self)
-        return plain
+        return dict(plain_tree(self))
 
     @staticmethod
-    def from_json(plain: Table) -> TrainingRequest:
+    def from_json(plain: Mapping[str, object]) -> TrainingRequest:
         """Return the request from the result of `to_json`; other keys are ignored.
 
         Raises:
@@ -128,7 +127,7 @@ class Outcome:
     Attributes:
         order: what was to be trained.
         status: ``done``, or how it ended.
-        result: of `edp.workflows.search.trainings.train_order`, where it is done.
+        result: of `TrainedPart`, where it is done.
         message: what went wrong.
     """
 
@@ -153,33 +152,32 @@ class Outcome:
         return float(np.mean([self.score(session, horizon, name) for session in self.order.judged]))
 
 
-def train_order(plain: Table) -> Table:
-    """Train and judge a request of plain values; see `train_part`.
+@dataclass(frozen=True)
+class TrainedPart:
+    """A training that has ended, or a part of one.
 
-    Returns:
-        ``sessions``: for each judging session its scores at each horizon, report units, mean over targets;
-        ``scores``: their means over sessions; ``parameters``, ``macs_tick``; ``seconds``; ``train_loss``.
+    Attributes:
+        result: for JSON. ``sessions``: for each judging session its scores at each horizon, report units, mean over
+            targets; ``scores``: their means over sessions; ``parameters``, ``macs_tick``, and more where it applies.
+        state: from which the next part continues; None at the end.
     """
-    return train_part(plain)[0]
+
+    result: dict[str, object]
+    state: bytes | None = None
 
 
-def train_part(plain: Table, start: bytes | None = None) -> tuple[Table, bytes | None]:
+def train_part(order: TrainingRequest, start: bytes | None = None) -> TrainedPart:
     """Train and judge a request, which may be a part of a training.
 
     Args:
-        plain: of `TrainingRequest.to_json`.
-        start: what an earlier part left; it saves the time to come there, and changes nothing else.
-
-    Returns:
-        What `train_order` returns, and what the next part goes on from; None at the end of the training.
+        order: what to train.
+        start: state of an earlier part; it saves the time to come there, and changes nothing else.
 
     Raises:
         ConfigError: settings that contradict one another or the data.
         DataError: a session is missing or cannot be read.
         Diverged: the loss was not finite any more.
     """
-    order = TrainingRequest.from_json(plain)
-    began = time.perf_counter()
     experiment = experiment_of(order)
     data = prepared(order, experiment)
     windowed = order.epochs > 1 and experiment.training.chunks.regime == "window"
@@ -193,18 +191,17 @@ def train_part(plain: Table, start: bytes | None = None) -> tuple[Table, bytes |
         by_recording = judge(fitted.predictor, data, spec, "").scores.models["network"].recordings
     sessions = session_scores(by_recording)
     parameters, macs_tick = parameters_and_macs(fitted.predictor.costs())
-    result = {
+    result: dict[str, object] = {
         "sessions": sessions,
         "scores": mean_scores(sessions),
         "parameters": parameters,
         "macs_tick": macs_tick,
         "train_loss": fitted.history[-1]["train_loss"],
-        "seconds": round(time.perf_counter() - began, 3),
     }
     if order.epochs > 1:
         rows = fitted.history
         result |= {"epochs": len(rows), "best_epoch": max((row["epoch"] for row in rows if row["best"]), default=0)}
-    return result, state
+    return TrainedPart(result, state)
 
 
 def experiment_of(order: TrainingRequest) -> Experiment:
@@ -212,7 +209,7 @@ def experiment_of(order: TrainingRequest) -> Experiment:
 
     With one long epoch schedules run to their end and nothing is chosen; with several, each is validated.
     """
-    experiment = build(Experiment, order.settings, "of a search")
+    experiment = Arm(order.settings).experiment()
     training = replace(
         experiment.training,
         epochs=order.epochs,
@@ -248,7 +245,7 @@ def prepared(order: TrainingRequest, experiment: Experiment) -> Prepared:
         ConfigError: settings that contradict the data.
         DataError: a session is missing or cannot be read.
     """
-    recordings = {recording.name: recording for recording in _recordings(_freeze_source(order.source))}
+    recordings = {recording.name: recording for recording in _recordings(json.dumps(order.source, sort_keys=True))}
     needed = dict.fromkeys((*order.train, *order.validation, *order.judged))
     missing = [name for name in needed if name not in recordings]
     if missing:
@@ -286,11 +283,7 @@ class _Named:
         return Split(*(tuple(whole[name] for name in part) for part in parts))
 
 
-def _freeze_source(source: Table) -> str:
-    # Text as a key: `lru_cache` needs something that can be hashed.
-    return json.dumps(source, sort_keys=True)
-
-
+# Text as a key: `lru_cache` needs something that can be hashed.
 # One source: a worker serves one search, and two data sets might not fit in memory.
 @lru_cache(maxsize=1)
 def _recordings(source: str) -> Sequence[Recording]:
@@ -298,35 +291,22 @@ def _recordings(source: str) -> Sequence[Recording]:
     return DataSource.from_plain(json.loads(source)).read()
 
 
-def costs_of(settings: Table, channels: Sequence[str] = ()) -> dict[str, float]:
-    """Analytic costs of the network of some settings, before anything is trained: parameters, MACs of a tick.
+def costs_of(arm: Arm, channels: Sequence[str] = ()) -> dict[str, float]:
+    """Analytic costs of the network of an arm, before anything is trained: parameters, MACs of a tick.
 
     Raises:
         ConfigError: settings that cannot be, or a part that counts other work than it does.
     """
-    return dict(_costs(_freeze_source(settings), tuple(channels)))
+    return dict(_costs(json.dumps(arm.tables, sort_keys=True), tuple(channels)))
 
 
 # A study that goes on asks for the costs of all its networks again, and phases ask for those of the same network.
 @lru_cache(maxsize=1024)
 def _costs(settings: str, channels: tuple[str, ...]) -> Mapping[str, float]:
-    experiment = build(Experiment, json.loads(settings), "of a search")
+    experiment = Arm(json.loads(settings)).experiment()
     task = experiment.task.resolve(100.0, channels, experiment.model.physics)
     # Weights do not matter to counts; building takes milliseconds, training minutes.
     network = build_model(task, experiment.model, blank_scaler(task), seed=0)
     check_counted(network)
     parameters, macs_tick = parameters_and_macs(network.costs())
     return {"parameters": float(parameters), "macs_tick": float(macs_tick)}
-
-
-def settings_of(experiment: Experiment) -> Table:
-    """Return an experiment as plain tables, without the values that a request determines.
-
-    Equal requests then have equal keys.
-    """
-    settings: Table = plain_tree(experiment)
-    del settings["split"], settings["judge"]["baselines"]
-    # Orders decide these; left in the settings they would make equal trainings different.
-    for name in ("epochs", "updates", "patience", "refit", "seed"):
-        del settings["training"][name]
-    return settings

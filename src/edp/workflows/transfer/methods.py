@@ -20,7 +20,7 @@ from edp.networks.matrices import matrices_of
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
 from edp.registry import Registry
-from edp.settings.tree import Table
+from edp.settings.tree import value_at
 from edp.training.averages import NoAverage
 from edp.training.bundle import weights_digest
 from edp.training.optimizers import AdamW, Discriminative, Sgd
@@ -124,9 +124,9 @@ class FewSteps(Method):
     def make(self, case: TransferCase) -> Made:
         """Take the steps; what did not adapt in the meta-learning does not here."""
         spec, source = case.spec, case.source
-        meta: Table = (source.bundle.provenance.more.get("strategy") or {}).get("meta") or {}
-        rate = spec.inner_rate or float(meta.get("inner_rate", STEP_RATE))
-        frozen = decompose(source.predictor).encoding if meta.get("head_only") else ()
+        more = source.bundle.provenance.more
+        rate = spec.inner_rate or float(value_at(more, "strategy.meta.inner_rate", STEP_RATE))
+        frozen = decompose(source.predictor).encoding if value_at(more, "strategy.meta.head_only") else ()
         training = replace(
             case.tuning(Sgd(learning_rate=rate), spec.inner_steps),
             # Plain descent at a constant rate without an average: what meta-learning trained for.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -10,7 +10,6 @@ from edp.config.experiment import (
     Change,
     Experiment,
     FeatureSettings,
-    Table,
     TaskSettings,
     build,
     load_experiment,
@@ -24,7 +23,7 @@ from edp.data.splits import ByTime
 from edp.data.task import Task
 from edp.errors import BundleError, ConfigError, EdpError
 from edp.networks.predictor import Predictor
-from edp.settings.tree import combined
+from edp.settings.tree import combined, value_at
 from edp.storage.paths import is_file_at
 from edp.training import Bundle, load_bundle
 from edp.training.bundle import weights_digest
@@ -121,7 +120,7 @@ def target_experiment(source: SourceModel, changes: Sequence[Change] = ()) -> Ex
     return build(Experiment, merged(table, combined(layers)), "of the source with --set")
 
 
-def _check_kept(layer: Table) -> None:
+def _check_kept(layer: Mapping[str, object]) -> None:
     """Refuse changes of task and network, which give weights their meaning, and of values of ``[finetune]``."""
     for name in layer:
         if name not in PLACES:
@@ -130,10 +129,7 @@ def _check_kept(layer: Table) -> None:
                 "changed, and those of finetune"
             )
     for path in OWN:
-        value: object = layer
-        for key in path.split("."):
-            value = value.get(key) if isinstance(value, dict) else None
-        if value is not None:
+        if value_at(layer, path) is not None:
             raise ConfigError(f"{path}: a fine-tuning has settings of its own for it, in its table [finetune]")
 
 

@@ -20,7 +20,6 @@ from edp.networks.twin.model_selection import AutoTwin
 from edp.networks.twin.recurrent import RecurrentTwin, averaged, member_seed
 from edp.networks.twin.recurrent_members import replace_scales, scales_for, separated
 from edp.networks.twin.static_map import StaticMap, StaticTwin
-from edp.settings.tree import Table
 from edp.storage.runs import PARTS, KeyedRun
 from edp.training.free_run import FittedTwin
 from edp.training.free_run_members import MemberTraining
@@ -138,7 +137,7 @@ class BaseTwin:
                     "scales in the signal map"
                 )
 
-    def provenance(self) -> Table:
+    def provenance(self) -> dict[str, object]:
         """Return the entries about this twin in the provenance of the new one."""
         data = self.bundle.provenance.origin.digest
         return {"from": {"run": str(self.folder), "hash": self.digest, "data": data}}

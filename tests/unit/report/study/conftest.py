@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from edp.config.experiment import load_experiment
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.engine import run_phases
 from edp.workflows.search.modules import MODULES
@@ -25,7 +26,7 @@ from edp.workflows.search.settings import (
 from edp.workflows.search.smaller import Recipe
 from edp.workflows.search.space import Choice, Real
 from edp.workflows.search.study import SamplerSpec
-from edp.workflows.search.trainings import SCORES, Outcome, costs_of, settings_of
+from edp.workflows.search.trainings import SCORES, Outcome, costs_of
 
 SESSIONS = tuple(f"s{number:02d}" for number in range(12))
 SPEC = SearchSpec(
@@ -68,7 +69,7 @@ class World:
                 "status": outcome.status,
                 "score": float(number) if np.isfinite(number) else None,
                 "seconds": 2.5,
-                "parameters": costs_of(order.settings)["parameters"] if self.phase == "calibration" else None,
+                "parameters": costs_of(Arm(order.settings))["parameters"] if self.phase == "calibration" else None,
                 "macs_tick": None,
                 "label": f"{order.settings['model']['backbone']['kind']} {order.settings['task']['features']}",
             }
@@ -122,7 +123,7 @@ def smaller_outcome(order, score):
 
 def study_of(spec):
     """What the search writes, from all phases on the made-up world."""
-    base = settings_of(load_experiment(None, "quick", ["model.blocks=[]", "model.backbone.units=4"]))
+    base = Arm.from_experiment(load_experiment(None, "quick", ["model.blocks=[]", "model.backbone.units=4"]))
     context, world = (
         SearchContext(spec, base, {"path": "nowhere"}, SESSIONS[:9], SESSIONS[9:11], second=SESSIONS[11:]),
         World(),

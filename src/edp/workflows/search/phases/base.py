@@ -6,13 +6,13 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from edp.config.experiment import Table
 from edp.errors import ConfigError
 from edp.evaluation.study import Decision
 from edp.evaluation.study_facts import RelativeChange
 from edp.registry import Registry
 from edp.stats.clustered import MeanTest
 from edp.wording import percent
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.space import Choice, Range, Space, apply
 from edp.workflows.search.study import Study, Trial
@@ -50,12 +50,12 @@ class Quest:
 
     Attributes:
         study: which asks.
-        settings: the experiment that a trial stands for.
+        arm: what a trial stands for.
         trials: how many.
     """
 
     study: Study
-    settings: Callable[[Trial], Table]
+    arm: Callable[[Trial], Arm]
     trials: int
 
 
@@ -103,11 +103,11 @@ def answer_all(
 
 
 def _prepare(context: SearchContext, quest: Quest, trial: Trial) -> Trial:
-    trial.settings = quest.settings(trial)
-    trial.costs = _costs(trial.settings, context)
+    trial.arm = quest.arm(trial)
+    trial.costs = _costs(trial.arm, context)
     # Limits on cost are checked before training: what does not fit is never trained.
     if trial.costs and all(trial.costs[name] <= most for name, most in context.spec.limits.items()):
-        trial.requests = context.orders(trial.settings, range(context.spec.trial_runs))
+        trial.requests = context.orders(trial.arm, range(context.spec.trial_runs))
     return trial
 
 
@@ -123,15 +123,15 @@ def _goes_on(context: SearchContext, study: Study, trial: Trial, stop: int) -> b
     return not trial.pruned
 
 
-def _costs(settings: Table, context: SearchContext) -> dict[str, float]:
+def _costs(arm: Arm, context: SearchContext) -> dict[str, float]:
     # A combination of legal values without a network is an answer too: the study learns to avoid it.
     try:
-        return costs_of(settings, context.channels)
+        return costs_of(arm, context.channels)
     except ConfigError:  # values that are each in their range, and make no network together
         return {}
 
 
-def possible(context: SearchContext, space: Space, arm: Table) -> tuple[Space, list[str]]:
+def possible(context: SearchContext, space: Space, arm: Arm) -> tuple[Space, list[str]]:
     """Return the part of a space in which every value gives a network of this arm, and notes on the excluded part."""
     feasible: dict[str, Range] = {}
     notes = []
@@ -145,7 +145,7 @@ def possible(context: SearchContext, space: Space, arm: Table) -> tuple[Space, l
             feasible[name] = Choice(fit)
         if out:
             left = f"{', '.join(map(str, fit))} stay" if len(fit) > 1 else "it keeps its own"
-            notes.append(f"{name} {', '.join(out)} cannot be with a window of {arm['model']['window']}; {left}")
+            notes.append(f"{name} {', '.join(out)} cannot be with a window of {arm['model.window']}; {left}")
     return feasible, notes
 
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from edp.config.experiment import Table
 from edp.errors import DataError
 from edp.evaluation.study import Decision
 from edp.evaluation.study_facts import CalibratedBackbone, CalibrationFacts, FinalRound, IsolationFacts, TrialRow
@@ -15,6 +14,7 @@ from edp.stats.efficiency import SizeScore, most_efficient
 from edp.stats.paired import fill_worst
 from edp.stats.pareto import pareto
 from edp.wording import behind, percent, percent_interval, typed
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.phases.base import (
     PHASES,
@@ -27,7 +27,7 @@ from edp.workflows.search.phases.base import (
     said_of_pruned,
     scored,
 )
-from edp.workflows.search.phases.isolation import arm_settings, lowest_against_others
+from edp.workflows.search.phases.isolation import arm_of, lowest_against_others
 from edp.workflows.search.space import Choice, Space, applicable, apply
 from edp.workflows.search.study import Trial
 from edp.workflows.search.trainings import Outcome
@@ -50,7 +50,7 @@ class Calibration:
         The best of each on all folds.
         """
         features = context.spec.feature_sets[context.facts(IsolationFacts).features]
-        arms = {backbone: arm_settings(context.base, backbone, features) for backbone in context.spec.backbones}
+        arms = {backbone: arm_of(context.base, backbone, features) for backbone in context.spec.backbones}
         # Only values that make a network of this arm are asked for.
         spaces = {name: possible(context, applicable(context.spec.space, arm), arm) for name, arm in arms.items()}
         quests = [_quest(context, name, arm, spaces[name][0]) for name, arm in arms.items()]
@@ -63,7 +63,7 @@ class Calibration:
         # One fold may be easy for one of them; the thesis decides by it.
         if context.spec.mode == "sound" and len(chosen) > 1:
             runs = range(context.spec.folds)
-            final = yield [order for picked in chosen.values() for order in context.orders(picked.settings, runs)]
+            final = yield [order for picked in chosen.values() for order in context.orders(picked.arm, runs)]
         return self.decide(context, asked, chosen, final, notes)
 
     def decide(
@@ -121,13 +121,13 @@ class Calibration:
             final=final_round,
             backbone=winner,
             baseline=dict(chosen[winner].values),
-            settings=chosen[winner].settings,
+            settings=chosen[winner].arm.tables,
             front=front,
         )
         return Decision("calibration", facts, tuple(sentences))
 
 
-def _quest(context: SearchContext, backbone: str, arm: Table, space: Space) -> Quest:
+def _quest(context: SearchContext, backbone: str, arm: Arm, space: Space) -> Quest:
     spec = context.spec
     study = new_study(context, f"calibration {backbone}", space)
     sizes = space.get("units")

@@ -6,7 +6,6 @@ from collections.abc import Generator, Sequence
 from dataclasses import replace
 from statistics import fmean
 
-from edp.config.experiment import Experiment, Table, build
 from edp.errors import ConfigError
 from edp.evaluation.compression import CompressedRow
 from edp.evaluation.study import Decision
@@ -18,6 +17,7 @@ from edp.wording import percent
 from edp.workflows.compression import FORMATS, CompressionRequest
 from edp.workflows.compression.pipeline import TEACHER, NetworkResult, choose, relative_error, rows_of
 from edp.workflows.compression.planning import CompressionPlan, make_plan
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.phases.base import PHASES, Course
 from edp.workflows.search.smaller import Recipe
@@ -38,7 +38,7 @@ class CompressionPhase:
             return 0
         if "exploration" in context.decided:
             try:
-                return plan_of(context, teacher_settings(context)).trainings + 3
+                return plan_of(context, teacher_of(context)).trainings + 3
             except ConfigError:
                 return 1
         widths = len(spec.units) or len(spec.shares) + len(spec.formats or FORMATS) - 1
@@ -49,24 +49,24 @@ class CompressionPhase:
         if not context.spec.compression.on:
             yield from ()
             return Decision(NAME, SmallerFacts(on=False), ("Left out: search.compression.on is false.",))
-        settings = teacher_settings(context)
+        teacher_arm = teacher_of(context)
         # The teacher first: all others are made of it.
-        (first,) = yield [order_of(context, settings, recipe_of(context))]
+        (first,) = yield [order_of(context, teacher_arm, recipe_of(context))]
         if first.result is None:
             return _nothing(
                 context, f"The teacher's training at length did not end well ({first.message or first.status})."
             )
         try:
-            plan = plan_of(context, settings)
+            plan = plan_of(context, teacher_arm)
         except ConfigError as error:
             return _nothing(context, f"No network was made: {error}.")
         teacher = NetworkResult.from_json(first.result)
         requests = [order for orders in plan.orders.values() for order in orders]
-        results = yield from _make(context, settings, requests)
+        results = yield from _make(context, teacher_arm, requests)
         if plan.rounds:
             # The mean over horizons of the MAE itself, not over the teacher's as in the rows.
             errors = {order: fmean(one["mae"] for one in result.plain.values()) for order, result in results.items()}
-            results |= yield from _make(context, settings, plan.to_round(errors))
+            results |= yield from _make(context, teacher_arm, plan.to_round(errors))
         networks: list[tuple[CompressionRequest | None, NetworkResult]] = [(None, teacher), *results.items()]
         rows = [(order, row) for order, result in networks for row in rows_of(order, result, teacher.plain)]
         front, chosen = choose([row for _, row in rows])
@@ -96,7 +96,7 @@ class CompressionPhase:
             replace(recipe_of(context), final="float32"),
             replace(recipe_of(context, order), final=row.number_format),
         ]
-        outcomes = yield [order_of(context, settings, recipe, context.second) for recipe in final]
+        outcomes = yield [order_of(context, teacher_arm, recipe, context.second) for recipe in final]
         scores = {
             who: result.scores
             for who, recipe, outcome in zip((TEACHER, "chosen"), final, outcomes, strict=True)
@@ -115,10 +115,10 @@ class CompressionPhase:
 
 
 def _make(
-    context: SearchContext, settings: Table, requests: Sequence[CompressionRequest]
+    context: SearchContext, teacher: Arm, requests: Sequence[CompressionRequest]
 ) -> Generator[list[TrainingRequest], list[Outcome], dict[CompressionRequest, NetworkResult]]:
     """Have networks made; those that were not trained to their end are left out."""
-    outcomes = yield [order_of(context, settings, recipe_of(context, request)) for request in requests]
+    outcomes = yield [order_of(context, teacher, recipe_of(context, request)) for request in requests]
     return {
         request: NetworkResult.from_json(outcome.result)
         for request, outcome in zip(requests, outcomes, strict=True)
@@ -142,9 +142,9 @@ def _network(order: CompressionRequest | None, row: CompressedRow) -> SmallerNet
     )
 
 
-def teacher_settings(context: SearchContext) -> Table:
-    """Return the settings of the winner of the search."""
-    return context.facts(ExplorationFacts).teacher_settings
+def teacher_of(context: SearchContext) -> Arm:
+    """Return the winner of the search."""
+    return Arm(context.facts(ExplorationFacts).teacher_settings)
 
 
 def recipe_of(context: SearchContext, order: CompressionRequest | None = None) -> Recipe:
@@ -160,22 +160,22 @@ def recipe_of(context: SearchContext, order: CompressionRequest | None = None) -
     return replace(recipe, units=order.units, pruned=order.begins_pruned, rounded=order.rounding is not None)
 
 
-def order_of(context: SearchContext, settings: Table, recipe: Recipe, judged: Sequence[str] = ()) -> TrainingRequest:
+def order_of(context: SearchContext, teacher: Arm, recipe: Recipe, judged: Sequence[str] = ()) -> TrainingRequest:
     """Return the request that makes and judges a recipe's network, by default on the comparing sessions."""
     validation, updates = context.validation, context.spec.final_updates
     sessions = tuple(judged) or validation
-    order = context.order(settings, context.training, sessions, context.seed(NAME), updates, validation)
+    order = context.order(teacher, context.training, sessions, context.seed(NAME), updates, validation)
     return replace(order, recipe=recipe.to_json())
 
 
-def plan_of(context: SearchContext, settings: Table) -> CompressionPlan:
+def plan_of(context: SearchContext, teacher: Arm) -> CompressionPlan:
     """Return the plan of the smaller networks.
 
     Raises:
         ConfigError: a budget that no network of this kind meets.
     """
     spec = context.spec.compression
-    experiment = build(Experiment, settings, "of the search")
+    experiment = teacher.experiment("of the search")
     task = experiment.task.resolve(100.0, context.channels, experiment.model.physics)
     network = build_model(task, experiment.model, blank_scaler(task), seed=0)
     # Widths beyond the teacher's are left out here: settings are written before its width is known.

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from edp.config.experiment import Table
 from edp.evaluation.study import Decision, facts_of_kind
 from edp.evaluation.study_facts import PlanningFacts, ScreeningFacts, SoundConfirmation, ThesisConfirmation
 from edp.stats.checks import Mask
@@ -16,6 +15,7 @@ from edp.stats.paired import fill_worst
 from edp.stats.race import INTERIM_ANALYSES, InterimAnalysis
 from edp.stats.thesis_confirm import ThesisEvidence, thesis_confirm
 from edp.wording import percent, typed
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.context import Array, SearchContext
 from edp.workflows.search.modules import MODULES
 from edp.workflows.search.phases.base import PHASES, Course
@@ -48,12 +48,12 @@ class Confirmation:
                 confirmed=(), evidence=()
             )
             return Decision("confirmation", facts, ("No module passed the screening.",))
-        base = baseline_of(context)[0]
+        base = baseline_of(context).arm
         arms = [base, *(context.network(base, [name]) for name in passed)]
         return (yield from (_thesis if context.spec.mode == "thesis" else _sound)(context, passed, arms))
 
 
-def _sound(context: SearchContext, passed: list[str], arms: list[Table]) -> Course:
+def _sound(context: SearchContext, passed: list[str], arms: list[Arm]) -> Course:
     """One interim analysis after the other; a dropped module is not trained any more."""
     runs = context.facts(PlanningFacts).runs
     interim_analyses = tuple(analysis for analysis in INTERIM_ANALYSES if analysis.runs < runs)
@@ -99,7 +99,7 @@ def _hopeless(filled: Array, mask: Mask, stop: int, interim_analyses: Sequence[I
     return [bool(value > level) for value in np.atleast_1d(p)]
 
 
-def _thesis(context: SearchContext, passed: list[str], arms: list[Table]) -> Course:
+def _thesis(context: SearchContext, passed: list[str], arms: list[Arm]) -> Course:
     runs, seeds = context.facts(PlanningFacts).runs, context.spec.run_seeds
     outcomes = yield [
         order for arm in arms for seed in range(seeds) for order in context.orders(arm, range(runs), seed=seed)

@@ -12,6 +12,7 @@ from edp.evaluation.study_facts import ExplorationFacts, JointFacts, SynthesisFa
 from edp.stats.clustered import clustered_t
 from edp.stats.paired import fill_worst
 from edp.wording import percent, typed
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.modules import fitting, options_of, title_of
 from edp.workflows.search.phases.base import PHASES, Course, relative_change
@@ -34,7 +35,7 @@ class Exploration:
     def run(self, context: SearchContext) -> Course:
         """Ask about all modules and options of active ones; train both winners on fresh folds with equal seeds."""
         spec = context.spec
-        base = baseline_of(context)[0]
+        base = baseline_of(context).arm
         free = fitting(base, context.channels, spec.modules)
         earlier = context.facts(SynthesisFacts)
         # The winner of phase 4 is the warm start: phase 5 is to find at least that.
@@ -44,8 +45,8 @@ class Exploration:
         answers = yield from ask_together(context, "exploration", switches, spec.exploration.trials, starts, options)
         winner = winner_of(context, "exploration", switches, answers)
         runs = fresh_runs(context)
-        arms = (earlier.settings, winner.settings)
-        outcomes = yield [order for settings in arms for order in context.orders(settings, runs)]
+        arms = (Arm(earlier.settings), Arm(winner.settings))
+        outcomes = yield [order for arm in arms for order in context.orders(arm, runs)]
         searched = {key: tuple(choice.options) for own in options.values() for key, choice in own.items()}
         return self.decide(context, winner, searched, outcomes)
 

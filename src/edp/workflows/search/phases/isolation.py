@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.config.experiment import Table
 from edp.errors import DataError, count_of
 from edp.evaluation.study import Decision
 from edp.evaluation.study_facts import ArmComparison, ArmFacts, FeatureComparison, IsolationFacts
@@ -15,11 +14,13 @@ from edp.stats.clustered import clustered_t
 from edp.stats.paired import fill_worst
 from edp.stats.variance import PairedVariance, paired_variance, split_variance, thesis_variance
 from edp.wording import behind, percent, percent_interval, typed
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.context import Array, SearchContext
 from edp.workflows.search.phases.base import PHASES, Course, relative_change
+from edp.workflows.search.space import CHANNELS, UNITS
 from edp.workflows.search.trainings import Outcome
 
-DEFAULT_BACKBONE: dict[str, Table] = {
+DEFAULT_BACKBONE: dict[str, Mapping[str, object]] = {
     "lstm": {"kind": "lstm", "units": 64},
     "gru": {"kind": "gru", "units": 64},
     "tcn": {"kind": "tcn", "channels": [64, 64, 64, 64], "kernel": 3},
@@ -27,24 +28,17 @@ DEFAULT_BACKBONE: dict[str, Table] = {
 }
 
 
-def arm_settings(base: Table, backbone: str, features: str | Table) -> Table:
+def arm_of(base: Arm, backbone: str, features: str | Mapping[str, object]) -> Arm:
     """Return the base with another backbone of similar size, and another feature set (a name, or a plain table)."""
-    base_backbone = base["model"]["backbone"]
-    if base_backbone["kind"] == backbone:
-        arm_backbone = dict(base_backbone)
-    else:
-        arm_backbone = dict(DEFAULT_BACKBONE[backbone])
-        # Like width: backbones are compared before any is tuned.
-        width = int(base_backbone.get("units", (base_backbone.get("channels") or [64])[-1]))
-        if "units" in arm_backbone:
-            arm_backbone["units"] = width
-        if "channels" in arm_backbone:
-            arm_backbone["channels"] = [width] * len(arm_backbone["channels"])
-    return {
-        **base,
-        "task": {**base["task"], "features": features},
-        "model": {**base["model"], "backbone": arm_backbone, "blocks": []},
-    }
+    arm = base.with_value("task.features", features).with_value("model.blocks", [])
+    if base["model.backbone.kind"] == backbone:
+        return arm
+    arm = arm.with_value("model.backbone", DEFAULT_BACKBONE[backbone])
+    # Like width: backbones are compared before any is tuned.
+    width = int(base.get(UNITS, (base.get(CHANNELS) or [64])[-1]))
+    if UNITS in arm:
+        arm = arm.with_value(UNITS, width)
+    return arm.with_value(CHANNELS, [width] * len(arm[CHANNELS])) if CHANNELS in arm else arm
 
 
 class Isolation:
@@ -68,7 +62,7 @@ class Isolation:
             for backbone, features in self.arms(context)
             for seed in range(spec.isolation.seeds)
             for order in context.orders(
-                context.shaped(arm_settings(context.base, backbone, spec.feature_sets[features])),
+                context.shaped(arm_of(context.base, backbone, spec.feature_sets[features])),
                 range(spec.isolation.runs),
                 seed=seed,
             )

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import replace
 
-from edp.config.experiment import Table
 from edp.errors import DataError, count_of
 from edp.evaluation.study_facts import JointFacts
 from edp.stats.pareto import pareto
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.modules import contradicting, present_options
 from edp.workflows.search.phases.base import Quest, answer_all, best, new_study, said_of_pruned, scored
@@ -48,12 +48,12 @@ def ask_together(
         present = present_options(base, start.modules, context.shaped) if options else None
         study.suggest(_inside(space, start.values), start.modules, present)
 
-    def settings(trial: Trial) -> Table:
+    def arm(trial: Trial) -> Arm:
         return context.network(apply(base, trial.values), trial.modules, trial.options)
 
     # The thesis prunes in phase 1 only (3.3.2).
     stops = () if context.spec.mode == "thesis" else context.spec.stops
-    (answers,) = yield from answer_all(context, [Quest(study, settings, trials)], stops)
+    (answers,) = yield from answer_all(context, [Quest(study, arm, trials)], stops)
     return answers
 
 
@@ -74,7 +74,7 @@ def winner_of(context: SearchContext, name: str, modules: Sequence[str], trials:
         indices = pareto([(score, trial.costs[context.spec.cost]) for score, trial in done])
         front = tuple(done[index][1].number for index in indices)
     return JointFacts(
-        settings=winner.settings,
+        settings=winner.arm.tables,
         values={**winner.values, **winner.options},
         modules=winner.modules,
         score=winner.score,

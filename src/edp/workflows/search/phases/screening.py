@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.config.experiment import Table
 from edp.errors import count_of
 from edp.evaluation.study import Decision
 from edp.evaluation.study_facts import CalibrationFacts, ModuleEffect, ModuleGain, SoundScreening, ThesisScreening
 from edp.stats.factorial import Factorial, least_runs, two_level_design
 from edp.stats.importance import main_effects
 from edp.wording import behind, typed
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.modules import MODULES, contradicting, fitting
 from edp.workflows.search.phases.base import PHASES, Course, Quest, answer_all, new_study, scored
@@ -40,12 +41,21 @@ class ModuleScreening:
         return (yield from (_thesis(context) if context.spec.mode == "thesis" else _sound(context)))
 
 
-def baseline_of(context: SearchContext) -> tuple[Table, Candidate, Space]:
-    """Return the baseline's settings and values, and the window around them for the tuning of candidates."""
+class TunedBaseline(NamedTuple):
+    """Winner of phase 1, its values, and the window around them for the tuning of candidates."""
+
+    arm: Arm
+    values: Candidate
+    window: Space
+
+
+def baseline_of(context: SearchContext) -> TunedBaseline:
+    """Return the baseline of the later phases."""
     facts = context.facts(CalibrationFacts)
     space = {name: dimension for name, dimension in context.spec.space.items() if name in context.spec.elastic}
     beyond = context.spec.mode == "thesis"
-    return facts.settings, facts.baseline, elastic(space, facts.baseline, context.spec.elastic, beyond)
+    window = elastic(space, facts.baseline, context.spec.elastic, beyond)
+    return TunedBaseline(Arm(facts.settings), facts.baseline, window)
 
 
 def _sound(context: SearchContext) -> Course:
@@ -62,8 +72,7 @@ def _sound(context: SearchContext) -> Course:
             values = drawn[repeat * len(design.levels) + row]
             # Values are drawn anew for each row: main effects are then averages over the window.
             chosen = [name for name, on in zip(free, levels, strict=True) if on]
-            settings = context.network(apply(base, values), chosen)
-            orders += context.orders(settings, [repeat])
+            orders += context.orders(context.network(apply(base, values), chosen), [repeat])
             rows.append(_DesignRow(levels, values, repeat))
     outcomes = yield orders
     return _estimate_effects(context, design, rows, outcomes)
@@ -152,10 +161,10 @@ def _thesis(context: SearchContext) -> Course:
     return Decision("screening", facts, sentences)
 
 
-def _quest(context: SearchContext, base: Table, module: str, window: Space) -> Quest:
-    settings = context.network(base, [module])
+def _quest(context: SearchContext, base: Arm, module: str, window: Space) -> Quest:
+    arm = context.network(base, [module])
     study = new_study(context, f"screening {module}", window)
-    return Quest(study, lambda trial: apply(settings, trial.values), context.spec.screening.trials)
+    return Quest(study, lambda trial: apply(arm, trial.values), context.spec.screening.trials)
 
 
 def _gain(trials: list[Trial], reference: float) -> ModuleGain:

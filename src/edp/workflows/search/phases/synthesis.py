@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from edp.config.experiment import Table
 from edp.evaluation.study import Decision
 from edp.evaluation.study_facts import ConfirmationFacts, RelativeChange, SynthesisFacts
 from edp.stats.clustered import clustered_t
 from edp.wording import behind, percent, typed
+from edp.workflows.search.arms import Arm
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.modules import title_of
 from edp.workflows.search.phases.base import PHASES, Course, relative_change
@@ -40,8 +40,8 @@ class Synthesis:
             starts = []
         answers = yield from ask_together(context, "synthesis", switches, context.spec.synthesis.trials, starts)
         winner = winner_of(context, "synthesis", switches, answers)
-        arms = {"synthesis": winner.settings, "baseline": base}
-        outcomes = yield [order for settings in arms.values() for order in final_orders(context, settings)]
+        arms = {"synthesis": Arm(winner.settings), "baseline": base}
+        outcomes = yield [order for arm in arms.values() for order in final_orders(context, arm)]
         facts = SynthesisFacts(
             **vars(winner),
             test=judged(context, list(arms), outcomes),
@@ -58,7 +58,9 @@ class Synthesis:
         if facts.antagonistic:
             left = ", ".join(map(title_of, facts.antagonistic))
             sentences.append(f"Confirmed alone, but not wanted together: {left}.")
-        ours, base = (_format_score(facts.test[arm]["composite"], context.unit) for arm in ("synthesis", "baseline"))
+        scores = (facts.test[arm]["composite"] for arm in ("synthesis", "baseline"))
+        failed, unit = "no score, since a training failed", behind(context.unit)
+        ours, base = (failed if score is None else typed(score, 3) + unit for score in scores)
         gain = facts.test_gain
         interval = "" if gain is None else f"; {percent(gain.change, signed=True)}, p {typed(gain.p, 2)}"
         sentences.append(
@@ -68,7 +70,7 @@ class Synthesis:
         return Decision("synthesis", facts, tuple(sentences))
 
 
-def final_orders(context: SearchContext, settings: Table) -> list[TrainingRequest]:
+def final_orders(context: SearchContext, arm: Arm) -> list[TrainingRequest]:
     """Return trainings on all development sessions at full length, judged on the test sessions; one per seed.
 
     Several epochs are validated by the development sessions that judge the first run, which then do not train: the test
@@ -78,11 +80,11 @@ def final_orders(context: SearchContext, settings: Table) -> list[TrainingReques
     validation: tuple[str, ...] = ()
     if context.spec.epochs > 1:
         # With several epochs the sessions of a fold choose the best epoch; test sessions never do.
-        first = context.orders(settings, [0])[0]
+        first = context.orders(arm, [0])[0]
         train, validation = first.train, first.judged
     updates = context.spec.final_updates
     return [
-        context.order(settings, train, context.test, context.seed("final", seed), updates, validation)
+        context.order(arm, train, context.test, context.seed("final", seed), updates, validation)
         for seed in range(context.spec.run_seeds)
     ]
 
@@ -111,10 +113,6 @@ def gained(context: SearchContext, outcomes: Sequence[Outcome]) -> RelativeChang
     if min(arms.shape[1:]) < 2 or not np.isfinite(arms).all():
         return None
     return relative_change(clustered_t(arms[0] - arms[1]), float(arms[1].mean()))
-
-
-def _format_score(score: float | None, unit: str) -> str:
-    return "no score, since a training failed" if score is None else typed(score, 3) + behind(unit)
 
 
 PHASES.register("synthesis")(Synthesis())
