@@ -57,7 +57,8 @@ def fit(
         run: where the training writes; where given, a checkpoint after each epoch makes it resumable.
         on_event: called with progress.
         strategy: weights to begin with, a teacher, or what fits the network by itself; it is part of what the key of
-            `run` must tell apart. A strategy knows no folds: with it a committee trains by gradient (`to_gradient_training`).
+            `run` must tell apart. A strategy has no folds: with it a committee trains by gradient (see
+            `to_gradient_training`).
 
     Raises:
         ConfigError: settings that contradict one another.

@@ -218,8 +218,9 @@ def _traces(mark: Mark) -> list[Trace]:
 def _(mark: DataSeries) -> list[Trace]:
     mode = "+".join(["lines"] * (mark.width > 0) + ["markers"] * bool(mark.symbol)) or "none"
     trace: Trace = {
-        "type": "scatter", **_axis_values(mark.x), "y": _escape_names(mark.y), "mode": mode, "line": {"color": mark.colour},
-        "opacity": mark.opacity, "legendrank": mark.rank, "cliponaxis": mark.clipped, **_hover(mark),
+        "type": "scatter", **_axis_values(mark.x), "y": _escape_names(mark.y), "mode": mode,
+        "line": {"color": mark.colour}, "opacity": mark.opacity, "legendrank": mark.rank,
+        "cliponaxis": mark.clipped, **_hover(mark),
     }  # fmt: skip
     if mark.width:
         trace["line"] = {"color": mark.colour, "width": mark.width, "dash": mark.dash, "shape": STEPS[mark.step]}

@@ -198,8 +198,8 @@ def propose_plant(proposal: MapProposal, targets: Sequence[str], inputs: Sequenc
         return PlantProposal(assignments | ({"velocities": tuple(targets)} if Kind.GENERIC in answers else {}))
     if not answers <= {*RATE_OF}:
         return PlantProposal(
-            why_not=f"it answers with positions or speeds, and {_list_names(targets)} are none: record one, or give what "
-            "shall answer the kind generic in the map and name it, edp twin --set 'channels.velocities=[...]'"
+            why_not=f"it answers with positions or speeds, and {_list_names(targets)} are none: record one, or give "
+            "what shall answer the kind generic in the map and name it, edp twin --set 'channels.velocities=[...]'"
         )
     return _propose_from_positions(proposal, kinds, commands, assignments)
 
@@ -211,8 +211,8 @@ def _propose_from_positions(
     asked = [name for name, kind in kinds.items() if kind in INTEGRAL]
     if asked:  # one that is no answer, or the answers to predict would be velocities
         return PlantProposal(
-            why_not=f"it would take {_list_names(asked)}, which no measurement follows, for an answer: record the speed "
-            "itself, or give this column the kind generic in the map"
+            why_not=f"it would take {_list_names(asked)}, which no measurement follows, for an answer: record the "
+            "speed itself, or give this column the kind generic in the map"
         )
     if not assignments["commands"] and not any(kinds[name] in COMMANDS for name in commands):
         assignments = {"commands": tuple(commands)}

@@ -177,8 +177,8 @@ class _Walk:
 
     def refused(self, name: str, what: str) -> DataError:
         return DataError(
-            f"'{self.path}': {_format_name(name)} is {what}; a MAT file of MATLAB holds all of its values itself. Load it in "
-            "MATLAB and save it again"
+            f"'{self.path}': {_format_name(name)} is {what}; a MAT file of MATLAB holds all of its values itself. Load "
+            "it in MATLAB and save it again"
         )
 
 
