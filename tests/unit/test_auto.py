@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from read_progress_notes import NotedProgress
+from noted_progress import NotedProgress
 
 from edp.data.splits import SPLITS
 from edp.errors import ConfigError, DataError, StorageError

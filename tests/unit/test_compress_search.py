@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from browser import browser as browser
 from browser import check_page
-from read_progress_notes import NotedProgress
+from noted_progress import NotedProgress
 from typer.testing import CliRunner
 
 from edp.cli import app

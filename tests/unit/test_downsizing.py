@@ -5,7 +5,7 @@ import json
 
 import pytest
 import torch
-from read_progress_notes import NotedProgress
+from noted_progress import NotedProgress
 from typer.testing import CliRunner
 
 from edp.cli import app

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from read_progress_notes import NotedProgress
+from noted_progress import NotedProgress
 
 from edp.logs import find_repeats, inspect, sketch, write_recording
 from edp.logs.quality import columns

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from read_progress_notes import NotedProgress
+from noted_progress import NotedProgress
 
 from edp.data.chunks import ChunkSampler, ChunkSpec
 from edp.data.features import Derived, FeatureSet

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from read_progress_notes import NotedProgress
+from noted_progress import NotedProgress
 
 from edp.errors import ConfigError
 from edp.jobs import IN_PROCESS, Workers

@@ -17,7 +17,7 @@ from edp.storage import read_json
 from edp.workflows.feature_selection.trials import (
     TrialSpec,
     _difference,
-    _drawn,
+    _draw_sets,
     add_differences,
     try_feature_sets,
 )
@@ -148,7 +148,7 @@ def test_pressures_get_their_differences():
 )
 def test_no_set_is_drawn_that_is_there_already(experiment, channels, asked, found):
     first = FeatureSettings(name="first", channels=channels)
-    drawn = _drawn({"first": first}, experiment, drive("d", 1), TrialSpec(random=asked))
+    drawn = _draw_sets({"first": first}, experiment, drive("d", 1), TrialSpec(random=asked))
     assert list(drawn) == [f"random {k + 1}" for k in range(len(found))]
     assert {tuple(one.channels) for one in drawn.values()} == {("v", name) for name in found}
 

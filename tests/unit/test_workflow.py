@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from read_progress_notes import NotedProgress
+from noted_progress import NotedProgress
 
 from edp.cli import app
 from edp.cli.console import run_app

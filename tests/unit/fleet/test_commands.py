@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from read_progress_notes import NotedProgress
+from noted_progress import NotedProgress
 
 from edp.errors import ConfigError, DataError, StorageError
 from edp.jobs import Workers

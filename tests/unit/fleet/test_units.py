@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from read_progress_notes import NotedProgress
+from noted_progress import NotedProgress
 
 from edp.errors import ConfigError, DataError, LostError
 from edp.jobs import IN_PROCESS, LocalPool, Workers

@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 from fleet_reports import fleet_report
-from read_progress_notes import NotedProgress
+from noted_progress import NotedProgress
 
 from edp.errors import BundleError, ConfigError, DataError, EdpError, StorageError
 from edp.jobs import Workers

@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from read_progress_notes import NotedProgress
+from noted_progress import NotedProgress
 
 from edp.config.experiment import load_experiment
 from edp.data.chunks import stack

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 from ray_nodes import needs_ray, three_nodes
-from read_progress_notes import NotedProgress
+from noted_progress import NotedProgress
 
 import edp.jobs.cluster
 from edp.errors import ConfigError

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from read_progress_notes import NotedProgress
+from noted_progress import NotedProgress
 
 from edp.config.experiment import load_experiment, plain_tree
 from edp.data.frozen import SECOND_TEST_SET, ByFrozen, Session

@@ -7,7 +7,7 @@ import signal
 import time
 
 import pytest
-from read_progress_notes import NotedProgress
+from noted_progress import NotedProgress
 
 import edp.storage
 from edp.config.experiment import load_experiment

@@ -4,7 +4,7 @@ import json
 from dataclasses import replace
 
 import pytest
-from read_progress_notes import NotedProgress
+from noted_progress import NotedProgress
 
 from edp.config.experiment import load_experiment
 from edp.errors import BusyError, ConfigError, DataError, LostError, StorageError

@@ -3,7 +3,7 @@
 import dataclasses
 
 import pytest
-from read_progress_notes import NotedProgress
+from noted_progress import NotedProgress
 
 from edp.config.experiment import load_experiment
 from edp.evaluation.study import read_study

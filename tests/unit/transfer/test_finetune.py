@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from read_progress_notes import NotedProgress
+from noted_progress import NotedProgress
 from scipy import stats
 from typer.testing import CliRunner
 

@@ -4,7 +4,7 @@ import json
 import shutil
 
 import pytest
-from read_progress_notes import NotedProgress
+from noted_progress import NotedProgress
 
 from edp.errors import BundleError
 from edp.evaluation import judge
