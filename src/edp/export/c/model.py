@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import binascii
-from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
 
 from edp import __version__
 from edp.errors import ExportError
@@ -13,10 +11,10 @@ from edp.export.c import adaptation, integer_calls, tangents
 from edp.export.c.calls import WORK, Calls, describe, needs_columns, slot
 from edp.export.c.constants import constants_of, stored, total_bytes
 from edp.export.c.plan import MemoryPlan, plan
-from edp.export.c.text import filled, indented, number
-from edp.export.escape import C_SIGNIFICANT, Code, c_comment, c_names, fill
+from edp.export.c.text import channel_enumeration, enumeration, filled, indented, number
+from edp.export.escape import C_SIGNIFICANT, Code, c_comment, fill_file, package_text
 from edp.export.hashes import little_endian, model_hash, scale_hash
-from edp.export.si_names import si_channels, si_names
+from edp.export.si_names import si_names
 from edp.export.sizes import MOST_COLUMNS, check_numbers, check_sizes
 from edp.ir import Graph, Layer, memory
 from edp.ir.base import Number
@@ -125,8 +123,12 @@ class Model:
 
     def fill(self, template: str) -> Code:
         """Fill in a template."""
-        text = resources.files("edp.export.c").joinpath(f"templates/{template}").read_text()
-        return fill(text, self._values())
+        return fill_file(f"c/templates/{template}", self._values())
+
+    def runtime_texts(self) -> dict[str, str]:
+        """Return the files of the runtime by name, generated tables first."""
+        texts = {"edp_tables.h": integer_calls.tables_header()} if self.integer else {}
+        return texts | {file: package_text(f"c/runtime/{file}") for file in self.runtime}
 
     def _values(self) -> dict[str, object]:
         task, predictor = self.bundle.task, self.bundle.predictor
@@ -193,24 +195,15 @@ class Model:
     def _enums(self) -> dict[str, str]:
         task, upper = self.bundle.task, self.name.upper()
         # Names must differ within the 63 characters that C99 compares.
-        most = C_SIGNIFICANT - len(f"{upper}_OUT_")
-        inputs = [
-            (f"{upper}_IN_{name} = {i},", f"{channel.unit}; {channel.description}")
-            for i, (name, channel) in enumerate(
-                zip(c_names((c.name for c in si_channels(self.bundle.inputs)), most), self.bundle.inputs, strict=True)
-            )
-        ]
-        targets = [
-            (f"{upper}_OUT_{name} = {i},", "; ".join(part for part in (KINDS[kind].si_unit, text) if part))
-            for i, (name, kind, text) in enumerate(
-                zip(c_names(self._targets(), most), self.bundle.target_kinds, self.bundle.descriptions, strict=True)
-            )
-        ]
-        ahead = [
-            (f"{upper}_AHEAD_{k} = {i},", f"{k} ticks, {1000 * k / task.rate_hz:g} ms")
-            for i, k in enumerate(task.horizons)
-        ]
-        return {"input_enum": _listed(inputs), "target_enum": _listed(targets), "horizon_enum": _listed(ahead)}
+        longest = C_SIGNIFICANT - len(f"{upper}_OUT_")
+        units = [KINDS[kind].si_unit for kind in self.bundle.target_kinds]
+        meanings = ["; ".join(filter(None, pair)) for pair in zip(units, self.bundle.descriptions, strict=True)]
+        ahead = [f"{k} ticks, {1000 * k / task.rate_hz:g} ms" for k in task.horizons]
+        return {
+            "input_enum": channel_enumeration(f"{upper}_IN_", self.bundle.inputs, longest, aligned=True),
+            "target_enum": enumeration(f"{upper}_OUT_", self._targets(), meanings, longest, aligned=True),
+            "horizon_enum": enumeration(f"{upper}_AHEAD_", map(str, task.horizons), ahead, aligned=True),
+        }
 
     def _state(self) -> dict[str, str]:
         declared, cleared = remembered(self.graph)
@@ -310,12 +303,6 @@ def computed(graph: Graph, plan: MemoryPlan) -> tuple[list[str], list[str]]:
         zero = "[0][0]" if meaning == "prediction" else "[0][0][0]"
         copies.append(f"    edp_copy({at}, {size}u, &out->{meaning}{zero});")
     return lines[1:], [*checks, "if (finite) {", *copies, "}", "return finite;"]
-
-
-def _listed(entries: Sequence[tuple[str, str]]) -> Code:
-    """Lines of an enumeration with a comment each."""
-    wide = max(len(entry) for entry, _ in entries)
-    return Code("\n".join(f"    {entry:<{wide}} /* {c_comment(text)} */" for entry, text in entries))
 
 
 def make_model(name: str, bundle: Bundle, tangent: bool = False, adapts: bool = False) -> Model:
