@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from edp import __version__
 from edp.errors import ExportError
-from edp.export.c import adaptation, integer_calls, tangents
+from edp.export.c import adaptation, integer_calls, parameter_index, tangents
 from edp.export.c.calls import WORK, Calls, describe, needs_columns, slot
 from edp.export.c.constants import constants_of, stored, total_bytes
 from edp.export.c.plan import MemoryPlan, plan
@@ -128,6 +128,7 @@ class Model:
     def runtime_texts(self) -> dict[str, str]:
         """Return the files of the runtime by name, generated tables first."""
         texts = {"edp_tables.h": integer_calls.tables_header()} if self.integer else {}
+        texts |= {parameter_index.HEADER: parameter_index.index_header()} if self.hydraulic else {}
         return texts | {file: package_text(f"c/runtime/{file}") for file in self.runtime}
 
     def _values(self) -> dict[str, object]:
