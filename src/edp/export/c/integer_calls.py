@@ -120,9 +120,6 @@ INTEGER_CALLS: dict[type[Layer], Write] = {
 """By kind of integer layer."""
 CALLS |= INTEGER_CALLS
 
-COUNTED = (quantised.QDifference, quantised.QConvolution, quantised.QTrailingMean, quantised.QAttentionPool)
-"""Layers with a ring or a counter."""
-
 
 def structs(layer: Layer) -> list[Code]:
     """Constant structs that an integer layer's function reads, one a line."""

@@ -16,7 +16,7 @@ from edp.export.escape import C_SIGNIFICANT, Code, c_comment, fill_file, package
 from edp.export.hashes import little_endian, model_hash, scale_hash
 from edp.export.si_names import si_names
 from edp.export.sizes import MOST_COLUMNS, check_numbers, check_sizes
-from edp.ir import Graph, Layer, memory
+from edp.ir import Graph, Layer
 from edp.ir.base import Number
 from edp.ir.hydraulics import HydraulicTick
 from edp.networks.input_range import HOLD_TICKS, LIMIT, input_limits
@@ -30,17 +30,6 @@ DOUBLE_BYTES = 8
 MOST_STACK = 2**18
 """Bytes: a quarter of the smallest stack that threads of desktop systems have (1 MiB, Windows)."""
 CLIPPED = Code("    uint32_t clipped;  /* numbers beyond the range of their format, chosen on training data */\n")
-COUNTED = (
-    memory.Difference,
-    memory.Starting,
-    memory.Convolution,
-    memory.TrailingMean,
-    memory.AttentionPool,
-    memory.WindowAttention,
-    memory.PrefixCorrection,
-    *integer_calls.COUNTED,
-)
-"""Layers with a ring or a counter."""
 PLANT = (
     " *",
     " * PLANT MODEL. Inputs are the commands, a measured value for each answer, and a flag for each (..._MEASURED): 1",
@@ -324,7 +313,7 @@ def make_model(name: str, bundle: Bundle, tangent: bool = False, adapts: bool = 
     if integer and tangent:
         raise ExportError("a network in integer arithmetic is a staircase and has no tangent; export the float run")
     graph = predictor.integers if isinstance(predictor, IntegerPredictor) else predictor.graph()
-    changes = plan(graph, tangents.tangent_scratch_of) if tangent else None
+    changes = plan(graph, tangent=True) if tangent else None
     model = Model(name, bundle, graph, plan(graph), changes, adapts and bundle.adaptation is not None)
     _check(model)
     return model
@@ -361,7 +350,7 @@ def _check(model: Model) -> None:
 
 def has_ring(layer: Layer) -> bool:
     """Whether the C state of a layer has a ring or a counter."""
-    return isinstance(layer, COUNTED) and bool(layer.slots)
+    return layer.counted and bool(layer.slots)
 
 
 def crc(graph: Graph) -> int:
