@@ -7,7 +7,7 @@ from typing import Any
 
 from edp.errors import ExportError
 from edp.export.c.plan import MemoryPlan, scratch_number
-from edp.export.c.text import call, identifier, number, struct, truth, unsigned
+from edp.export.c.text import bool_literal, call, identifier, number, struct, unsigned_literals
 from edp.export.escape import Code, c_comment
 from edp.ir import Graph, Layer, layers, memory
 from edp.ir.base import INPUT, Number
@@ -111,7 +111,7 @@ def _gather(calls: Calls, layer: layers.Gather) -> list[str]:
 
 def _difference(calls: Calls, layer: memory.Difference) -> list[str]:
     states = (slot(layer, "before"), ring(layer))
-    return calls.simple(layer, "edp_difference", layer.width, truth(layer.from_zero), *states)
+    return calls.simple(layer, "edp_difference", layer.width, bool_literal(layer.from_zero), *states)
 
 
 def _convolution(calls: Calls, layer: memory.Convolution) -> list[str]:
@@ -255,14 +255,14 @@ def structs(layer: Layer) -> list[Code]:
         return [struct("edp_gru_weights", f"{name}_weights", members)]
     if isinstance(layer, memory.PrefixCorrection):
         members = [at[key] for key in ("first_weight", "first_bias", "second_weight", "second_bias")]
-        sizes = unsigned((len(layer.first_bias), len(layer.second_bias), layer.ticks))
+        sizes = unsigned_literals((len(layer.first_bias), len(layer.second_bias), layer.ticks))
         return [struct("edp_prefix_weights", f"{name}_weights", [*members, *sizes])]
     if isinstance(layer, HydraulicTick):
         counts = (
             *(*layer.sizes, len(layer.ports), len(layer.knots), len(layer.exponents), layer.powers),
             *(layer.remembered, layer.steps, *layer.load, layer.circuit, int(layer.linked)),
         )
-        members = [*at.values(), *unsigned(counts), number(layer.tick_s)]
+        members = [*at.values(), *unsigned_literals(counts), number(layer.tick_s)]
         return [struct("edp_hydraulics", f"{name}_machine", members)]
     return []
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.export.c.calls import CALLS, Calls, Write, constant, needs_columns, ring, runs, slot
-from edp.export.c.text import array, braced, call, identifier, number, struct, truth, unsigned
+from edp.export.c.text import array, bool_literal, call, identifier, initialiser, number, struct, unsigned_literals
 from edp.export.escape import Code
 from edp.ir import Layer
 from edp.ir.layers import Function
@@ -79,7 +79,7 @@ def _recurrent(calls: Calls, x: quantised.QLstm | quantised.QGru) -> list[str]:
 
 
 def _difference(calls: Calls, x: quantised.QDifference) -> list[str]:
-    return calls.simple(x, "edp_q_difference", x.width, truth(x.from_zero), x.right, slot(x, "before"), ring(x))
+    return calls.simple(x, "edp_q_difference", x.width, bool_literal(x.from_zero), x.right, slot(x, "before"), ring(x))
 
 
 def _pool(calls: Calls, x: quantised.QAttentionPool) -> list[str]:
@@ -130,7 +130,7 @@ def structs(layer: Layer) -> list[Code]:
         return [constant(layer, part) for part in parts]
 
     def recurrent(biases: tuple[str, str], share: int) -> list[Code]:
-        members = [braced(matrix("_x")), braced(matrix("_h")), *(constant(layer, bias) for bias in biases)]
+        members = [initialiser(matrix("_x")), initialiser(matrix("_h")), *(constant(layer, bias) for bias in biases)]
         return [struct("edp_q_recurrent", f"{name}_weights", [*members, str(share)])]
 
     if isinstance(layer, quantised.QDense | quantised.QGroupedDense | quantised.QConvolution):
@@ -180,5 +180,5 @@ def tables_header() -> str:
         ("log1p_exp", fixed.LOG1P_EXP, "log(1 + exp(-x)) on [0, 16]"),
         ("normal", fixed.NORMAL, "cumulated normal distribution on [0, 8]"),
     ):
-        parts.append(array("uint16_t", f"edp_table_{name}", unsigned(values), note))
+        parts.append(array("uint16_t", f"edp_table_{name}", unsigned_literals(values), note))
     return "\n".join([*parts, "", "#endif", ""])

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edp.errors import ExportError
-from edp.export.c.text import array, double_number, number, table, unsigned
+from edp.export.c.text import array, double_number, number, table, unsigned_literals
 from edp.export.escape import Code
 from edp.export.hashes import little_endian
 
@@ -86,7 +86,7 @@ class ConstantTables:
             raise ExportError(
                 f"table '{name}' of the {self.owner} counts to {max(listed):,}; {MOST_PLACES:,} must hold"
             )
-        self.lines.append(array("uint16_t", name, unsigned(listed)))
+        self.lines.append(array("uint16_t", name, unsigned_literals(listed)))
         self._enter(name, np.asarray(listed, dtype=np.uint16))
 
     def text(self, line: str) -> None:

@@ -52,12 +52,12 @@ def double_number(value: float) -> str:
     return text if any(c in text for c in ".e") else f"{text}.0"
 
 
-def truth(value: bool) -> str:
+def bool_literal(value: bool) -> str:
     """Return a boolean literal."""
     return "true" if value else "false"
 
 
-def unsigned(values: Iterable[int]) -> list[str]:
+def unsigned_literals(values: Iterable[int]) -> list[str]:
     """Return unsigned integer literals."""
     return [f"{value}u" for value in values]
 
@@ -70,14 +70,14 @@ def filled(items: Iterable[str], indent: str = "    ") -> Code:
     return Code(textwrap.fill(", ".join(items), WIDTH, initial_indent=indent, subsequent_indent=indent))
 
 
-def braced(items: Iterable[str]) -> Code:
-    """Return an initialiser on one line."""
+def initialiser(items: Iterable[str]) -> Code:
+    """Return a braced initialiser on one line."""
     return Code(f"{{{', '.join(items)}}}")
 
 
-def braced_rows(rows: Iterable[Iterable[str]]) -> Code:
-    """Return initialisers, one on each line."""
-    return Code(",\n".join(f"    {braced(row)}" for row in rows))
+def initialiser_rows(rows: Iterable[Iterable[str]]) -> Code:
+    """Return braced initialisers, one on each line."""
+    return Code(",\n".join(f"    {initialiser(row)}" for row in rows))
 
 
 def array(kind: str, name: str, values: Iterable[str], note: str = "") -> Code:
@@ -89,12 +89,12 @@ def array(kind: str, name: str, values: Iterable[str], note: str = "") -> Code:
 
 def struct(kind: str, name: str, members: Iterable[str]) -> Code:
     """Return the definition of a constant struct, or of a short array, on one line."""
-    return Code(f"static const {kind} {name} = {braced(members)};")
+    return Code(f"static const {kind} {name} = {initialiser(members)};")
 
 
 def table(kind: str, name: str, rows: Iterable[Iterable[str]]) -> Code:
     """Return the definition of a constant array of structs or arrays, one on each line; `name` includes the sizes."""
-    return Code(f"static const {kind} {name} = {{\n{braced_rows(rows)}\n}};")
+    return Code(f"static const {kind} {name} = {{\n{initialiser_rows(rows)}\n}};")
 
 
 def reference_array(kind: str, name: str, values: NDArray[np.floating], missing: bool = False) -> Code:

@@ -8,7 +8,7 @@ import numpy as np
 
 from edp.errors import ExportError
 from edp.export.c.model import Model, make_model
-from edp.export.c.text import filled, identifier, number, unsigned
+from edp.export.c.text import filled, identifier, number, unsigned_literals
 from edp.export.controller.parts import PlanParts
 from edp.export.controller.plants import plant_files, plant_values
 from edp.export.escape import Code
@@ -89,7 +89,7 @@ class NearModel:
             "room": machine.room,
             "low": filled(map(number, np.asarray(twin.scales.low) / twin.units)),
             "high": filled(map(number, np.asarray(twin.scales.high) / twin.units)),
-            "axes": Code(", ".join(unsigned(machine.ports[answer, 1] for answer in self.velocities))),
+            "axes": Code(", ".join(unsigned_literals(machine.ports[answer, 1] for answer in self.velocities))),
             "machine": f"{identifier(machine.name)}_machine",
         }
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from edp.export.c.tables import ConstantTables
-from edp.export.c.text import braced, number, struct, table, truth
+from edp.export.c.text import bool_literal, initialiser, number, struct, table
 from edp.export.controller.parts import AXES, ControllerParts, PlanParts, Side
 
 SIDES = ("out", "back")
@@ -22,12 +22,12 @@ def constants_of_controller(parts: ControllerParts, near: bool = False) -> Const
     tables.floats("input_low", parts.limits_low)
     tables.floats("input_high", parts.limits_high)
     tables.rows("front_angles", parts.angles)
-    lengths = [braced(map(number, values)) for values in (parts.full_m, parts.lengths_m)]
+    lengths = [initialiser(map(number, values)) for values in (parts.full_m, parts.lengths_m)]
     tables.text(struct("edp_front", "front", [f"{len(parts.angles)}u", "front_angles", *lengths]))
     # A rounding below: levers are sums in single precision, and a limit is one.
     slew = np.maximum(np.asarray(parts.slew) - ROUNDED, 0.5 * np.asarray(parts.slew))
     limits = (parts.lever_low, parts.lever_high, slew)
-    tables.text(struct("edp_lever_limits", "limits", (braced(map(number, values)) for values in limits)))
+    tables.text(struct("edp_lever_limits", "limits", (initialiser(map(number, values)) for values in limits)))
     if parts.plan is None or parts.plan.fallback:
         _set_sides(tables, "loop", parts.sides)
         gains = map(number, (*parts.gains, parts.rate_hz))
@@ -51,7 +51,7 @@ def _set_plan(tables: ConstantTables, parts: ControllerParts, plan: PlanParts, n
     if plan.pressures:
         tables.places("pressure_answers", plan.pressures)
     tables.text(struct("edp_lever_shape", "lever_shape", map(number, plan.lever_shape)))
-    pilots = [(f"{p.axis}u", truth(p.second), truth(p.extend), number(p.share)) for p in plan.pilots]
+    pilots = [(f"{p.axis}u", bool_literal(p.second), bool_literal(p.extend), number(p.share)) for p in plan.pilots]
     tables.text(table("edp_pilot", f"pilots[{len(pilots)}]", pilots))
     names = ("along", "attitude", "change", "feedforward", "trust", "smoothing")
     scalars = dict(zip(names, plan.weights, strict=True)) | {"STEP": plan.step_m_s, "margin": plan.margin}
@@ -70,7 +70,7 @@ def _set_sides(tables: ConstantTables, name: str, sides: Iterable[tuple[Side, Si
             own = f"{name}_{label}_{axis}"
             tables.floats(f"{own}_speeds", _rising(speeds))
             tables.floats(f"{own}_levers", levers)
-            entries.append(braced([f"{len(speeds)}u", f"{own}_speeds", f"{own}_levers"]))
+            entries.append(initialiser([f"{len(speeds)}u", f"{own}_speeds", f"{own}_levers"]))
         rows.append(entries)
     tables.text(table("edp_valve_side", f"{name}_sides[{AXES}][2]", rows))
 

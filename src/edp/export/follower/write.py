@@ -16,15 +16,15 @@ from edp.export.c.model import Model, crc, make_model
 from edp.export.c.tables import ConstantTables
 from edp.export.c.target import check_name
 from edp.export.c.text import (
-    braced_rows,
     channel_enumeration,
     enumeration,
     filled,
     identifier,
+    initialiser_rows,
     number,
     reference_array,
     table,
-    unsigned,
+    unsigned_literals,
 )
 from edp.export.controller.near import RUNTIME as NEAR
 from edp.export.controller.near import WITHIN
@@ -152,7 +152,7 @@ class FollowerFiles:
         named = ["numbers", "commands", "entries", "groups", "velocities", "targets", "horizons", "reach"]
         counts = [*(s[name] for name in named), self.parts.twin.prefix_ticks, spec.learn_ticks, s["state"], s["most"]]
         shares = [number(spec.gain), number(spec.load_share), repr(keep), number(oil), repr(1.0 / (JUDGED_S * rate))]
-        return filled([*unsigned(counts), *shares])
+        return filled([*unsigned_literals(counts), *shares])
 
     def _values(self) -> dict[str, object]:
         parts, twin, graph = self.parts, self.parts.twin, self.model.graph
@@ -184,7 +184,7 @@ class FollowerFiles:
             "high": filled(map(number, np.asarray(twin.scales.high) / twin.units)),
             "constants": Code("\n".join(tables.lines)),
             "own_tables": Code(", ".join(tables.entries)),
-            "limits": braced_rows(map(number, row) for row in parts.limit),
+            "limits": initialiser_rows(map(number, row) for row in parts.limit),
             "law": self._law(),
             "machine": f"{identifier(self.machine.name)}_machine",
             "sources": Code(" ".join(self.sources)),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from edp.export.c.model import Model, make_model
 from edp.export.c.tables import ConstantTables
-from edp.export.c.text import number, table, truth, unsigned
+from edp.export.c.text import bool_literal, number, table, unsigned_literals
 from edp.export.escape import Code, fill_file
 from edp.export.monitor.parts import NetworkPart, SourcePart, TwinPart
 from edp.monitor.residuals.balances import Balances
@@ -70,11 +70,11 @@ class SourceCode(ABC):
     def code(self, name: str, first: int) -> Code:
         """Return the function that fills the residuals of the monitor `name` beginning at `first`."""
         reads, blanks = len(self.reads), self.blanks(first)
-        hold = self.fragment("hold", {"count": reads})
+        hold = self.fill_template("hold", {"count": reads})
         common = {"name": name, "hold": hold, "first": first, "residuals": self.residuals, "reads": reads}
-        return self.fragment(self.template, {**common, **blanks})
+        return self.fill_template(self.template, {**common, **blanks})
 
-    def fragment(self, template: str, values: Mapping[str, object]) -> Code:
+    def fill_template(self, template: str, values: Mapping[str, object]) -> Code:
         """Return a filled template of a source."""
         return fill_file(f"monitor/templates/source_{template}.c.in", {"own": self.own, **values})
 
@@ -135,7 +135,7 @@ class NetworkCode(SourceCode):
         """See `SourceCode`."""
         own, part = self.own, self.part
         value = f"(s->row[{own}_judged[i]] - s->{own}_past[back][i])"
-        width = self.fragment("ahead_width", {"least": number(part.least_width)}) if part.scaled else Code("")
+        width = self.fill_template("ahead_width", {"least": number(part.least_width)}) if part.scaled else Code("")
         return {
             "model": self.prefix,
             "width": width,
@@ -309,7 +309,7 @@ class FlowCode(SourceCode):
         numbers = (spots.end, spots.far, 1.0 / spots.cushion, spots.tank)
         lines = f"&{self.own}_lines[{index * len(chamber.lines)}]"
         doubts = f"&{self.own}_doubts[{index * len(chamber.doubts)}]"
-        return [*unsigned(places), truth(spots.sign > 0), *map(number, numbers), lines, doubts]
+        return [*unsigned_literals(places), bool_literal(spots.sign > 0), *map(number, numbers), lines, doubts]
 
     def blanks(self, first: int) -> dict[str, object]:
         """See `SourceCode`."""
@@ -322,7 +322,7 @@ class FlowCode(SourceCode):
                 "residuals": self.residuals,
                 "first": first,
             }
-            oil = self.fragment("flow_oil", values)
+            oil = self.fill_template("flow_oil", values)
         return {
             "oil": oil,
             "length": self.length,

@@ -15,6 +15,7 @@ from edp.export.c.model import RUNTIME
 from edp.export.c.tables import ConstantTables
 from edp.export.c.target import check_name, core_files
 from edp.export.c.text import (
+    bool_literal,
     channel_enumeration,
     double_number,
     enumeration,
@@ -22,8 +23,7 @@ from edp.export.c.text import (
     number,
     struct,
     table,
-    truth,
-    unsigned,
+    unsigned_literals,
 )
 from edp.export.escape import C_SIGNIFICANT, Code, c_comment, fill_file, package_text
 from edp.export.folder import write_export
@@ -116,7 +116,9 @@ class MonitorFiles:
         tables.places("driver_second", np.where(pairs[:, 1] < 0, NO_INPUT, pairs[:, 1]).tolist())
         counted = (summaries.centre, summaries.scale, summaries.level, summaries.moving, summaries.drivers)
         arrays = ("centre", "spread", "scale", "change", "channel", "level", "moving", "driver_first", "driver_second")
-        tables.text(struct("edp_blocks", "blocks", [*unsigned((summaries.block, *map(len, counted))), *arrays]))
+        tables.text(
+            struct("edp_blocks", "blocks", [*unsigned_literals((summaries.block, *map(len, counted))), *arrays])
+        )
         lines = {
             "point_offset": conditioning.offset,
             "point_width": conditioning.width,
@@ -149,16 +151,16 @@ class MonitorFiles:
             tables.singles(f"mean_{index}", view.watch.mean)
             tables.singles(f"matrix_{index}", np.ascontiguousarray(view.watch.matrix.T))
             weight = view.option if view.detector == "ewma" else 1.0
-            sizes = unsigned((self.parts.chain.summaries.width, view.directions, view.rows))
+            sizes = unsigned_literals((self.parts.chain.summaries.width, view.directions, view.rows))
             options = map(double_number, (view.option, (2.0 - weight) / weight, view.watch.scale))
             arrays = (f"mean_{index}", f"matrix_{index}")
-            rows.append([DETECTORS[view.detector], truth(view.watch.own), *sizes, *options, *arrays])
+            rows.append([DETECTORS[view.detector], bool_literal(view.watch.own), *sizes, *options, *arrays])
         tables.text(table("edp_watch", f"watches[{len(rows)}]", rows))
         memories = np.cumsum([0, *(view.memory for view in watches[:-1])]).tolist()
-        tables.text(struct("uint32_t", f"memory_from[{len(memories)}]", unsigned(memories)))
+        tables.text(struct("uint32_t", f"memory_from[{len(memories)}]", unsigned_literals(memories)))
         first = 1 + (self.parts.each + 1) * len(self.parts.residuals)
         starts = (first + np.cumsum([0, *(view.slices for view in watches)])).tolist()
-        tables.text(struct("uint32_t", f"slices_from[{len(starts)}]", unsigned(starts)))
+        tables.text(struct("uint32_t", f"slices_from[{len(starts)}]", unsigned_literals(starts)))
 
     def _filled(self, template: str) -> Code:
         return fill_file(f"monitor/templates/{template}", self._values())
