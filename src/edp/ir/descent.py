@@ -15,7 +15,7 @@ def depth_of(leaves: int) -> int:
     return leaves.bit_length() - 1
 
 
-def reached_leaves(feature: Indices, threshold: NDArray[Any], leaf: NDArray[Any], x: NDArray[Any]) -> NDArray[Any]:
+def find_leaves(feature: Indices, threshold: NDArray[Any], leaf: NDArray[Any], x: NDArray[Any]) -> NDArray[Any]:
     """Return the leaf that an input row reaches in each tree of `edp.ir.layers.TreeSums`.
 
     Args:

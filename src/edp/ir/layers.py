@@ -12,7 +12,7 @@ from enum import StrEnum
 import numpy as np
 
 from edp.ir.base import Array, Indices, Layer, LayerRun, Values
-from edp.ir.descent import depth_of, reached_leaves, summed
+from edp.ir.descent import depth_of, find_leaves, summed
 
 LEAST = float(np.finfo(np.float32).tiny)
 """The least normal number of single precision."""
@@ -303,7 +303,7 @@ class TreeSums(Layer):
         return depth_of(self.leaf.shape[2])
 
     def over_time(self, run: LayerRun, x: Values) -> Values:
-        return summed(reached_leaves(self.feature, run.constants["threshold"], run.constants["leaf"], x))
+        return summed(find_leaves(self.feature, run.constants["threshold"], run.constants["leaf"], x))
 
 
 NEVER = float(np.finfo(np.float32).max)

@@ -204,7 +204,7 @@ class Model:
         return {
             "work_fields": indented(f"{STATES[kind]} {WORK[kind]}[{size}];" for kind, size in sizes.items()),
             "work_pointers": indented(f"{STATES[kind]} *const {WORK[kind]} = s->{WORK[kind]};" for kind in sizes),
-            "clear_work": indented(cleared_work(self.plan)),
+            "clear_work": indented(clear_work(self.plan)),
         }
 
     def _tangent(self, changes: MemoryPlan) -> dict[str, object]:
@@ -274,7 +274,7 @@ def remembered(graph: Graph) -> tuple[list[str], list[str]]:
     return declared, cleared
 
 
-def cleared_work(plan: MemoryPlan) -> list[str]:
+def clear_work(plan: MemoryPlan) -> list[str]:
     """Statements that clear the work memories."""
     return [f"{FILLS[kind]}{size}u, s->{WORK[kind]});" for kind, size in plan.sizes.items()]
 

@@ -89,12 +89,12 @@ class LaneModel:
             "forget": indented(cleared or ["s->none[0] = 0.0f;"]),
             "low": filled(map(number, low)),
             "high": filled(map(number, high)),
-            "compute": indented(self._computed(free=False)),
-            "run": indented(self._computed(free=True)),
+            "compute": indented(self._write_statements(free=False)),
+            "run": indented(self._write_statements(free=True)),
             "result": Code(f" + {at}" if at else ""),
         }
 
-    def _computed(self, free: bool) -> Iterator[str]:
+    def _write_statements(self, free: bool) -> Iterator[str]:
         """Yield the statements of a time step. Neighbouring layers without products share one loop over the copies.
 
         Args:
@@ -103,7 +103,7 @@ class LaneModel:
         calls, together = Calls(self.model.graph, self.model.plan), list[str]()
         for layer in self.model.graph.layers:
             if free and layer.name.startswith(PORTS):
-                together += self._fed(calls, layer)
+                together += self._write_port_layer(calls, layer)
                 continue
             whole = self._whole(calls, layer)
             if whole is None:
@@ -114,7 +114,7 @@ class LaneModel:
             together = []
         yield from _loop(self.name, together)
 
-    def _fed(self, calls: Calls, layer: Layer) -> list[str]:
+    def _write_port_layer(self, calls: Calls, layer: Layer) -> list[str]:
         """Return the remaining statements of a port layer if all ports run free."""
         if layer.name != FED:
             return []

@@ -61,8 +61,8 @@ class MonitorFiles:
         """Every file by name, the one to read first in front."""
         name = self.name
         texts: dict[str, str] = {
-            f"{name}.h": self._filled("monitor.h.in"),
-            f"{name}.c": self._filled("monitor.c.in"),
+            f"{name}.h": self._fill_template("monitor.h.in"),
+            f"{name}.c": self._fill_template("monitor.c.in"),
             f"{name}_numbers.h": self._numbers(),
         }
         texts |= {file: package_text(f"monitor/runtime/{file}") for file in OWN}
@@ -75,9 +75,9 @@ class MonitorFiles:
         """Return the texts with self-test, example and CMake file."""
         return self.texts() | {
             f"{self.name}_golden.h": golden_header(self.name, self.parts),
-            "host_test.c": self._filled("host_test.c.in"),
-            "example_task.c": self._filled("example_task.c.in"),
-            "CMakeLists.txt": self._filled("CMakeLists.txt.in"),
+            "host_test.c": self._fill_template("host_test.c.in"),
+            "example_task.c": self._fill_template("example_task.c.in"),
+            "CMakeLists.txt": self._fill_template("CMakeLists.txt.in"),
         }
 
     @property
@@ -162,7 +162,7 @@ class MonitorFiles:
         starts = (first + np.cumsum([0, *(view.slices for view in watches)])).tolist()
         tables.text(struct("uint32_t", f"slices_from[{len(starts)}]", unsigned_literals(starts)))
 
-    def _filled(self, template: str) -> Code:
+    def _fill_template(self, template: str) -> Code:
         return fill_file(f"monitor/templates/{template}", self._values())
 
     def _values(self) -> dict[str, object]:

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.ir.base import Indices, Layer, LayerRun, Number, Slot
-from edp.ir.descent import depth_of, reached_leaves
+from edp.ir.descent import depth_of, find_leaves
 from edp.ir.layers import Function, flat, split
 from edp.ir.w8a16 import arithmetic as fixed
-from edp.ir.w8a16.arithmetic import GATE_FRAC, GATE_LIMIT, LARGEST, UNIT_FRAC, Fixed, rounded_shift, saturated, scaled
+from edp.ir.w8a16.arithmetic import GATE_FRAC, GATE_LIMIT, LARGEST, UNIT_FRAC, Fixed, round_shift, saturated, scaled
 
 Bytes = NDArray[np.int8]
 Halves = NDArray[np.int16]
@@ -113,7 +113,7 @@ class QGather(FixedLayer):
         return len(self.columns)
 
     def over_time(self, run: LayerRun, *parts: Fixed) -> Fixed:
-        return np.concatenate(list(map(rounded_shift, parts, self.shifts)), axis=-1)[..., list(self.columns)]
+        return np.concatenate(list(map(round_shift, parts, self.shifts)), axis=-1)[..., list(self.columns)]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -126,7 +126,7 @@ class QSum(_Sized):
 
     def over_time(self, run: LayerRun, a: Fixed, b: Fixed) -> Fixed:
         a, b = a << self.lefts[0], b << self.lefts[1]
-        return saturated(rounded_shift(a - b if self.minus else a + b, self.right))
+        return saturated(round_shift(a - b if self.minus else a + b, self.right))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -136,7 +136,7 @@ class QMultiply(_Sized):
     right: int
 
     def over_time(self, run: LayerRun, a: Fixed, b: Fixed) -> Fixed:
-        return saturated(rounded_shift(a * b, self.right))
+        return saturated(round_shift(a * b, self.right))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -152,7 +152,7 @@ class QScaleShift(FixedLayer):
         return len(self.gain)
 
     def over_time(self, run: LayerRun, x: Fixed) -> Fixed:
-        return saturated(rounded_shift(x * self.gain + self.offset, self.right))
+        return saturated(round_shift(x * self.gain + self.offset, self.right))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -171,8 +171,8 @@ class QActivate(_Sized):
         if self.function is Function.TANH:
             return fixed.tanh(gate, GATE_FRAC)
         if self.function is Function.GELU:
-            return saturated(rounded_shift(x * fixed.normal(gate), 16))
-        return saturated(rounded_shift(fixed.softplus(gate), GATE_FRAC - self.frac))
+            return saturated(round_shift(x * fixed.normal(gate), 16))
+        return saturated(round_shift(fixed.softplus(gate), GATE_FRAC - self.frac))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -189,7 +189,7 @@ class QGlu(FixedLayer):
     def over_time(self, run: LayerRun, x: Fixed) -> Fixed:
         halves = x.reshape(*x.shape[:-1], self.rows, 2, -1)
         gate = fixed.sigmoid(_to_gate(halves[..., 1, :], self.frac))
-        return np.asarray(flat(rounded_shift(halves[..., 0, :] * gate, UNIT_FRAC)))
+        return np.asarray(flat(round_shift(halves[..., 0, :] * gate, UNIT_FRAC)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -256,8 +256,8 @@ class QTreeSums(FixedLayer):
         return depth_of(self.leaf.shape[2])
 
     def over_time(self, run: LayerRun, x: Fixed) -> Fixed:
-        leaves = reached_leaves(self.feature, self.threshold, self.leaf, x)
-        return saturated(rounded_shift(leaves.sum(axis=-1, dtype=np.int64), self.right))
+        leaves = find_leaves(self.feature, self.threshold, self.leaf, x)
+        return saturated(round_shift(leaves.sum(axis=-1, dtype=np.int64), self.right))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -335,10 +335,10 @@ class QLstm(_QRecurrent):
             i, f, o = np.moveaxis(fixed.sigmoid(gates[..., [0, 1, 3], :]), -2, 0)
             # Both terms in the format of the product, so that one rounding remains.
             product = f * c + ((i * fixed.tanh(gates[..., 2, :], GATE_FRAC)) << (fixed.CELL_FRAC - UNIT_FRAC))
-            fresh = saturated(rounded_shift(product, UNIT_FRAC), fixed.CELL_LIMIT)
-            shown = rounded_shift(o * fixed.tanh(fresh, fixed.CELL_FRAC), UNIT_FRAC)
-            c = c + rounded_shift(self.share * (fresh - c), UNIT_FRAC)
-            h = h + rounded_shift(self.share * (shown - h), UNIT_FRAC)
+            fresh = saturated(round_shift(product, UNIT_FRAC), fixed.CELL_LIMIT)
+            shown = round_shift(o * fixed.tanh(fresh, fixed.CELL_FRAC), UNIT_FRAC)
+            c = c + round_shift(self.share * (fresh - c), UNIT_FRAC)
+            h = h + round_shift(self.share * (shown - h), UNIT_FRAC)
             out[tick] = h
         m["h"], m["c"] = h, c
         return out
@@ -367,8 +367,8 @@ class QGru(_QRecurrent):
         for tick, ahead in enumerate(split(driven, 3)):
             back = split(_gates(h, self.weight_h, self.multiplier_h, self.shift_h) + self.bias_h, 3)
             r, z = np.moveaxis(fixed.sigmoid(ahead[..., :2, :] + back[..., :2, :]), -2, 0)
-            n = fixed.tanh(ahead[..., 2, :] + rounded_shift(r * back[..., 2, :], UNIT_FRAC), GATE_FRAC)
-            h = n + rounded_shift(z * (h - n), UNIT_FRAC)
+            n = fixed.tanh(ahead[..., 2, :] + round_shift(r * back[..., 2, :], UNIT_FRAC), GATE_FRAC)
+            h = n + round_shift(z * (h - n), UNIT_FRAC)
             out[tick] = h
         m["h"] = h
         return out
@@ -401,10 +401,10 @@ class QMinGru(FixedLayer):
         fresh, h = x[..., self.units :] << self.EXTRA, m["h"]
         out = np.empty_like(fresh)
         for tick in range(len(x)):
-            h = h + rounded_shift(z[tick] * (fresh[tick] - h), UNIT_FRAC)
+            h = h + round_shift(z[tick] * (fresh[tick] - h), UNIT_FRAC)
             out[tick] = h
         m["h"] = h
-        return saturated(rounded_shift(out, self.EXTRA))
+        return saturated(round_shift(out, self.EXTRA))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -430,11 +430,11 @@ class QRotation(FixedLayer):
         re, im = m["h"][..., 0], m["h"][..., 1]
         out = np.empty_like(driven)
         for tick, add in enumerate(driven):
-            turned = rounded_shift(a * re - b * im, 30), rounded_shift(a * im + b * re, 30)
+            turned = round_shift(a * re - b * im, 30), round_shift(a * im + b * re, 30)
             re, im = (saturated(turned[i] + add[..., i], fixed.CELL_LIMIT) for i in (0, 1))
             out[tick, ..., 0], out[tick, ..., 1] = re, im
         m["h"] = np.stack([re, im], axis=-1)
-        return saturated(rounded_shift(out.reshape(x.shape), self.right))
+        return saturated(round_shift(out.reshape(x.shape), self.right))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -460,7 +460,7 @@ class QDifference(FixedLayer):
         before = m["before"] if self.from_zero or m["age"][0] > 0 else x[0]
         change = x - np.concatenate([before[None], x[:-1]])
         m["before"], m["age"] = x[-1], np.ones_like(m["age"])
-        return saturated(rounded_shift(self.factor * change, self.right))
+        return saturated(round_shift(self.factor * change, self.right))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -525,7 +525,7 @@ class QAttentionPool(FixedLayer):
             first, stop = tick + window - min(age + tick + 1, window), tick + window
             weights = fixed.softmax(scores[first:stop].T).astype(np.float64)
             sums = np.einsum("bs,sbn->bn", weights, ring[first:stop].astype(np.float64))
-            out[tick] = rounded_shift(sums.astype(np.int64), UNIT_FRAC)
+            out[tick] = round_shift(sums.astype(np.int64), UNIT_FRAC)
         m["ring"], m["scores"] = ring[len(x) :], scores[len(x) :]
         m["age"] = np.full_like(m["age"], min(age + len(x), window))
         return saturated(out)
@@ -546,4 +546,4 @@ def _gates(x: Fixed, weight: NDArray[np.int8], multiplier: Any, shift: Any) -> F
 
 
 def _to_gate(x: Fixed, frac: int) -> Fixed:
-    return saturated(rounded_shift(x, frac - GATE_FRAC), GATE_LIMIT)
+    return saturated(round_shift(x, frac - GATE_FRAC), GATE_LIMIT)
