@@ -113,9 +113,7 @@ class Episodes:
         if how == tick.FINE:
             return
         if how == tick.NOT_FINITE_LEVER:
-            raise ConfigError(
-                f"levers of episode {failed} are {levers[failed].tolist()}; give three finite numbers from -1 to 1"
-            )
+            raise not_finite(levers, failed)
         start = self.starts[failed]
         if start is None:
             raise ConfigError(f"episode {failed} has not begun; reset it first")
@@ -208,6 +206,14 @@ class Episodes:
             return
         self.memory, self.drawn = _long_enough(self.memory, len(memory)), _long_enough(self.drawn, len(drawn))
         self.memory[index, : len(memory)], self.drawn[index, : len(drawn)] = memory, drawn
+
+
+def not_finite(levers: Array, index: int) -> ConfigError:
+    """Return the error for levers, shape (episode, 3), that are not finite in one episode."""
+    return ConfigError(
+        f"levers of episode {index} are not finite: {levers[index].tolist()}; expected finite numbers from -1 to 1: "
+        "give three finite positions, boom, arm and bucket"
+    )
 
 
 def _long_enough(rows: Array, length: int) -> Array:
