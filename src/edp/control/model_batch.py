@@ -81,13 +81,7 @@ class ModelBatch(PlantBatch):
         self._ticks, self.tick = round(duration_s * rate_hz), np.zeros(count, np.int64)
 
     def begin(self, index: int, seed: int | None, rng: np.random.Generator, options: Options) -> Infos:
-        """Begin an episode in steady state; nothing is drawn.
-
-        Args:
-            index: which.
-            seed: not read.
-            rng: not read.
-            options: ``strokes``, fractions of full to start from; ``material``, of a twin with a ground.
+        """Begin an episode in steady state at ``strokes`` (fractions of full stroke); nothing is drawn.
 
         Raises:
             ConfigError: an option is unknown, or a soil where there is no ground.

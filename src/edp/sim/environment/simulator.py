@@ -60,11 +60,7 @@ class SimulatorBatch(PlantBatch):
         return self.models[0].commands(levers)
 
     def begin(self, index: int, seed: int | None, rng: np.random.Generator, options: Options) -> Infos:
-        """Begin an episode; see `edp.sim.environment.start` for the options.
-
-        Raises:
-            ConfigError: an option is unknown or out of range.
-        """
+        """Begin an episode; see `edp.sim.environment.start` for the options."""
         seed = int(rng.integers(MOST_SEED)) if seed is None else seed
         start, facts = episode_start(self._settings[index], seed, options)
         self.episodes.begin(index, start, self._present)
@@ -72,12 +68,7 @@ class SimulatorBatch(PlantBatch):
         return facts
 
     def step(self, actions: Array, active: Bools | None = None) -> StepOutcome:
-        """Hold lever positions, shape (count, 3), for one tick.
-
-        Raises:
-            ConfigError: they are not finite; no machine has moved.
-            SimulationError: a state became non-finite.
-        """
+        """Hold lever positions, shape (count, 3), for one tick, see `EpisodeBatch.step`."""
         self.episodes.step(actions, self._present, active)
         return self._outcome
 
@@ -89,11 +80,7 @@ class SimulatorBatch(PlantBatch):
         return Truth(row, pilots, self._in_soil, episodes.most_faults, episodes.shares())
 
     def restore(self, index: int, snapshot: Moment) -> None:
-        """Restore one machine to a snapshot of this or another environment.
-
-        Raises:
-            ConfigError: the snapshot is of an environment that shows other channels.
-        """
+        """Restore one machine to a snapshot, see `ExcavatorEnv.restore`."""
         self.episodes.go_to(index, snapshot)
         self.episodes.show(index, self._present)
         self._enter(index)

@@ -164,22 +164,11 @@ class VectorExcavatorEnv(VectorEnvironment):
         return self._batch.models
 
     def snapshot(self, index: int) -> Moment:
-        """Return a snapshot of one machine; `ExcavatorEnv.restore` accepts it, too.
-
-        Raises:
-            ConfigError: no episode has begun there.
-        """
+        """Return a snapshot of one machine, see `ExcavatorEnv.snapshot`."""
         return self._batch.episodes.moment(index)
 
     def restore(self, index: int, snapshot: Moment) -> Observations:
-        """Restore one machine to a snapshot of this or another environment.
-
-        Returns:
-            Its observation of that moment, shape (channel,).
-
-        Raises:
-            ConfigError: the snapshot is of an environment that shows other channels.
-        """
+        """Restore one machine to a snapshot, also of another environment, see `ExcavatorEnv.restore`."""
         self._batch.restore(index, snapshot)
         self._begun[index], self._ended[index] = True, self._batch.ended[index]
         return self._batch.observation(index)
