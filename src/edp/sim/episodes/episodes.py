@@ -16,6 +16,7 @@ from edp.sim.faults.course import MachineCourse, SensorCourse, numbers_of, share
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
 from edp.sim.physics import soil
+from edp.sim.physics.material import load_material
 from edp.sim.physics.plant import Plant
 from edp.sim.scenario import Scenario, SimulationError
 from edp.sim.sensors import alterations, chain, draws
@@ -189,7 +190,7 @@ class Episodes:
         losses[done:] = _losses(start, len(losses), lost)[done:]
         if start.scenario.material:
             soil.redraw_course(
-                soil.load_material(start.scenario.material),
+                load_material(start.scenario.material),
                 blocks.view(blocks.SOIL_NUMBERS, self.memory[index], drawn)[0],
                 blocks.view(blocks.GROUND_MEMORY, self.memory[index], drawn)[0],
                 blocks.view(blocks.SOIL_COURSE, self.memory[index], drawn),
