@@ -82,21 +82,25 @@ class VectorEnvironment(gymnasium.vector.VectorEnv[Observations, Observations, N
             SimulationError: a state became non-finite.
         """
         asked = checked_actions(actions, (self.num_envs, at.AXES))
-        again = self._ended
-        stuck = ~self._begun if self._mode is AutoresetMode.NEXT_STEP else ~self._begun | again
-        if stuck.any():
+        again, restarts = self._ended, bool(self._ended.any())
+        if not self._begun.all() or (restarts and self._mode is not AutoresetMode.NEXT_STEP):
+            stuck = ~self._begun if self._mode is AutoresetMode.NEXT_STEP else ~self._begun | again
             raise ConfigError(f"episodes {shown(np.flatnonzero(stuck).tolist())} are not under way; call reset() first")
         # An episode that is reset in this step ignores its action.
-        active = ~again
-        rewards, terminated, truncated = self._batch.step(asked, active)
-        rewards, terminated, truncated = rewards.copy(), terminated & active, truncated & active
+        active = ~again if restarts else None
+        outcome = self._batch.step(asked, active)
+        rewards, terminated, truncated = outcome.rewards.copy(), outcome.terminated.copy(), outcome.truncated.copy()
+        if active is not None:
+            terminated &= active
+            truncated &= active
         self._ended = terminated | truncated
         infos: Infos = {}
-        for index in np.flatnonzero(self._ended).tolist():
+        ended = np.flatnonzero(self._ended).tolist()
+        for index in ended:
             infos = self._add_info(infos, self._batch.summary(index), index)
-        if again.any():
+        if restarts:
             infos = self._begin(again, [None] * self.num_envs, {}, infos)
-        if self._mode is AutoresetMode.SAME_STEP and self._ended.any():
+        if ended and self._mode is AutoresetMode.SAME_STEP:
             infos = self._restart(infos)
         return self._batch.observation(ALL), rewards, terminated, truncated, {**self._batch.info(ALL), **infos}
 
