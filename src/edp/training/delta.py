@@ -196,7 +196,7 @@ def _factors(matrix: NDArray[np.float64], rank: int) -> tuple[Scaled, Scaled]:
     return Scaled.of(root * u[:, :rank].T), Scaled.of(root * v[:rank])
 
 
-def with_delta(base: Predictor, delta: Delta) -> Predictor:
+def apply_delta(base: Predictor, delta: Delta) -> Predictor:
     """Return the network of a machine: a copy of the base with the change added.
 
     Raises:

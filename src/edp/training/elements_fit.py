@@ -76,8 +76,8 @@ class _Problem:
         if len(cuts) > affordable:
             cuts = [cuts[i] for i in np.linspace(0, len(cuts) - 1, affordable).round().astype(int)]
         # A run that ends early keeps its last command; what would be judged behind its end is not a number.
-        self.commands = np.stack([_padded(part.inputs[at : at + ticks], ticks, "edge") for part, at in cuts])
-        rows = np.stack([_padded(part.targets[at : at + ticks + 1], ticks + 1, "nan") for part, at in cuts])
+        self.commands = np.stack([_pad_rows(part.inputs[at : at + ticks], ticks, "edge") for part, at in cuts])
+        rows = np.stack([_pad_rows(part.targets[at : at + ticks + 1], ticks + 1, "nan") for part, at in cuts])
         self.first, self.truth = rows[:, 0], rows[:, 1:]
         count, strokes = len(twin.channels.velocities), len(twin.channels.strokes)
         weight = 1.0 / (NOISE * twin.scales.answer_width.astype(np.float64))
@@ -138,7 +138,7 @@ class _Problem:
         return matrix, gradient
 
 
-def _padded(rows: NDArray[np.float32], ticks: int, by: str) -> Doubles:
+def _pad_rows(rows: NDArray[np.float32], ticks: int, by: str) -> Doubles:
     """Extend rows to the given number of samples as doubles, with the last one ("edge") or NaN ("nan")."""
     short, values = ticks - len(rows), rows.astype(np.float64)
     if by == "edge":
@@ -199,7 +199,7 @@ def fit_elements(
         point, matrix = _descend(
             problem, APART * rng.normal(size=every) if start else np.zeros(every), twin.spec.rounds
         )
-        fitted = twin.with_numbers(problem.numbers(point[:size]))
+        fitted = twin.with_parameters(problem.numbers(point[:size]))
         judge.twin = fitted
         error = judge.error()
         better = bool(error < least)

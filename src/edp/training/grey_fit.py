@@ -176,11 +176,13 @@ class GreyProblem:
             matrix, gradient = slopes.T @ matrix @ slopes, slopes.T @ gradient
         elif full:
             slope = self.slope(numbers)
-            matrix, gradient = _led(matrix * slope * slope[:, None], gradient * slope, self.twin.table.leader)
+            matrix, gradient = _tie_derivatives(
+                matrix * slope * slope[:, None], gradient * slope, self.twin.table.leader
+            )
         return matrix, gradient, np.nan_to_num(normal.losses, nan=1e12, posinf=1e12)
 
 
-def _led(matrix: Doubles, gradient: Doubles, leader: NDArray[np.int64]) -> tuple[Doubles, Doubles]:
+def _tie_derivatives(matrix: Doubles, gradient: Doubles, leader: NDArray[np.int64]) -> tuple[Doubles, Doubles]:
     """Move derivatives of parameters tied to a leader to the leader's coordinate."""
     for index in np.flatnonzero(leader != np.arange(len(leader))):
         matrix[leader[index]] += matrix[index]
@@ -239,13 +241,13 @@ def fit_grey_box(
     fit, parts = twin.spec.fit, (train, validation)
     progress = _Progress(sum(fit.rounds) + (fit.starts - 1) * fit.rounds[0] + fit.final_rounds, on_event)
     if tie is not None or twin.spec.stretches or not fit.final_rounds:
-        return _fitted(GreyProblem(twin, train, tie), parts, seed, progress)
+        return _fit_form(GreyProblem(twin, train, tie), parts, seed, progress)
     coarse = GreyProblem(twin.with_stretches(STRETCHES[0]), train)
-    stages = _fitted(coarse, parts, seed, progress, final=False)
+    stages = _fit_form(coarse, parts, seed, progress, final=False)
     # Final rounds of a coarser form remember too well what it made of the logs: a finer one begins before them.
     begin, share, best = stages, 1.0 - fit.memory, stages
     for stretches in STRETCHES:
-        tried = _continued(begin, stretches, (share, parts, seed), progress)
+        tried = _refine(begin, stretches, (share, parts, seed), progress)
         progress.total += fit.final_rounds
         history, better = best.history + tried.history, tried.error < (1.0 - LEAST_GAIN) * best.error
         best = replace(tried if better else best, history=history, seconds=progress.seconds)
@@ -257,7 +259,7 @@ def fit_grey_box(
     return best
 
 
-def _continued(before: GreyFit, stretches: int, how: tuple[float, Any, int], progress: _Progress) -> GreyFit:
+def _refine(before: GreyFit, stretches: int, how: tuple[float, Any, int], progress: _Progress) -> GreyFit:
     """Run the final rounds with a finer curve; `how`: weight of the earlier information, parts and seed.
 
     Rounds that remember one another know several times what one does; the share makes it one round's.
@@ -266,10 +268,10 @@ def _continued(before: GreyFit, stretches: int, how: tuple[float, Any, int], pro
     begun = before.twin.with_stretches(stretches)
     by_finer = coarse_by_fine(before.twin.table, begun.table)
     problem = GreyProblem(begun, parts[0], carried=share * by_finer.T @ before.information @ by_finer)
-    return _fitted(problem, parts, seed + stretches, progress)
+    return _fit_form(problem, parts, seed + stretches, progress)
 
 
-def _fitted(
+def _fit_form(
     problem: GreyProblem,
     parts: tuple[Sequence[Series], Sequence[Series]],
     seed: int,
@@ -290,7 +292,7 @@ def _fitted(
             # The last round of a stage is judged, whatever its number.
             if number != len(lengths) and number % spec.validate_every and length_s == lengths[number]:
                 continue
-            judge.twin = twin.with_numbers(problem.numbers(path.theta))
+            judge.twin = twin.with_parameters(problem.numbers(path.theta))
             better = path.judge(judge.error()) and path.least <= min(other.least for other in paths)
             moved = float(np.sqrt(np.mean((path.theta - before) ** 2)))
             row = {"update": progress.done, "start": path.number, "length_s": length_s, "validation": path.error}
@@ -307,7 +309,7 @@ def _fitted(
         chosen = min(paths, key=lambda path: path.least)
         advance(chosen, rounds[spec.rounds[0] :])
     advance(chosen, rounds[-1:] * (spec.final_rounds if final else 0), True)
-    end = twin.with_numbers(problem.numbers(chosen.best))
+    end = twin.with_parameters(problem.numbers(chosen.best))
     return GreyFit(end, history, progress.seconds, chosen.information, chosen.best, chosen.least)
 
 

@@ -56,15 +56,15 @@ def fit_ground(
     """
     started = time.process_time()
     check_grounded(twin)
-    parts = {"train": [logged_forces(twin, one) for one in train]}
-    parts["validation"] = [logged_forces(twin, one) for one in validation]
+    parts = {"train": [read_forces(twin, one) for one in train]}
+    parts["validation"] = [read_forces(twin, one) for one in validation]
     law = GROUNDS[kind].fitted(twin, parts["train"], machine)
     shares = {part: law.explained(twin, logs) if logs else float("nan") for part, logs in parts.items()}
     explained = {part: share if np.isfinite(share) else None for part, share in shares.items()}
     return FittedGround(law, explained, time.process_time() - started)
 
 
-def logged_forces(twin: GreyTwin, series: Series) -> Log:
+def read_forces(twin: GreyTwin, series: Series) -> Log:
     """Strokes (m), velocities (m/s) and forces (N) against each actuator ``(tick, actuator)`` along a log.
 
     Forces are `DisturbanceObserver`'s, told all channels tick by tick; ticks of the prefix have no row.

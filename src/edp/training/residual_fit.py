@@ -77,8 +77,8 @@ def fit_residual(
     """
     spec = residual_spec(form, training)
     ticks = round(spec.validation_s * twin.channels.rate_hz)
-    grey_error = FreeRunValidation(twin.without_network(), validation, ticks, spec.lanes).error()
+    grey_error = FreeRunValidation(twin.drop_network(), validation, ticks, spec.lanes).error()
     fitted = fit_free_runs(twin, train, validation, spec, on_event, run)
     error = min(row["validation"] for row in fitted.history)
-    chosen = twin if error < grey_error else twin.without_network()
+    chosen = twin if error < grey_error else twin.drop_network()
     return ResidualFit(chosen, fitted.history, fitted.seconds, grey_error, error)

@@ -26,14 +26,14 @@ from edp.storage.runs import missing_text
 from edp.storage.seals import HASH
 from edp.training.bundle import (
     Bundle,
-    as_damage,
+    add_plugins,
     channel_from_plain,
     channel_to_plain,
     check_hash,
+    convert_damage,
     read_arrays,
     remove_old_arrays,
     sealed_header,
-    with_plugins,
     write_arrays,
 )
 
@@ -133,7 +133,7 @@ def save_twin(bundle: TwinBundle, folder: str | Path) -> Path:
     }
     if bundle.ground is not None:
         header["ground"] = {"kind": GROUNDS.name_of(bundle.ground), **bundle.ground.plain()}
-    write_json(path / HEADER, with_plugins(header))
+    write_json(path / HEADER, add_plugins(header))
     remove_old_arrays(path, ("weights",), (entry["file"],))
     return path
 
@@ -154,7 +154,7 @@ def twin_hash(folder: str | Path) -> str:
         BundleError: the header was damaged or changed.
     """
     path = _twin_folder(folder)
-    with as_damage(path):
+    with convert_damage(path):
         header = read_header(path / HEADER, (HASH,))
         check_hash(header, path / HEADER)
         return str(header[HASH])
@@ -177,12 +177,12 @@ def load_twin(folder: str | Path) -> TwinBundle:
     path = _twin_folder(folder)
     if not is_entry_at(path / HEADER):
         raise BundleError(missing_text(path, "twin", "a twin"))
-    with as_damage(path):
+    with convert_damage(path):
         header = sealed_header(path / HEADER, "twin", READABLE, "train again")
-        return _assembled(header, path)
+        return _assemble(header, path)
 
 
-def _assembled(header: Table, path: Path) -> TwinBundle:
+def _assemble(header: Table, path: Path) -> TwinBundle:
     parts = {part: tuple(channel_from_plain(entry) for entry in header["channels"][part]) for part in PARTS}
     channels = TwinChannels(**parts, rate_hz=float(header["rate_hz"]))
     spec = _TREE.build(_Form, {"twin": header["twin"]}, f"'{path / HEADER}'").twin

@@ -9,7 +9,7 @@ from edp.networks.twin import TWINS, fit_scales
 from edp.networks.twin.recurrent import Recurrent
 from edp.storage.runs import KeyedRun, Run
 from edp.testing.twins import sample_series
-from edp.training.free_run import FreeRunDiverged, FreeRunSampler, FreeRunSpec, fit_free_runs, measured_ports
+from edp.training.free_run import FreeRunDiverged, FreeRunSampler, FreeRunSpec, draw_measured_ports, fit_free_runs
 from edp.training.optimizers import AdamW, Soap
 
 SMALL = {"lanes": 16, "lengths_s": (0.2, 1.0), "updates": (150, 100), "validate_every": 50, "validation_s": 5.0}
@@ -111,13 +111,13 @@ def test_stretches_lie_within_recordings_and_begin_everywhere(data):
     owners = np.searchsorted(np.cumsum([s.samples for s in train]), rows, side="right")
     assert (owners == owners[0]).all()
     assert set(rows[0]) == {s * 600 + t for s in range(4) for t in range(600 - 25)}
-    expected = twin.scaled_commands(train[2].inputs)
+    expected = twin.scale_commands(train[2].inputs)
     assert np.array_equal(sampler.commands[1200:1800], expected)
 
 
 def test_ports_are_measured_by_their_shares():
     spec = FreeRunSpec(measured_share=0.25, mixed_share=0.25)
-    ports = measured_ports(spec, (30, 4000, 6), 10, np.random.default_rng(0))
+    ports = draw_measured_ports(spec, (30, 4000, 6), 10, np.random.default_rng(0))
     assert (ports[0] == 1).all()
     later = ports[10:]
     assert (later == later[:1]).all()

@@ -22,9 +22,9 @@ from edp.networks.twin.lumped.parts import (
     TankElement,
     check_parts,
     default_parts,
-    lumped_numbers,
+    list_lumped_parameters,
 )
-from edp.networks.twin.lumped.run import Values, Wiring, free_run, measured_run
+from edp.networks.twin.lumped.run import Values, Wiring, free_run, simulate_measured
 from edp.networks.twin.scales import Array, TwinScales
 from edp.settings.bounds import MOST_UPDATES, check_bounds, check_count, integer, span
 
@@ -79,7 +79,7 @@ class ElementsBox:
 
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> ElementsTwin:
         """Return a twin with typical parameters."""
-        numbers = [n.nominal for n in lumped_numbers(self.parts(channels), channels, scales)]
+        numbers = [n.nominal for n in list_lumped_parameters(self.parts(channels), channels, scales)]
         return self.build(channels, scales, {"numbers": np.array(numbers, np.float32)})
 
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
@@ -102,7 +102,7 @@ class ElementsTwin(Twin):
     def __init__(self, channels: TwinChannels, scales: TwinScales, spec: ElementsBox, numbers: Doubles) -> None:
         super().__init__(channels, scales, spec.prefix_ticks)
         self.spec, self.elements, self.numbers = spec, spec.parts(channels), numbers
-        self.table: list[LumpedNumber] = lumped_numbers(self.elements, channels, scales)
+        self.table: list[LumpedNumber] = list_lumped_parameters(self.elements, channels, scales)
         names = [c.name for c in channels.answers]
         self.columns = {name: i for i, name in enumerate(names)}
         self.inputs = {c.name: i for i, c in enumerate(channels.commands)}
@@ -110,7 +110,7 @@ class ElementsTwin(Twin):
         self.places = {(n.element, n.name): i for i, n in enumerate(self.table)}
         self.wiring = self._wiring()
 
-    def with_numbers(self, numbers: Doubles) -> ElementsTwin:
+    def with_parameters(self, numbers: Doubles) -> ElementsTwin:
         """Return the elements with other parameters, rounded to the stored precision."""
         rounded = numbers.astype(np.float32).astype(np.float64)
         return ElementsTwin(self.channels, self.scales, self.spec, rounded)
@@ -186,7 +186,7 @@ class ElementsTwin(Twin):
     def _run(self, commands: Array, measured: Array, state: TwinState) -> tuple[Array, TwinState]:
         answer, hidden = (np.array(state[name], np.float32, order="C") for name in ("answer", "hidden"))
         driven, read = (np.ascontiguousarray(part, np.float32) for part in (commands, measured))
-        answers = np.asarray(measured_run(self.numbers, driven, read, answer, hidden, self.wiring))
+        answers = np.asarray(simulate_measured(self.numbers, driven, read, answer, hidden, self.wiring))
         return answers, {"answer": answer, "hidden": hidden}
 
     def lower_answers(self, build: Builder, commands: str, fed: str) -> str:

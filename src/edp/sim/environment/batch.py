@@ -152,7 +152,7 @@ def checked_mode(what: str, num_envs: int, mode: Any) -> Any:
         raise ConfigError(f"{what}: autoreset_mode = {mode!r}; choose one of {modes}") from error
 
 
-def checked_mask(count: int, mask: Any) -> Bools:
+def check_mask(count: int, mask: Any) -> Bools:
     """Return the mask of environments that restart, shape ``(count,)``; all of them without a mask.
 
     Raises:
@@ -169,7 +169,7 @@ def checked_mask(count: int, mask: Any) -> Bools:
     return array
 
 
-def checked_seed(seed: Any) -> int | None:
+def check_seed(seed: Any) -> int | None:
     """Return a seed checked for Gymnasium.
 
     Raises:
@@ -191,11 +191,11 @@ def checked_seeds(count: int, seed: Any) -> list[int | None]:
     if seed is None:
         return [None] * count
     if isinstance(seed, int | np.integer):
-        first = checked_seed(seed)
+        first = check_seed(seed)
         return [None if first is None else first + index for index in range(count)]
     if len(seed) != count:
         raise ConfigError(f"reset: {len(seed)} seeds for {count} machines; give one for each, or one")
-    return [checked_seed(each) for each in seed]
+    return [check_seed(each) for each in seed]
 
 
 def checked_actions(actions: Any, shape: tuple[int, ...]) -> Array:

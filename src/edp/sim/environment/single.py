@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from edp.errors import ConfigError
 from edp.signals import Channel
-from edp.sim.environment.batch import EpisodeBatch, Infos, Options, check_render, checked_actions, checked_seed
+from edp.sim.environment.batch import EpisodeBatch, Infos, Options, check_render, check_seed, checked_actions
 from edp.sim.environment.library import gymnasium
 from edp.sim.environment.model import NominalMachine
 from edp.sim.environment.simulator import SimulatorBatch
@@ -53,7 +53,7 @@ class SingleEnvironment(gymnasium.Env[Observation, Observation]):
         Raises:
             ConfigError: an option is unknown or out of range.
         """
-        seed = checked_seed(seed)
+        seed = check_seed(seed)
         super().reset(seed=seed)
         facts = self._batch.begin(0, seed, self.np_random, options or {})
         self._idle = ""

@@ -14,7 +14,7 @@ from edp.sim.episodes.episodes import EpisodeStart
 from edp.sim.faults import fault_text
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import check_machine
-from edp.sim.machine.machine_files import family_member, known_mass
+from edp.sim.machine.machine_files import family_member, look_up_mass
 from edp.storage.reading import Table
 
 OF_SPEC = (
@@ -49,20 +49,20 @@ def episode_start(spec: EnvironmentSpec, seed: int, options: Options) -> tuple[E
     if overrides:
         spec = replace(spec, **overrides)
     scenario = spec.scenario(seed)
-    machine = _drawn(spec, seed) if spec.randomise is not False else scenario.load()
+    machine = _draw_machine(spec, seed) if spec.randomise is not False else scenario.load()
     if "oil_temperature" in options:
-        machine = _warmed(machine, options["oil_temperature"])
+        machine = _set_oil_temperature(machine, options["oil_temperature"])
     start = EpisodeStart(
         scenario, machine, spec.hand, spec.loop_latency, spec.lost_frames, _strokes(options.get("strokes"))
     )
     facts: Infos = {"seed": seed, "machine": machine.name, "material": spec.material}
     if spec.faults:
         facts["faults"] = "; ".join(map(fault_text, spec.faults))
-    mass_t = known_mass(machine.name)
+    mass_t = look_up_mass(machine.name)
     return start, facts if mass_t is None else {**facts, "mass_t": mass_t}
 
 
-def _drawn(spec: EnvironmentSpec, seed: int) -> Machine:
+def _draw_machine(spec: EnvironmentSpec, seed: int) -> Machine:
     """Return the random machine of the family for this seed."""
     low, high = spec.masses_t
     # A family of its own for each seed, so that its first member has any mass.
@@ -70,7 +70,7 @@ def _drawn(spec: EnvironmentSpec, seed: int) -> Machine:
     return family_member(family, 0, low, high, spec.spread)
 
 
-def _warmed(machine: Machine, celsius: Any) -> Machine:
+def _set_oil_temperature(machine: Machine, celsius: Any) -> Machine:
     try:
         warmed = replace(machine, oil=replace(machine.oil, temperature=float(celsius)))
     except (TypeError, ValueError) as error:

@@ -18,9 +18,9 @@ from edp.sim.environment.batch import (
     EpisodeBatch,
     Infos,
     Options,
+    check_mask,
     check_render,
     checked_actions,
-    checked_mask,
     checked_mode,
     checked_seeds,
 )
@@ -70,7 +70,7 @@ class VectorEnvironment(gymnasium.vector.VectorEnv[Observations, Observations, N
             ConfigError: an option or the number of seeds is not possible.
         """
         options = dict(options or {})
-        mask = checked_mask(self.num_envs, options.pop("reset_mask", None))
+        mask = check_mask(self.num_envs, options.pop("reset_mask", None))
         infos = self._begin(mask, checked_seeds(self.num_envs, seed), options, {})
         return self._batch.observation(ALL), {**infos, **self._batch.info(ALL)}
 

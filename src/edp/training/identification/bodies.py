@@ -125,7 +125,7 @@ def grey_load(
     return pull * MEGA * lever, inertia * lever[:, :, None] * lever[:, None]
 
 
-def solved_base(torque: Doubles, inertia: Doubles, poses: Poses, guess: Machine) -> Doubles:
+def solve_base(torque: Doubles, inertia: Doubles, poses: Poses, guess: Machine) -> Doubles:
     """Return the nine base parameters that best match gravity torques and joint inertia over the poses.
 
     Args:
@@ -149,7 +149,7 @@ def solved_base(torque: Doubles, inertia: Doubles, poses: Poses, guess: Machine)
     return np.asarray(size * np.linalg.lstsq(matrix * size, goal, rcond=None)[0])
 
 
-def linked_bodies(load: Doubles, guess: Machine) -> Bodies:
+def convert_bodies(load: Doubles, guess: Machine) -> Bodies:
     """Return the bodies of a grey box with a known linkage from its load parameters; lengths are the guess's."""
     mass, x, y, inertia = load.reshape(-1, BODY_VALUES).T * np.array([[GIGA], [1.0], [1.0], [GIGA]])
     return replace(guess.bodies, mass=_triple(mass), com_x=_triple(x), com_y=_triple(y), inertia=_triple(inertia))
@@ -171,7 +171,7 @@ def realised(base: Doubles, guess: Machine) -> Bodies:
 
     def apart(logarithms: Doubles) -> Doubles:
         mass = np.array(own.mass) * np.exp(logarithms)
-        x, y, inertia = _given_masses(base, mass, length)
+        x, y, inertia = _compute_centres(base, mass, length)
         share = inertia / (mass * length**2) / spin
         # A steep line below a tenth: what is negative is further away than any proportion, but finite.
         bent = np.where(share > 0.1, np.log(np.maximum(share, 0.1)), np.log(0.1) - 100.0 * (0.1 - share))
@@ -179,7 +179,7 @@ def realised(base: Doubles, guess: Machine) -> Bodies:
         return np.concatenate([logarithms / NEAR[0], moved, bent / NEAR[3]])
 
     mass = np.array(own.mass) * np.exp(least_squares(apart, np.zeros(3), xtol=1e-14, ftol=1e-14, gtol=1e-14).x)
-    x, y, inertia = _given_masses(base, mass, length)
+    x, y, inertia = _compute_centres(base, mass, length)
     if not (inertia > 0.0).all():
         worst = int(np.argmin(inertia))
         raise ConfigError(
@@ -191,7 +191,7 @@ def realised(base: Doubles, guess: Machine) -> Bodies:
     return replace(own, mass=_triple(mass), com_x=_triple(x), com_y=_triple(y), inertia=_triple(inertia))
 
 
-def _given_masses(base: Doubles, mass: Doubles, length: Doubles) -> tuple[Doubles, Doubles, Doubles]:
+def _compute_centres(base: Doubles, mass: Doubles, length: Doubles) -> tuple[Doubles, Doubles, Doubles]:
     """Centres of gravity and inertias about them, of bodies with these masses."""
     behind = np.array([mass[1] + mass[2], mass[2], 0.0])
     x, y = (base[[0, 2, 4]] - behind * length) / mass, base[[1, 3, 5]] / mass

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from edp.networks.twin.grey.parameters import ParameterTable
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import BOUNDS
-from edp.training.identification.machine_numbers import MACHINE_NUMBERS, guesses, with_values
+from edp.training.identification.machine_numbers import MACHINE_NUMBERS, guesses, set_values
 from edp.training.identification.mapping import GreyParts, grey_numbers
 
 Doubles = NDArray[np.float64]
@@ -83,7 +83,7 @@ class MachineTie:
 
     def machine(self, theta: Doubles) -> Machine:
         """Return the machine for these coordinates; fixed parameters equal the guess, zeros included."""
-        return with_values(self.base, self._values(theta))
+        return set_values(self.base, self._values(theta))
 
     def _values(self, theta: Doubles) -> Doubles:
         own = np.clip(theta[: len(MACHINE_NUMBERS)], -FARTHEST, FARTHEST)
@@ -175,7 +175,7 @@ def deviations(information: Doubles) -> Doubles:
     return np.asarray(np.sqrt(np.diag(np.linalg.inv(information + np.eye(len(information))))))
 
 
-def kept_back(theta: Doubles, information: Doubles, back: NDArray[np.bool_]) -> Doubles:
+def fix_coordinates(theta: Doubles, information: Doubles, back: NDArray[np.bool_]) -> Doubles:
     """Return the optimum of the quadratic for the other coordinates after some are reset to the guess.
 
     Args:

@@ -34,13 +34,13 @@ from edp.storage.arrays import ArrayRule, checked_arrays
 from edp.storage.paths import is_file_at
 from edp.storage.runs import missing_text
 from edp.training.bundle import (
-    as_damage,
+    add_plugins,
     channel_from_plain,
     channel_to_plain,
+    convert_damage,
     read_arrays,
     remove_old_arrays,
     sealed_header,
-    with_plugins,
     write_arrays,
 )
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
@@ -127,7 +127,7 @@ def keep_controller(
         "twin": twin is not None,
         "arrays": entry,
     }
-    write_json(folder / HEADER, with_plugins(header))
+    write_json(folder / HEADER, add_plugins(header))
     remove_old_arrays(folder, ("arrays",), (entry["file"],))
     return folder
 
@@ -144,7 +144,7 @@ def load_kept(run: str | Path) -> KeptController:
     folder = path / KEPT
     if not is_file_at(folder / HEADER):
         raise StorageError(missing_text(path, "control", "a run of edp control, or is one of an earlier version"))
-    with as_damage(folder):
+    with convert_damage(folder):
         header = sealed_header(folder / HEADER, "controller", (SCHEMA,), "run edp control again")
         channels = tuple(channel_from_plain(entry) for entry in header["channels"])
         arrays = load_arrays(read_arrays(folder, header["arrays"]))

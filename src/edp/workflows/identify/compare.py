@@ -66,11 +66,11 @@ class MeasuredRuns:
         state = twin.reset(self.commands[:, : self.prefix], self.truth[:, : self.prefix])
         return twin.rollout(self.commands[:, self.prefix :], state)[0]
 
-    def by_machine(self, machine: Machine, front: FrontChannels) -> NDArray[np.float32]:
+    def group_by_machine(self, machine: Machine, front: FrontChannels) -> NDArray[np.float32]:
         """Answers of a machine of the simulator: placed at each measured tick of the prefix, then on its own."""
         answers = np.empty((len(self.names), self.commands.shape[1] - self.prefix, self.truth.shape[2]), np.float32)
         for run, (commands, truth) in enumerate(zip(self.commands, self.truth, strict=True)):
-            answers[run] = _driven(machine, front, commands, truth, self.prefix)
+            answers[run] = _simulate(machine, front, commands, truth, self.prefix)
         return answers
 
 
@@ -124,7 +124,7 @@ class FrontChannels:
         return np.where(places >= 0, row[places], np.nan).astype(np.float64)
 
 
-def _driven(
+def _simulate(
     machine: Machine, front: FrontChannels, commands: NDArray[np.float32], truth: NDArray[np.float32], prefix: int
 ) -> NDArray[np.float32]:
     """Return answers ``(tick, answer)`` after the prefix."""

@@ -38,7 +38,7 @@ from edp.storage.paths import is_there
 from edp.storage.provenance import PROVENANCE
 from edp.storage.runs import Run, check_claimable, run_key
 from edp.training.grey_fit import GreyProblem, fit_grey_box
-from edp.training.identification.bodies import Poses, linked_bodies, realised
+from edp.training.identification.bodies import Poses, convert_bodies, realised
 from edp.training.identification.elements import (
     NO_MOTORS,
     check_same_linkage,
@@ -52,13 +52,13 @@ from edp.training.identification.machine_text import machine_text
 from edp.training.identification.mapping import GreyParts
 from edp.training.identification.rows import TOLD, IdentifiedNumber, body_rows, line_comments, number_rows
 from edp.training.identification.stability import covariance
-from edp.training.identification.tie import MachineTie, deviations, kept_back, nearest
+from edp.training.identification.tie import MachineTie, deviations, fix_coordinates, nearest
 from edp.training.progress_steps import free_run_steps
 from edp.training.provenance import training_provenance
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 from edp.wording import percent, typed
 from edp.workflows.identify.compare import FrontChannels, MeasuredRuns
-from edp.workflows.twin.prepare_twin import prepared_twin
+from edp.workflows.twin.prepare_twin import cut_recordings
 
 Doubles = NDArray[np.float64]
 KIND, RUN, RESULT, GREY_FOLDER = "identification", ".run", "identification.json", "grey"
@@ -143,7 +143,7 @@ def identify(
     base = load_machine(machine)
     progress.note("reading logs")
     recordings = source.read()
-    loaded = None if run is None else _of_run(run)
+    loaded = None if run is None else _read_run(run)
     settings = experiment or load_twin_experiment(None, ["twin.kind=greybox"])
     settings = loaded[1] if loaded is not None else settings
     grey = _whole_grey_box(settings.twin)
@@ -152,7 +152,7 @@ def identify(
             f"settings: twin.linkage = '{grey.linkage[:80]}' came; the linkage is that of --machine ({base.name}): "
             "leave twin.linkage out"
         )
-    channels, data = prepared_twin(recordings, settings)
+    channels, data = cut_recordings(recordings, settings)
     _check_strokes(channels, data, base)
     # What could not be judged, or holds no number, is refused before the fit of minutes.
     celsius, notes = _celsius(recordings, base)
@@ -164,13 +164,13 @@ def identify(
     key = run_key({"identify": TWIN_SETTINGS.plain(settings)} | made_of, data.digest)
     with Run.create(target.with_suffix(RUN), KIND, key, twin_toml(settings)) as opened:
         if loaded is None:
-            fitted = _fitted(opened, base, machine, grey, (channels, data, settings.training.seed), progress)
+            fitted = _fit_grey_box(opened, base, machine, grey, (channels, data, settings.training.seed), progress)
         else:
-            fitted = _informed(loaded[0], data, settings.training.seed)
+            fitted = _add_information(loaded[0], data, settings.training.seed)
         parts = parts_of(fitted.twin, fitted.elements, base, celsius)
         notes += _notes(parts)
         progress.note("fitting the machine itself to free runs")
-        fit = _refined(opened, base, parts, fitted, (data, settings), progress)
+        fit = _refine_machine(opened, base, parts, fitted, (data, settings), progress)
         progress.note("asking what parts of the logs, and runs of other lengths, would say")
         spread = _stage(
             opened,
@@ -273,7 +273,7 @@ def _whole_grey_box(spec: TwinSpec | AutoTwin) -> GreyBox:
     return spec
 
 
-def _of_run(run: str | Path) -> tuple[GreyTwin, TwinExperiment]:
+def _read_run(run: str | Path) -> tuple[GreyTwin, TwinExperiment]:
     bundle = load_twin(run)
     if not isinstance(bundle.twin, GreyTwin):
         raise ConfigError(
@@ -284,7 +284,7 @@ def _of_run(run: str | Path) -> tuple[GreyTwin, TwinExperiment]:
     return bundle.twin, replace(load_twin_experiment(Path(run) / "config.toml"), twin=bundle.spec)
 
 
-def _fitted(
+def _fit_grey_box(
     run: Run, base: Machine, machine: str, spec: GreyBox, logs: tuple[TwinChannels, Prepared, int], progress: Progress
 ) -> _Fitted:
     """Return a grey box with the elements of an excavator front, fitted to the logs; `logs` ends with the seed.
@@ -312,7 +312,7 @@ def _fitted(
     return _Fitted(grey, elements, _read_stage(run, GREY_STAGE, {"information": (count, count)})["information"])
 
 
-def _informed(twin: GreyTwin, data: Prepared, seed: int) -> _Fitted:
+def _add_information(twin: GreyTwin, data: Prepared, seed: int) -> _Fitted:
     """Return an earlier grey box with the information of free runs of its last stage."""
     problem, spec = GreyProblem(twin, data.train), twin.spec.fit
     rng, total = np.random.default_rng(seed), np.zeros((len(twin.numbers),) * 2)
@@ -323,7 +323,7 @@ def _informed(twin: GreyTwin, data: Prepared, seed: int) -> _Fitted:
     return _Fitted(twin, twin.spec.elements(twin.channels), total / ROUNDS_THAT_INFORM)
 
 
-def _refined(
+def _refine_machine(
     run: Run,
     base: Machine,
     parts: GreyParts,
@@ -366,7 +366,7 @@ def _machine(fit: _Tied, spread: Doubles, data: Prepared) -> tuple[Machine, list
     excited = deviations(information)[:count] < UNEXCITED
     back = np.concatenate([~excited, np.zeros(len(theta) - count, np.bool_)])
     final = replace(tie, free=excited)
-    settled = kept_back(theta, information, back)
+    settled = fix_coordinates(theta, information, back)
     machine, load = final.machine(settled), tie.load_at(settled)
     valves = machine.valves
     missing = np.array(tie.parts.conflux) < 0
@@ -382,7 +382,7 @@ def _machine(fit: _Tied, spread: Doubles, data: Prepared) -> tuple[Machine, list
     nine, body = body_rows(tie, load, spread[count:, count:], twin.wiring.z_of, poses)
     numbers = number_rows(tie.base, machine, left[:count], excited)
     if tie.parts.table.front is not None:
-        return replace(machine, bodies=linked_bodies(load, tie.base)), numbers + body, []
+        return replace(machine, bodies=convert_bodies(load, tie.base)), numbers + body, []
     try:
         return replace(machine, bodies=realised(nine, tie.base)), numbers + body, []
     except ConfigError as error:
@@ -441,8 +441,8 @@ def _scores(
     floor: TwinSpec = replace(TWINS["static"](), prefix_ticks=twin.prefix_ticks)
     static = floor.start(twin.channels, twin.scales, data.train, settings.training.seed)
     answers = {
-        MACHINE: runs.by_machine(machines[1], front),
-        f"machine {machines[0].name}": runs.by_machine(machines[0], front),
+        MACHINE: runs.group_by_machine(machines[1], front),
+        f"machine {machines[0].name}": runs.group_by_machine(machines[0], front),
         GREY: runs.by_twin(twin),
         "static map": runs.by_twin(static),
     }

@@ -18,7 +18,7 @@ from edp.evaluation.guard import free_run_error
 from edp.networks.twin import TWINS, Twin
 from edp.networks.twin.model_selection import AutoTwin
 from edp.networks.twin.recurrent import RecurrentTwin, averaged, member_seed
-from edp.networks.twin.recurrent_members import scales_for, separated, with_scales
+from edp.networks.twin.recurrent_members import replace_scales, scales_for, separated
 from edp.networks.twin.static_map import StaticMap, StaticTwin
 from edp.settings.tree import Table
 from edp.storage.runs import PARTS, KeyedRun
@@ -163,11 +163,11 @@ class ContinuedTwin:
         start = self.start.twin
         scales = scales_for(start, self.fit.scales, self.fit.data.train)
         # End stops are the machine's: the twin as it is has those of these recordings, too.
-        as_it_is = with_scales(start, scales)
+        as_it_is = replace_scales(start, scales)
         fits = [FittedTwin(as_it_is, [], 0.0)]
         tried = [TwinCandidate("the twin as it is", 0.0, error=self._error(as_it_is))]
         for share in SHARES:
-            fit = self._trained(as_it_is, share)
+            fit = self._train_members(as_it_is, share)
             label = f"{round(share * sum(self.fit.experiment.training.updates)):,} further updates"
             fits.append(fit)
             tried.append(TwinCandidate(label, fit.seconds, error=self._error(fit.twin)))
@@ -179,7 +179,7 @@ class ContinuedTwin:
         fitted = replace(fits[best], seconds=sum(one.seconds for one in tried))
         return FittedFormulation(self.start.bundle.spec, fitted, facts=self.start.provenance()), tried
 
-    def _trained(self, start: RecurrentTwin, share: float) -> FittedTwin:
+    def _train_members(self, start: RecurrentTwin, share: float) -> FittedTwin:
         """Train each member further from its start, and average them again."""
         training = shortened(self.fit.experiment.training, share)
         train, validation = self.fit.data.train, self.fit.data.validation
@@ -195,7 +195,7 @@ class ContinuedTwin:
         fits = list(self.fit.train_members(jobs, self.fit.on_event))
         twins = [fit.twin for fit in fits if isinstance(fit.twin, RecurrentTwin)]
         # One network of members that read one another stays the average that it was said to be.
-        joined = averaged(twins) if len(twins) > 1 else _with_members(twins[0], start.members)
+        joined = averaged(twins) if len(twins) > 1 else _set_members(twins[0], start.members)
         several = len(fits) > 1
         history = [row | ({"member": n} if several else {}) for n, fit in enumerate(fits) for row in fit.history]
         return FittedTwin(joined, history, sum(fit.seconds for fit in fits))
@@ -216,6 +216,6 @@ class ContinuedTwin:
         return spec.start(twin.channels, twin.scales, self.fit.data.train, 0)
 
 
-def _with_members(twin: RecurrentTwin, members: int) -> RecurrentTwin:
+def _set_members(twin: RecurrentTwin, members: int) -> RecurrentTwin:
     parts = (twin.channels, twin.scales, twin.prefix_ticks, twin.network, twin.static)
     return twin if twin.members == members else RecurrentTwin(*parts, members)

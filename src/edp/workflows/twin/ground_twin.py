@@ -20,7 +20,7 @@ from edp.storage.runs import Run, run_key
 from edp.training.ground_fit import fit_ground
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin, twin_hash
 from edp.workflows.twin.continue_twin import BaseTwin
-from edp.workflows.twin.prepare_twin import prepared_twin
+from edp.workflows.twin.prepare_twin import cut_recordings
 
 FOLDER, DATASHEET = "twin", "datasheet"
 JUDGED = (FreeRunFile.NAME, RUNS, StepResponses.NAME)
@@ -58,7 +58,7 @@ def ground_twin(
     base, linkage = _base(start)
     experiment = base.settled(experiment)
     progress.note("reading recordings")
-    channels, data = prepared_twin(source.read(), experiment)
+    channels, data = cut_recordings(source.read(), experiment)
     base.check(channels, data.train)
     key = run_key({"twin": TWIN_SETTINGS.plain(experiment), "from": base.digest}, data.digest)
     with Run.create(out, "twin", key, twin_toml(experiment)) as run:
@@ -67,13 +67,13 @@ def ground_twin(
         progress.note(f"fitting the ground '{experiment.ground}' to forces along the logs")
         twin = check_grounded(base.bundle.twin)
         fitted = fit_ground(experiment.ground, twin, data.train, data.validation, linkage)
-        rows = [*_known_rows(base.folder), *fitted.law.rows()]
+        rows = [*_read_datasheet_rows(base.folder), *fitted.law.rows()]
         basis = f"{BASIS}; {GROUND_BASIS}"
         write_json(run.file(f"{DATASHEET}.json"), {"schema": 1, "basis": basis, "numbers": rows})
         write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(rows, basis).encode())
         contact = {"source": source.label, "digest": data.digest}
         facts = fitted.facts() | base.provenance() | {"ground_data": contact}
-        bundle = replace(base.bundle, ground=fitted.law, provenance=base.bundle.provenance.with_entries(**facts))
+        bundle = replace(base.bundle, ground=fitted.law, provenance=base.bundle.provenance.add_entries(**facts))
         for name in JUDGED:
             # In free air it is the twin that was judged there, so its page needs no evaluation of its own.
             if is_file_at(base.folder / name):
@@ -102,7 +102,7 @@ def _base(start: str | Path | None) -> tuple[BaseTwin, str]:
     return BaseTwin(Path(start), bundle, twin_hash(start)), bundle.spec.linkage
 
 
-def _known_rows(run: Path) -> list[dict[str, object]]:
+def _read_datasheet_rows(run: Path) -> list[dict[str, object]]:
     """Return the datasheet rows of a run; none without a datasheet."""
     file = run / f"{DATASHEET}.json"
     if not is_file_at(file):

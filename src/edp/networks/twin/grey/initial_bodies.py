@@ -28,7 +28,7 @@ def balance_columns(table: ParameterTable, rows: Array) -> Array:
     return np.moveaxis(forces_by_moments(strokes, speeds, pulls, table.linkage), 0, 1)
 
 
-def balanced_bodies(table: ParameterTable, matrix: Array, goal: Array) -> tuple[Array, Array]:
+def balance_bodies(table: ParameterTable, matrix: Array, goal: Array) -> tuple[Array, Array]:
     """Return parameters whose bodies balance the forces within plausible limits, and the other linear parameters.
 
     Args:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from edp.data.series import Series
 from edp.networks.twin.grey import parameter_index as at
-from edp.networks.twin.grey.initial_bodies import balance_columns, balanced_bodies
+from edp.networks.twin.grey.initial_bodies import balance_bodies, balance_columns
 from edp.networks.twin.grey.parameters import ParameterTable
 
 Array = NDArray[np.float64]
@@ -74,10 +74,10 @@ def load_start(
         goal[i] /= size
     flat = matrix.reshape(-1, matrix.shape[2]), goal.reshape(-1)
     if table.front is not None:
-        values, others = balanced_bodies(table, *flat)
-        return _with_friction(table, others, declared, values)
+        values, others = balance_bodies(table, *flat)
+        return _insert_friction(table, others, declared, values)
     solution = _ridge(*flat)
-    return _taken(table, solution, declared, values)
+    return _insert_solution(table, solution, declared, values)
 
 
 def _load_columns(table: ParameterTable, rows: Array, z_of: tuple[Array, Array]) -> Array:
@@ -104,7 +104,7 @@ def _entries(n: int) -> list[tuple[int, int]]:
     return [(a, c) for a in range(n) for c in range(a + 1)]
 
 
-def _taken(table: ParameterTable, solution: Array, declared: Sequence[bool], values: Array) -> Array:
+def _insert_solution(table: ParameterTable, solution: Array, declared: Sequence[bool], values: Array) -> Array:
     """Insert the solution into the parameters where it is plausible."""
     n = len(table.actuator_at)
     inertia = _entries(n)
@@ -120,10 +120,10 @@ def _taken(table: ParameterTable, solution: Array, declared: Sequence[bool], val
         values[table.inertia_at + k * table.inertia_terms] = low[p, r]
     potential = len(table.exponents) - 1
     values[table.potential_at : table.potential_at + potential] = solution[len(inertia) : len(inertia) + potential]
-    return _with_friction(table, solution[len(inertia) + potential :], declared, values)
+    return _insert_friction(table, solution[len(inertia) + potential :], declared, values)
 
 
-def _with_friction(table: ParameterTable, solution: Array, declared: Sequence[bool], values: Array) -> Array:
+def _insert_friction(table: ParameterTable, solution: Array, declared: Sequence[bool], values: Array) -> Array:
     """Insert friction and rod areas into the parameters where they are plausible."""
     for i in range(len(table.actuator_at)):
         a, own = table.actuator_at[i], 3 * i

@@ -169,7 +169,7 @@ def check_parts(parts: Parts, channels: TwinChannels) -> None:
             )
 
 
-def lumped_numbers(parts: Parts, channels: TwinChannels, scales: TwinScales) -> list[LumpedNumber]:
+def list_lumped_parameters(parts: Parts, channels: TwinChannels, scales: TwinScales) -> list[LumpedNumber]:
     """Return all parameters in a fixed order (tanks, masses, lags), with typical values from the channel scales."""
     answers = [c.name for c in channels.answers]
     commands = {c.name: float(w) for c, w in zip(channels.commands, scales.command_width, strict=True)}
