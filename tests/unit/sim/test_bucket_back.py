@@ -10,15 +10,16 @@ from edp.sim import Scenario, Simulation, load_machine
 from edp.sim.machine import layout as at
 from edp.sim.physics import bucket_back, ground_profile, soil
 from edp.sim.physics import terramechanics as tm
+from edp.sim.physics.material import load_material, material_names
 from edp.sim.physics.plant import Plant
 from edp.sim.physics.pose import Kinematics
 
-MATERIALS = soil.material_names()
+MATERIALS = material_names()
 
 
 def ground(push, name="sandy_loam", friction_deg=10.0, seed=0):
     changes = {"back_push": push, "back_friction_deg": friction_deg if push else 0.0}
-    material = dataclasses.replace(soil.load_material(name), **changes)
+    material = dataclasses.replace(load_material(name), **changes)
     return soil.Ground(material, load_machine("M22"), np.random.default_rng(seed))
 
 
@@ -188,4 +189,4 @@ def test_a_snapshot_goes_on_to_the_bit(tmp_path):
 )
 def test_what_cannot_be_is_refused(changes, says):
     with pytest.raises(ConfigError, match=says):
-        dataclasses.replace(soil.load_material("clay"), **changes)
+        dataclasses.replace(load_material("clay"), **changes)
