@@ -24,7 +24,7 @@ from safetensors.numpy import load, save
 
 from edp.errors import BundleError
 from edp.networks.predictor import Predictor
-from edp.storage import object_with, parse_json, read_bytes, write_bytes
+from edp.storage import object_with, parse_json, read_bytes
 from edp.training.bundle import weights_digest
 
 SCHEMA = 1
@@ -222,15 +222,6 @@ def with_delta(base: Predictor, delta: Delta) -> Predictor:
             state[name].copy_((state[name].double() + added).to(state[name].dtype))
     network.load_state_dict(state)
     return network.eval()
-
-
-def write_delta(path: str | Path, delta: Delta) -> None:
-    """Write a delta, whole or not at all.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
-    write_bytes(Path(path), delta.to_bytes())
 
 
 def read_delta(path: str | Path) -> Delta:
