@@ -22,14 +22,19 @@ from edp.training.identification.bodies import (
     base_parameters,
     grey_load,
     load_by_base,
-    realised,
-    solved_base,
+    realise_bodies,
+    solve_base,
 )
 from edp.training.identification.elements import check_strokes, excavator_elements, full_commands
 from edp.training.identification.machine_numbers import MACHINE_NUMBERS, guesses, with_values
 from edp.training.identification.machine_text import machine_text
 from edp.training.identification.mapping import GreyParts, grey_numbers
-from edp.training.identification.parametrisation import CUSHIONS, MachineParametrisation, kept_back, nearest_machine
+from edp.training.identification.parametrisation import (
+    CUSHIONS,
+    MachineParametrisation,
+    nearest_machine,
+    reset_to_guess,
+)
 
 M22 = load_machine("M22")
 PILOTS = ("BmUp", "BmDwn", "AmIn", "AmOut", "BktIn", "BktOut")
@@ -89,7 +94,7 @@ def test_what_the_data_do_not_tell_stays_at_the_guess(parts):
 def test_a_number_set_back_moves_those_that_make_up_for_it():
     information = np.array([[50.0, 49.0], [49.0, 50.0]])
     theta = np.array([0.5, -0.5])
-    moved = kept_back(theta, information, np.array([False, True]))
+    moved = reset_to_guess(theta, information, np.array([False, True]))
     # What matters is the sum, which the first one now gives alone, but for what was thought before.
     assert moved == pytest.approx([0.5 + 49.0 / 51.0 * -0.5, 0.0])
     assert posterior_deviations(np.diag([0.0, 99.0])) == pytest.approx([1.0, 0.1])
@@ -143,17 +148,17 @@ def test_inertia_and_gravity_are_linear_in_the_nine_numbers(poses):
 def test_bodies_come_back_from_inertia_and_gravity(poses):
     by_torque, by_inertia = load_by_base(poses, M22.bodies.length, M22.gravity)
     nine = base_parameters(M22.bodies)
-    assert solved_base(by_torque @ nine, by_inertia @ nine, poses, M22) == pytest.approx(nine, rel=1e-9)
-    bodies = realised(nine, M22)
+    assert solve_base(by_torque @ nine, by_inertia @ nine, poses, M22) == pytest.approx(nine, rel=1e-9)
+    bodies = realise_bodies(nine, M22)
     assert np.array(bodies.inertia) == pytest.approx(M22.bodies.inertia, rel=1e-6)
     heavy = replace(M22, bodies=replace(M22.bodies, mass=(2500.0, 700.0, 1200.0), com_y=(0.4, 0.2, 0.2)))
     # Other masses, the same motion; a guess that is far off changes what the poses tell by little.
-    assert base_parameters(realised(nine, heavy)) == pytest.approx(nine)
-    assert solved_base(by_torque @ nine, by_inertia @ nine, poses, heavy)[[0, 2, 4]] == pytest.approx(
+    assert base_parameters(realise_bodies(nine, heavy)) == pytest.approx(nine)
+    assert solve_base(by_torque @ nine, by_inertia @ nine, poses, heavy)[[0, 2, 4]] == pytest.approx(
         nine[[0, 2, 4]], rel=1e-3
     )
     with pytest.raises(ConfigError, match="no rigid bodies have the joint inertia and gravity torques of the logs"):
-        realised(nine * np.array([1, 1, 1, 1, 1, 1, 1, 1, 0.05]), M22)
+        realise_bodies(nine * np.array([1, 1, 1, 1, 1, 1, 1, 1, 0.05]), M22)
 
 
 def test_the_load_of_a_grey_box_is_read_as_forces_and_masses(parts, poses):

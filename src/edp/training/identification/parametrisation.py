@@ -143,7 +143,7 @@ def nearest_machine(
     return descend(problem, parametrisation.begin, limits).theta
 
 
-def kept_back(theta: Doubles, information: Doubles, back: NDArray[np.bool_]) -> Doubles:
+def reset_to_guess(theta: Doubles, information: Doubles, back: NDArray[np.bool_]) -> Doubles:
     """Return the optimum of the quadratic for the other coordinates after some are reset to the guess.
 
     Args:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from edp.networks.twin.parameters import FARTHEST, NORMAL, UNEXCITED, interval
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import CYLINDERS
-from edp.training.identification.bodies import NAMES, Poses, base_parameters, grey_load, linked_bodies, solved_base
+from edp.training.identification.bodies import NAMES, Poses, base_parameters, grey_load, read_bodies, solve_base
 from edp.training.identification.machine_numbers import MACHINE_NUMBERS
 from edp.training.identification.parametrisation import STEP, MachineParametrisation
 from edp.wording import typed
@@ -100,8 +100,8 @@ def body_rows(
 
     def solved(values: Doubles) -> Doubles:
         if table.front is not None:
-            return base_parameters(linked_bodies(values, base))
-        return solved_base(*grey_load(table, values, z_of, poses), poses, base)
+            return base_parameters(read_bodies(values, base))
+        return solve_base(*grey_load(table, values, z_of, poses), poses, base)
 
     nine, guess = solved(load), base_parameters(base.bodies)
     slopes = np.empty((len(nine), len(load)))

@@ -40,7 +40,7 @@ from edp.storage.paths import is_there
 from edp.storage.provenance import PROVENANCE
 from edp.storage.runs import Run, check_claimable, run_key
 from edp.training.grey_fit import GreyProblem, fit_grey_box
-from edp.training.identification.bodies import Poses, linked_bodies, realised
+from edp.training.identification.bodies import Poses, read_bodies, realise_bodies
 from edp.training.identification.elements import (
     NO_MOTORS,
     check_same_linkage,
@@ -52,7 +52,7 @@ from edp.training.identification.elements import (
 from edp.training.identification.machine_numbers import MACHINE_NUMBERS
 from edp.training.identification.machine_text import machine_text
 from edp.training.identification.mapping import GreyParts
-from edp.training.identification.parametrisation import MachineParametrisation, kept_back, nearest_machine
+from edp.training.identification.parametrisation import MachineParametrisation, nearest_machine, reset_to_guess
 from edp.training.identification.rows import TOLD, IdentifiedNumber, body_rows, line_comments, number_rows
 from edp.training.identification.stability import covariance
 from edp.training.progress_steps import free_run_steps
@@ -364,7 +364,7 @@ def _machine(fit: _FittedMachine, spread: Doubles, data: Prepared) -> tuple[Mach
     excited = posterior_deviations(information)[:count] < UNEXCITED
     back = np.concatenate([~excited, np.zeros(len(theta) - count, np.bool_)])
     final = replace(own, free=excited)
-    settled = kept_back(theta, information, back)
+    settled = reset_to_guess(theta, information, back)
     machine, load = final.machine(settled), own.load_at(settled)
     valves = machine.valves
     missing = np.array(own.parts.conflux) < 0
@@ -380,9 +380,9 @@ def _machine(fit: _FittedMachine, spread: Doubles, data: Prepared) -> tuple[Mach
     nine, body = body_rows(own, load, spread[count:, count:], twin.wiring.z_of, poses)
     numbers = number_rows(own.base, machine, left[:count], excited)
     if own.parts.table.front is not None:
-        return replace(machine, bodies=linked_bodies(load, own.base)), numbers + body, []
+        return replace(machine, bodies=read_bodies(load, own.base)), numbers + body, []
     try:
-        return replace(machine, bodies=realised(nine, own.base)), numbers + body, []
+        return replace(machine, bodies=realise_bodies(nine, own.base)), numbers + body, []
     except ConfigError as error:
         guessed_rows = [
             replace(row, value=row.base, low=row.base, high=row.base, excited=False, is_told=False) for row in body
