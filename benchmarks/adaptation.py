@@ -63,7 +63,7 @@ from edp.training.twin_bundle import TwinBundle, holds_twin, load_twin, plant_bu
 from edp.workflows.adaptation import fit_adaptation, motion_s
 from edp.workflows.adaptation.with_twin import correction_of
 from edp.workflows.train_evaluate import DataSource, SimulationOrder, prepare_data, simulate_data_set, train
-from edp.workflows.twin.prepare_twin import prepared_twin
+from edp.workflows.twin.prepare_twin import cut_recordings
 from twin import QUICK_FIT, fitted_linkage
 
 PROGRAMS = ("gcc", "arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm")
@@ -197,7 +197,7 @@ def driven(folder: Path, part: Series) -> tuple[Rows, Rows]:
 
 def fitted_grey(recordings: Sequence[Recording], fit: GreyFitSpec, seed: int) -> tuple[GreyTwin, float]:
     """A grey box of the machine before its change, told the linkage and wrong bodies; processor s of its fit."""
-    channels, data = prepared_twin(list(recordings), load_twin_experiment(None, ("twin.kind=greybox",)))
+    channels, data = cut_recordings(list(recordings), load_twin_experiment(None, ("twin.kind=greybox",)))
     return fitted_linkage((channels, fit_scales(channels, data.train), data), seed, fit)
 
 

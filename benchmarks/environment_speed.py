@@ -105,7 +105,7 @@ def naive(levers: Array, seed: int, machine: str, step_s: float) -> Turn:
 
         def step(lever: Array) -> None:
             rows[0] = np.concatenate((rows[0][1 - WINDOW :], plant.run(lever)))
-            sensors.measured_signals(rows[0], parameters, 100.0, rng, rows[0][:, at.LOG_OIL] + 273.15)
+            sensors.measure_signals(rows[0], parameters, 100.0, rng, rows[0][:, at.LOG_OIL] + 273.15)
 
         return timed(step, levers[:NAIVE, :1], 1)
 

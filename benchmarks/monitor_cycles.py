@@ -91,7 +91,7 @@ def main(bench: Bench) -> object:
     root = bench.folder
     sizes = HELD_OUT[:1] if quick else (FITTED if bench.options.fit else HELD_OUT)
     rows = [measured(size, root / str(i), seed) for i, size in enumerate(sizes)]
-    beside = beside_predictor(root / "beside", seed)
+    beside = compare_with_predictor(root / "beside", seed)
     each = float(np.mean([row["cycles_each"] for row in rows]))
     for row in rows:
         row["ratio"] = row["estimate"] / (row["mean"] * each)
@@ -144,7 +144,7 @@ def traced_ticks(folder: Path, ticks: int) -> tuple[int, int]:
     return traced_image(folder, QEMU_M4)
 
 
-def beside_predictor(folder: Path, seed: int) -> dict[str, Any]:
+def compare_with_predictor(folder: Path, seed: int) -> dict[str, Any]:
     """Instructions of a predictor alone, and of a monitor of its errors, a whole step each."""
     bundle = of_preset("quick", seed)
     with tempfile.TemporaryDirectory() as temporary:

@@ -39,7 +39,7 @@ from edp.data.screening import ScreeningSpec, screen
 from edp.data.screening.forest import rows_of
 from edp.data.screening.stability import piece_rows
 from edp.data.screening.table import CandidateTable, build_table
-from edp.data.screening.values import held_out_pieces
+from edp.data.screening.values import choose_held_out
 from edp.logs import read_data_set, write_recording
 from edp.signals import TABLE_A1
 from edp.workflows.train_evaluate import SimulationOrder, simulate_data_set
@@ -192,7 +192,7 @@ class Rival:
         options, entries = self.spec.forest, [e for e in self.found["importance"] if e["target"] == "all"]
         members = [e["members"] for e in entries]
         columns = np.array(sorted(self.data.names.index(name) for group in members for name in group))
-        held = held_out_pieces(len(self.data.pieces), options.held_out, self.spec.seed)
+        held = choose_held_out(len(self.data.pieces), options.held_out, self.spec.seed)
         others = np.setdiff1d(np.arange(len(self.data.pieces)), held).tolist()
         train = rows_of(self.data, others, columns, options.samples, self.spec.horizon)
         tests = rows_of(self.data, held.tolist(), columns, options.tests, self.spec.horizon)

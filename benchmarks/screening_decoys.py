@@ -29,7 +29,7 @@ from edp.recording import Recording
 from edp.signals import TABLE_A1, ChannelMap, SignalMap
 from edp.sim import simulate_many
 from edp.sim.data_set import SimulationOrder
-from edp.workflows.feature_selection.trials import Trials, TrialSpec, try_feature_sets, with_differences
+from edp.workflows.feature_selection.trials import Trials, TrialSpec, add_differences, try_feature_sets
 from edp.workflows.train_evaluate import channel_importance
 from m22_truth import Cause, causes
 from screening_thesis import TARGETS, only_table_a1
@@ -108,7 +108,7 @@ def tried(
     first = source.read()[0]
     sets: dict[str, str | FeatureSettings] = {
         "proposed": proposed,
-        "proposed, with pressure differences": with_differences(proposed, first, "proposed with differences"),
+        "proposed, with pressure differences": add_differences(proposed, first, "proposed with differences"),
         "FG1": "FG1",
         "FG2": "FG2",
         "needed causes": FeatureSettings(name="needed causes", channels=tuple(c.name for c in truth if c.needed)),

@@ -28,7 +28,7 @@ from safetensors.numpy import load_file
 
 from common import PLACE, Bench, benchmark, option, table
 from edp.data.chunks import ChunkSampler, ChunkSpec
-from edp.data.gathered import stored_columns
+from edp.data.gathered import read_stored_columns
 from edp.data.series import Series
 from edp.evaluation.guard import BEATEN
 from edp.logs.store import read_store
@@ -148,7 +148,7 @@ def draw_ms(store: Path, in_memory: bool) -> tuple[float, float]:
     targets = [name for name in names if name.startswith("CylVels")]
     series = []
     for recording in read_store(store):
-        inputs, outputs = (stored_columns(recording, part, (), 0, None) for part in (names, targets))
+        inputs, outputs = (read_stored_columns(recording, part, (), 0, None) for part in (names, targets))
         if in_memory:
             inputs, outputs = np.array(inputs), np.array(outputs)
         series.append(Series(recording.name, inputs, outputs))

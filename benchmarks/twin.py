@@ -25,7 +25,7 @@ import torch
 
 from common import DATA, Bench, benchmark, option, table
 from edp.config.twin import TwinExperiment, load_twin_experiment
-from edp.evaluation.ahead import ahead_scores, look_ahead
+from edp.evaluation.ahead import look_ahead, score_ahead
 from edp.evaluation.free_run import calibrated, free_run_scores, free_runs
 from edp.logs.source import DataSource
 from edp.networks.twin import TWINS, Twin, fit_scales
@@ -153,7 +153,7 @@ def scored(
         taught = name not in closed
         intervals = calibrated([(twin, data.validation)], experiment.judge) if taught else None
         own = free_run_scores(free_runs(twin, data.test, 60.0, starts), experiment.judge, intervals)
-        scores[name] = plain_value(replace(own, ahead=ahead_scores(look_ahead(twin, data.test, AHEAD))))
+        scores[name] = plain_value(replace(own, ahead=score_ahead(look_ahead(twin, data.test, AHEAD))))
         scores[name]["training_s"] = seconds
         if taught:
             scores[name]["validation_mae"] = validation_mae(twin, data, experiment)

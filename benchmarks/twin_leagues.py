@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common import EXAMPLES, SHARED, WORK, Bench, benchmark, kept, option, table
-from edp.config.twin import TwinExperiment, load_twin_experiment, with_budget
+from edp.config.twin import TwinExperiment, limit_processor_time, load_twin_experiment
 from edp.data.series import Series
 from edp.data.stretch_folds import StretchFold
 from edp.data.twin_channels import TwinChannels, twin_channels
@@ -236,7 +236,7 @@ class Judged:
         if quick and elements is not None:
             elements = replace(elements, starts=1, rounds=2)
         made = replace(made, twin=replace(made.twin, prefix_ticks=self.which.prefix_ticks, elements=elements))
-        return with_budget(made, self.minutes) if self.minutes else made
+        return limit_processor_time(made, self.minutes) if self.minutes else made
 
     def chosen(self, seed: int, quick: bool) -> tuple[FittedFormulation, dict[str, Any], TwinExperiment]:
         """The twin that the defaults choose, and what was tried."""

@@ -39,7 +39,7 @@ from edp.signals import Channel, Kind
 from edp.storage.runs import KeyedRun, Run
 from edp.workflows.twin.choose_twin import TwinChoice
 from edp.workflows.twin.fit_twin import TwinFit
-from edp.workflows.twin.prepare_twin import prepared_twin
+from edp.workflows.twin.prepare_twin import cut_recordings
 
 RIVALS = ("static", "arx", "n4sid")
 SPLIT = ByTime(validation_share=0.2, test_share=0.25)
@@ -128,7 +128,7 @@ def public_sets(seed: int, quick: bool) -> dict[str, dict[str, Any]]:
         recordings = [machine(recording, which) for recording in DataSource.of(EXAMPLES / f"{name}.toml").read()]
         experiment = replace(experiment_of(seed, quick, which.prefix_ticks), split=SPLIT)
         experiment = replace(experiment, channels=TwinChannelSettings(commands=which.commands))
-        found[name] = measure(*prepared_twin(recordings, experiment), experiment)
+        found[name] = measure(*cut_recordings(recordings, experiment), experiment)
         print(f"{name}: {found[name]['chosen']}, {found[name]['processor_s']} processor s", flush=True)
     return found
 
@@ -137,7 +137,7 @@ def own_logs(given: Any) -> dict[str, dict[str, Any]]:
     """A folder of logs, whole recordings judged."""
     recordings = source_of(given.logs, given.map, given.repair).read()
     experiment = replace(experiment_of(given.seed, given.quick), split=ByRecording(seed=given.seed))
-    return {given.logs.name: measure(*prepared_twin(recordings, experiment), experiment)}
+    return {given.logs.name: measure(*cut_recordings(recordings, experiment), experiment)}
 
 
 def show(found: dict[str, dict[str, Any]], quick: bool) -> list[Verdict]:

@@ -46,12 +46,12 @@ class Origin:
 
     def advice(self) -> str:
         """Return what to do where the part is not registered."""
-        from_package = f"package '{_shown(self.package)}' {_shown(self.version)} " if self.package else ""
-        came = f"it came from {from_package}(module {_shown(self.module)})"
+        from_package = f"package '{_quote(self.package)}' {_quote(self.version)} " if self.package else ""
+        came = f"it came from {from_package}(module {_quote(self.module)})"
         if self.module == "__main__":
             return f"{came}; a script registered it: put it into a module and set {VARIABLE} to that module"
-        install = f"pip install {_shown(self.package)}, or " if self.package else ""
-        return f"{came}; {install}set {VARIABLE}={_shown(self.module)}"
+        install = f"pip install {_quote(self.package)}, or " if self.package else ""
+        return f"{came}; {install}set {VARIABLE}={_quote(self.module)}"
 
 
 class Registry(Mapping[str, T], Generic[T]):
@@ -121,7 +121,7 @@ class Registry(Mapping[str, T], Generic[T]):
             self._parts.pop(name, None)
             self._modules.pop(name, None)
 
-    def added_since(self, names: Mapping[str, str]) -> dict[str, str]:
+    def list_added_since(self, names: Mapping[str, str]) -> dict[str, str]:
         """Return the parts of plug-ins that are not among `names`, with their modules."""
         return {name: module for name, module in self._modules.items() if name not in names}
 
@@ -166,7 +166,7 @@ class _Plugins:
         except (Exception, SystemExit) as error:
             # What it had registered goes: half a plug-in would fail later, with another message.
             for registry in self.registries:
-                registry.forget(registry.added_since(before.get(registry, {})))
+                registry.forget(registry.list_added_since(before.get(registry, {})))
             kind = "" if isinstance(error, ConfigError) else f"{type(error).__name__}: "
             self.failures.append(f"{where} cannot be loaded and is left out: {kind}{brief(error)}")
 
@@ -241,7 +241,7 @@ def missing_parts(entries: Any, plain: Any) -> list[str]:
         entries: what `origins_in` gave, from a file; entries of another form are left out.
         plain: the settings that must be built.
     """
-    origins = [o for entry in _listed(entries) if (o := _origin_of(entry)) is not None]
+    origins = [o for entry in _limit_entries(entries) if (o := _origin_of(entry)) is not None]
     if origins:
         load_plugins()
     named, sentences = set(_kinds(plain)), []
@@ -249,11 +249,11 @@ def missing_parts(entries: Any, plain: Any) -> list[str]:
         _PLUGINS.recorded[origin.what, origin.part] = origin
         alike = [registry for registry in _PLUGINS.registries if registry.what == origin.what]
         if origin.part in named and not any(origin.part in registry for registry in alike):
-            sentences.append(f"{_shown(origin.what)} '{_shown(origin.part)}': not registered; {origin.advice()}")
+            sentences.append(f"{_quote(origin.what)} '{_quote(origin.part)}': not registered; {origin.advice()}")
     return sentences
 
 
-def _listed(entries: Any) -> Sequence[Any]:
+def _limit_entries(entries: Any) -> Sequence[Any]:
     return entries[:_MAX_ORIGINS] if isinstance(entries, list) else ()
 
 
@@ -264,6 +264,6 @@ def _origin_of(entry: Any) -> Origin | None:
     return Origin(**{key: entry[key] for key in keys})
 
 
-def _shown(text: str) -> str:
+def _quote(text: str) -> str:
     """Return a text from a file as a message may have it."""
     return "".join(c if c.isprintable() else "?" for c in text[:_SHOWN])

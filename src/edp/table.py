@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
-from edp.wording import MISSING, decimals_for, in_cell, in_markdown, number, unit_text
+from edp.wording import MISSING, decimals_for, escape_csv, escape_markdown, number, unit_text
 
 Value = float | int | str | None
 Show = Callable[[Value], str]
@@ -92,7 +92,7 @@ class Table:
         """Return the cells as a reader sees them."""
         return tuple(tuple(column.show(value) for column, value in zip(self.columns, row)) for row in self.rows)
 
-    def without_empty_columns(self) -> Table:
+    def drop_empty_columns(self) -> Table:
         """Return the table without columns that are empty in every row, such as pressures of a machine without them."""
         texts = self.texts()
         filled = [i for i in range(len(self.columns)) if not i or any(row[i] != MISSING for row in texts)]
@@ -103,31 +103,31 @@ class Table:
 
     def markdown(self) -> str:
         """Return the caption and the table as Markdown; marked rows are bold."""
-        heads = [_in_row(head) for head in self.heads()]
-        lines = [f"**{_in_row(self.caption)}**", "", _row(heads), _row(["---"] * len(heads))]
+        heads = [_escape_cell(head) for head in self.heads()]
+        lines = [f"**{_escape_cell(self.caption)}**", "", _row(heads), _row(["---"] * len(heads))]
         for row, cells in enumerate(self.texts()):
             bold = row in self.marked
-            lines.append(_row([f"**{_in_row(c)}**" if bold and c != MISSING else _in_row(c) for c in cells]))
+            lines.append(_row([f"**{_escape_cell(c)}**" if bold and c != MISSING else _escape_cell(c) for c in cells]))
         return "\n".join(lines) + "\n"
 
     def csv(self) -> str:
         """Return the table as CSV in full precision; missing cells are empty, and formulas are escaped."""
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(map(in_cell, self.heads()))
+        writer.writerow(map(escape_csv, self.heads()))
         writer.writerows([_cell(value) for value in row] for row in self.rows)
         return stream.getvalue()
 
 
 def _cell(value: Value) -> Value:
-    return "" if value is None else in_cell(value) if isinstance(value, str) else value
+    return "" if value is None else escape_csv(value) if isinstance(value, str) else value
 
 
 def _row(cells: list[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def _in_row(text: str) -> str:
+def _escape_cell(text: str) -> str:
     """Return a text that ends no cell, starts no element and stays on its line."""
     flat = text.replace("\\", "\\\\").replace("|", "\\|").replace("*", "\\*").replace("_", "\\_")
-    return in_markdown(flat)
+    return escape_markdown(flat)

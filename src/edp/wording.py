@@ -177,34 +177,34 @@ def label_by_name(names: Iterable[str], most: int = MAX_LABEL) -> dict[str, str]
 
 
 def _labels(names: list[str], most: int) -> dict[str, str]:
-    begin = _shared([name for name in names if len(name) > most]) if len(names) > 1 else 0
-    labels = {name: _without_begin(name, begin, most) for name in names}
+    begin = _count_common_prefix([name for name in names if len(name) > most]) if len(names) > 1 else 0
+    labels = {name: _shorten_prefix(name, begin, most) for name in names}
     for label, count in Counter(labels.values()).items():
         alike = [name for name in names if labels[name] == label]
         if count > 1:
-            start = _shared(alike)
+            start = _count_common_prefix(alike)
             labels |= {name: _around(name, start, most) for name in alike}
     return labels
 
 
-def _shared(texts: Sequence[str]) -> int:
+def _count_common_prefix(texts: Sequence[str]) -> int:
     """Return the number of characters with which all texts begin."""
     alike = (len(set(letters)) == 1 for letters in zip(*texts, strict=False))
     return sum(1 for _ in itertools.takewhile(bool, alike))
 
 
-def _without_begin(name: str, begin: int, most: int) -> str:
+def _shorten_prefix(name: str, begin: int, most: int) -> str:
     """Return a name in at most `most` characters: without most of what all names begin with, or without its middle."""
     if len(name) <= most:
         return name
     head = most // 5
     rest = name[max(begin - 3, 0) :]
     if begin <= 2 * head or begin + head >= len(name):
-        return _without_middle(name, most)
-    return f"{name[:head]}…{_without_middle(rest, most - head - 1)}"
+        return _shorten_middle(name, most)
+    return f"{name[:head]}…{_shorten_middle(rest, most - head - 1)}"
 
 
-def _without_middle(name: str, most: int) -> str:
+def _shorten_middle(name: str, most: int) -> str:
     end = most // 3 + 1
     return name if len(name) <= most else f"{name[: most - 1 - end]}…{name[-end:]}"
 
@@ -218,7 +218,7 @@ def _around(name: str, start: int, most: int) -> str:
     return f"{name[:ends]}…{name[start : start + most - 2 * ends - 2]}…{name[-ends:]}"
 
 
-def in_cell(text: str) -> str:
+def escape_csv(text: str) -> str:
     """Return text for a CSV cell: text that a spreadsheet would run as a formula gets a leading apostrophe."""
     # Numbers with a sign stay numbers; only text can be a formula.
     try:
@@ -228,7 +228,7 @@ def in_cell(text: str) -> str:
     return text
 
 
-def in_markdown(text: str) -> str:
+def escape_markdown(text: str) -> str:
     """Escape a sentence for Markdown, so that names in it cannot start an element, a link or a line."""
     flat = printable(re.sub(r"[ \t\r\n\f\v]+", " ", text).strip())
     return flat.replace("<", "&lt;").replace("](", "]\\(").replace("][", "]\\[")

@@ -9,9 +9,9 @@ from edp.signals import EXTRA_CHANNELS, TABLE_A1
 from edp.sim import Scenario, Simulation, Snapshot, load_machine, simulate
 from edp.sim.environment import ExcavatorEnv, VectorExcavatorEnv
 from edp.sim.environment.spec import EnvironmentSpec
-from edp.sim.faults import FAULTS, FaultSpec, MachineFault, SensorFault, at_site, fault_text, ladder, parse_fault
+from edp.sim.faults import FAULTS, FaultSpec, MachineFault, SensorFault, fault_text, insert_site, ladder, parse_fault
 from edp.sim.faults.course import MachineCourse, SensorCourse, numbers_of, shares_at
-from edp.sim.faults.shown import falsified_channels
+from edp.sim.faults.shown import list_falsified
 from edp.sim.machine import layout as at
 from edp.sim.sensors import chain, draws, sensors
 from edp.sim.start import seeds_of
@@ -104,7 +104,7 @@ def test_places_units_and_ladder_are_sound(name):
 def test_parts_and_words_are_whole_sentences_at_every_site(name):
     kind = FAULTS[name]
     for site in kind.sites or ("",):
-        words = at_site(kind.words, site)
+        words = insert_site(kind.words, site)
         assert "{" not in kind.component(site)
         # A size is reported where there is one, and its sign where it may have either.
         assert ("{size}" in words) == bool(kind.units)
@@ -169,7 +169,7 @@ def test_an_episode_is_the_recording_to_the_bit(number):
     drawn = draws.draw(simulation.machine, len(log), 100.0, np.random.default_rng(seeds[2]))
     drawn = faults.drawn(drawn, 100.0, np.random.default_rng(seeds[4]))
     kelvin = log[:, at.LOG_OIL] + 273.15
-    shown = sensors.shown_signals(shifted, simulation.machine, 100.0, True, drawn, kelvin, faults.table)
+    shown = sensors.observe_signals(shifted, simulation.machine, 100.0, True, drawn, kelvin, faults.table)
     truth = sensors.truth_signals(shifted) | {name: shown[:, n] for name, n in sensors.shown_names().items()}
     whole = np.column_stack((shown[:, : len(TABLE_A1)], *(truth[name] for name in EXTRA_CHANNELS)))
 
@@ -286,7 +286,7 @@ def test_channels_of_a_sensor_fault_are_those_that_change():
         faulty = simulate(Scenario(duration_s=2.0, seed=3, faults=[f"{kind}:{site}:{size}@0s"]))
         names = [name for name in sound.channel_names if not name.startswith("CylAcc")]
         changed = {name for name in names if not np.array_equal(sound.column(name), faulty.column(name))}
-        assert changed == set(falsified_channels(kind, site))
-    assert falsified_channels("head_rod_swapped", "boom") == ("CylPressures_1", "CylPressures_5")
-    assert falsified_channels("temperature_offset", "") == ("OilTemperature",)
-    assert falsified_channels("internal_leak", "boom") == ()
+        assert changed == set(list_falsified(kind, site))
+    assert list_falsified("head_rod_swapped", "boom") == ("CylPressures_1", "CylPressures_5")
+    assert list_falsified("temperature_offset", "") == ("OilTemperature",)
+    assert list_falsified("internal_leak", "boom") == ()

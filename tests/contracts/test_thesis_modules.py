@@ -11,7 +11,7 @@ from edp.config.experiment import Experiment, build, load_experiment
 from edp.data.scaling import Scaler
 from edp.errors import ConfigError
 from edp.networks.predictor import build_model
-from edp.workflows.search.modules import MODULES, options_of, present_options, with_modules
+from edp.workflows.search.modules import MODULES, add_modules, options_of, present_options
 from edp.workflows.search.trainings import settings_of
 
 PAGE = Path(__file__).parents[2] / "docs" / "settings.md"
@@ -59,11 +59,11 @@ def test_each_is_reached_by_its_setting_and_takes_part(name, setting):
 @pytest.mark.parametrize("name", MODULES)
 def test_every_option_of_a_module_makes_another_network_and_its_present_value_the_same(name):
     base = settings_of(load_experiment(None, "quick", ["model.blocks=[]"]))
-    plain = with_modules(base, [name])
-    assert with_modules(base, [name], options=present_options(base, [name])) == plain
+    plain = add_modules(base, [name])
+    assert add_modules(base, [name], options=present_options(base, [name])) == plain
     for key, held in options_of(base, name).items():
-        made = [with_modules(base, [name], options={key: value}) for value in held.options]
+        made = [add_modules(base, [name], options={key: value}) for value in held.options]
         models = [build(Experiment, settings, "of a test").model for settings in made]
         assert len({repr(model) for model in models}) == len(held.options), key
     with pytest.raises(ConfigError, match=r"= 'odd'; one of"):
-        with_modules(base, ["zoneout"], options={"zoneout.zoneout": "odd"})
+        add_modules(base, ["zoneout"], options={"zoneout.zoneout": "odd"})

@@ -27,7 +27,7 @@ from edp.networks.twin.elements import ElementsBox
 from edp.networks.twin.lumped.parts import LagElement, MassElement, TankElement
 from edp.signals import Channel, Kind
 from edp.training.twin_bundle import TwinBundle, plant_bundle
-from edp.workflows.deployment import in_integers
+from edp.workflows.deployment import quantise_twin
 
 DRIVER = Path(__file__).with_name("tangent_driver.c")
 SANITISED = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
@@ -136,7 +136,7 @@ def test_eight_bits_are_refused_where_there_are_no_weights(bundle):
             return []
 
     with pytest.raises(ExportError, match=r"no matrix of weights.*export in float32"):
-        in_integers(bundle, Nothing())
+        quantise_twin(bundle, Nothing())
 
 
 def test_the_logarithm_of_single_precision_is_the_logarithm():

@@ -18,7 +18,7 @@ from edp.networks.twin import TWINS, Twin
 from edp.networks.twin.recurrent import Recurrent
 from edp.testing.twins import sample_actuators, sample_twin
 from edp.training.twin_bundle import TwinBundle, plant_bundle
-from edp.workflows.deployment import in_integers
+from edp.workflows.deployment import quantise_twin
 
 DRIVER = Path(__file__).with_name("tangent_driver.c")
 SANITISED = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
@@ -88,13 +88,13 @@ class Recordings:
 
 def test_a_state_space_model_has_no_integers():
     with pytest.raises(ExportError, match=r"'cell\.kept' multiplies what a feedback edge hands on.*export in float32"):
-        in_integers(twin_of("n4sid"), Recordings())
+        quantise_twin(twin_of("n4sid"), Recordings())
 
 
 @pytest.mark.parametrize("name", EQUATIONS)
 def test_equations_have_neither_integers_nor_tangents(name, tmp_path):
     with pytest.raises(ExportError, match=r"HydraulicTick.*integer arithmetic; its equations need double precision"):
-        in_integers(twin_of(name), Recordings())
+        quantise_twin(twin_of(name), Recordings())
     with pytest.raises(ExportError, match=r"'cell\.machine' is a HydraulicTick, which has no tangent in C"):
         make_target("c", {"tangent": True}).write(twin_of(name), "predictor", tmp_path)
 
@@ -102,7 +102,7 @@ def test_equations_have_neither_integers_nor_tangents(name, tmp_path):
 @pytest.mark.parametrize("name", [name for name in LOWERED if name not in NO_INTEGERS])
 def test_integers_are_those_of_the_reference(c, name, tmp_path):
     bundle = twin_of(name)
-    whole = in_integers(bundle, Recordings())
+    whole = quantise_twin(bundle, Recordings())
     c.need("gcc")
     make_target("c").write(whole, "predictor", tmp_path)
     own = [*c.sources(tmp_path), "host_test.c"]
@@ -119,7 +119,7 @@ def test_integers_are_those_of_the_reference(c, name, tmp_path):
 
 def test_integers_of_a_network_are_made_by_edp_quantise(bundle_of):
     with pytest.raises(ConfigError, match="edp quantise"):
-        in_integers(bundle_of("lstm"), Recordings())
+        quantise_twin(bundle_of("lstm"), Recordings())
 
 
 def test_names_of_channels_stay_text_and_the_fuzzer_finds_nothing(c, tmp_path):

@@ -27,9 +27,9 @@ def bench():
     twin = BENCH.start(channels, fit_scales(channels, series), series, 0)
     numbers = twin.table.nominal
     numbers[twin.table.inertia_at], numbers[twin.table.potential_at] = 0.07, 0.01  # 4.9 t, 20 kN
-    twin, levers = twin.with_numbers(numbers), series[0].inputs
+    twin, levers = twin.with_parameters(numbers), series[0].inputs
     bands = [number.name.startswith("dead_band") for number in twin.table.numbers]
-    worn = twin.with_numbers(np.where(bands, 1.5, 1.0) * twin.numbers)
+    worn = twin.with_parameters(np.where(bands, 1.5, 1.0) * twin.numbers)
     start = np.array([[0.0, 0.5, 5e6, 5e6, 5e6]], np.float32)
     answers, _ = worn.rollout(levers[None, :-1], worn.initial_state(levers[None, 0], start))
     return twin, levers, np.concatenate([start, answers[0]])

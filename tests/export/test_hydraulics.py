@@ -64,7 +64,7 @@ def bench():
     for entry, value in ((0, 0.07), (1, 0.01), (2, 0.05)):
         numbers[table.inertia_at + entry * table.inertia_terms] = value
     numbers[table.potential_at : table.potential_at + 2] = 0.01, -0.004
-    return plant_bundle(TwinBundle(SPEC, twin.with_numbers(numbers)))
+    return plant_bundle(TwinBundle(SPEC, twin.with_parameters(numbers)))
 
 
 def turning_bench():
@@ -93,7 +93,7 @@ def turning_bench():
     numbers, names = twin.table.nominal, [number.name for number in twin.table.numbers]
     for name, value in (("swing_00", 0.03), ("swing_10", 0.01), ("ram_00", 0.002)):
         numbers[names.index(f"inertia_root_swing_{name}")] = value
-    return plant_bundle(TwinBundle(spec, twin.with_numbers(numbers)))
+    return plant_bundle(TwinBundle(spec, twin.with_parameters(numbers)))
 
 
 def front_bench():
@@ -209,7 +209,7 @@ def test_a_network_on_a_grey_box_corrects_it_in_c(c, tmp_path):
     expected = stream(bundle.predictor, rows)
     allowed = grown_tolerance(bundle.predictor, rows, expected)
     assert (np.abs(c.stream(program, rows) - expected) <= allowed).all()
-    alone = stream(TwinPlant(twin.without_network(), ""), rows)
+    alone = stream(TwinPlant(twin.drop_network(), ""), rows)
     assert (np.abs(alone - expected) > 100 * allowed).any()
 
 

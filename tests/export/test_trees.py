@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edp.export.c.integer_calls import tables_header
-from edp.ir.descent import reached_leaves, summed
+from edp.ir.descent import find_leaves, summed
 from edp.ir.layers import NEVER
 from edp.ir.w8a16.layers import QTreeSums
 from edp.ir.w8a16.reference import INTEGER_STEPS
@@ -59,7 +59,7 @@ def test_single_precision_gives_the_bits_of_the_reference(runtime):
         leaf = draw.normal(size=(outputs, trees, 2**depth)).astype(np.float32)
         leaf[draw.random(leaf.shape) < 0.1] = -0.0
         found = called(runtime.edp_trees, rows, (feature, threshold, leaf), (outputs, trees, depth), outputs)
-        wanted = summed(reached_leaves(feature, threshold, leaf, rows))
+        wanted = summed(find_leaves(feature, threshold, leaf, rows))
         np.testing.assert_array_equal(found.view(np.uint32), wanted.view(np.uint32))
 
     check()

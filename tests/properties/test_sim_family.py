@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edp.errors import ConfigError
-from edp.sim import DataSetSpec, load_machine, machine_family, over_family, plan_data_set, simulate
-from edp.sim.machine.family import WIDEST, Draws, scaled_machine
+from edp.sim import DataSetSpec, distribute_over_family, load_machine, machine_family, plan_data_set, simulate
+from edp.sim.machine.family import WIDEST, Draws, scale_machine
 from edp.sim.machine.machine_checks import check_machine
 from edp.sim.physics.plant import Plant
 
@@ -18,9 +18,9 @@ from edp.sim.physics.plant import Plant
 @given(st.integers(0, 2**31), st.floats(10.0, 50.0), st.floats(0.1, WIDEST))
 def test_every_member_passes_the_checks(seed, mass_t, scatter):
     draws = Draws(np.random.default_rng(seed), scatter)
-    machine = scaled_machine(load_machine("M22"), mass_t, draws)
+    machine = scale_machine(load_machine("M22"), mass_t, draws)
     check_machine(machine, "member")
-    check_machine(scaled_machine(load_machine("C14"), mass_t, draws, "x", 14.7), "member")
+    check_machine(scale_machine(load_machine("C14"), mass_t, draws, "x", 14.7), "member")
 
 
 class Middle:
@@ -33,7 +33,7 @@ class Middle:
 
 def test_the_laws_of_scaling():
     base = load_machine("M22")
-    twice = scaled_machine(base, 8 * 21.7, Draws(Middle()))
+    twice = scale_machine(base, 8 * 21.7, Draws(Middle()))
     assert twice.bodies.length == pytest.approx(2 * np.array(base.bodies.length))
     assert twice.bodies.mass == pytest.approx(8 * np.array(base.bodies.mass))
     assert twice.bodies.inertia == pytest.approx(32 * np.array(base.bodies.inertia))
@@ -102,10 +102,10 @@ def test_scatter_widens_what_is_not_wear():
 
 
 def test_a_data_set_of_a_family_takes_turns():
-    plan = over_family(plan_data_set("M22", 1.0, 6, seed=2), 3, seed=2)
+    plan = distribute_over_family(plan_data_set("M22", 1.0, 6, seed=2), 3, seed=2)
     assert {s.machine for s in plan} == {f"family-2-{i}" for i in range(3)}
     assert len({s.name for s in plan}) == 6
     recording = simulate(dataclasses.replace(plan[0], duration_s=2.0))
     assert recording.source.startswith("sim:family-2-")
     with pytest.raises(ConfigError, match="family = -1"):
-        over_family(plan, -1, seed=2)
+        distribute_over_family(plan, -1, seed=2)

@@ -86,7 +86,7 @@ def test_a_ramp_on_the_bus_is_late_by_latency_and_waiting():
     rows[:, LOG_VELOCITY : LOG_VELOCITY + 3] = rows[:, at.HEAD : at.HEAD + 6] = np.arange(1000.0)[:, None]
     rows[:, at.LOG_DEMAND : at.LOG_DEMAND + 6] = np.arange(1000.0)[:, None] * [1, -1, 1, -1, 1, -1]
     machine = machine_with(velocity=0.0, pressure=0.0, can_period=0.010, can_latency=(0.004, 0.004))
-    shown = sensors.measured_signals(rows, machine, 100.0, np.random.default_rng(0))
+    shown = sensors.measure_signals(rows, machine, 100.0, np.random.default_rng(0))
     full = machine.valves.pilot_pressure
     for columns, ecu, scale in ((slice(0, 3), 0, 1.0), (slice(6, 12), 1, 1.0), ([12, 15, 16, 19, 20, 23], 2, full)):
         phase = draws.instance_of(machine).phase[ecu]
@@ -118,7 +118,7 @@ def test_the_lag_is_that_of_a_ramp_and_rests_at_the_first_value():
     rows = np.zeros((400, LOG_COLUMNS))
     rows[:, at.HEAD : at.HEAD + 3] = np.arange(400)[:, None] / 100
     rows[:, at.ROD : at.ROD + 3] = 7.0
-    shown = sensors.measured_signals(rows, machine, 100.0, np.random.default_rng(0))[:, 6:12]
+    shown = sensors.measure_signals(rows, machine, 100.0, np.random.default_rng(0))[:, 6:12]
     np.testing.assert_allclose(shown[50:, :3], rows[50:, at.HEAD : at.HEAD + 3] - 0.02, atol=1e-9)
     np.testing.assert_allclose(shown[:, 3:], 7.0, atol=1e-12)
 
@@ -166,7 +166,7 @@ def test_transmitters_stay_in_range_on_the_grid_of_their_bits_with_the_offset_of
     assert ((size >= 0.0025) & (size <= 0.005)).all()
     rows = np.zeros((300, LOG_COLUMNS))
     rows[:, at.HEAD : at.HEAD + 6] = np.linspace(0, 600e5, 300)[:, None]
-    shown = sensors.measured_signals(rows, machine, 100.0, np.random.default_rng(0))[:, 6:12]
+    shown = sensors.measure_signals(rows, machine, 100.0, np.random.default_rng(0))[:, 6:12]
     assert shown.min() >= 0.0
     assert shown.max() <= 500e5
     quantum = 500e5 / 4096
@@ -181,7 +181,7 @@ def test_pressures_drift_with_the_oil():
     rows = np.zeros((100, LOG_COLUMNS))
     rows[:, at.HEAD : at.HEAD + 6] = 100e5
     at_40, at_60 = (
-        sensors.measured_signals(rows, machine, 100.0, np.random.default_rng(0), np.full(100, kelvin))[:, 6:12]
+        sensors.measure_signals(rows, machine, 100.0, np.random.default_rng(0), np.full(100, kelvin))[:, 6:12]
         for kelvin in (313.15, 333.15)
     )
     np.testing.assert_allclose(at_60 - at_40, 20 * 1e-4 * 500e5)
@@ -192,7 +192,7 @@ def test_joint_rate_error_is_scaled_by_the_lever_arm(log):
     levers = pins.lever_arms(log[:, at.PSI : at.PSI + 3], Plant(machine, np.full(3, 0.5)).plant)
     truth = log[:, LOG_VELOCITY : LOG_VELOCITY + 3]
     np.testing.assert_allclose(levers * log[:, at.RATE : at.RATE + 3], truth, atol=1e-12)
-    error = sensors.measured_signals(log, machine, 100.0, np.random.default_rng(3))[:, :3] - truth
+    error = sensors.measure_signals(log, machine, 100.0, np.random.default_rng(3))[:, :3] - truth
     assert (error / levers).std() == pytest.approx(np.deg2rad(0.07), rel=0.1)
     assert 0.5e-3 < error[:, 0].std() < 1.5e-3
 
@@ -200,20 +200,20 @@ def test_joint_rate_error_is_scaled_by_the_lever_arm(log):
 @pytest.mark.parametrize("cut", [137, 300])
 def test_no_sample_depends_on_a_later_one(log, cut):
     machine = machine_with(**FULL)
-    whole = sensors.measured_signals(log, machine, 100.0, np.random.default_rng(4))
+    whole = sensors.measure_signals(log, machine, 100.0, np.random.default_rng(4))
     other = log.copy()
     other[cut:] = log[cut - 1]
     other[cut:, LOG_VELOCITY:] += 1.0
-    changed = sensors.measured_signals(other, machine, 100.0, np.random.default_rng(4))
+    changed = sensors.measure_signals(other, machine, 100.0, np.random.default_rng(4))
     np.testing.assert_array_equal(changed[:cut], whole[:cut])
     assert (changed[cut + 5 :] != whole[cut + 5 :]).any()
 
 
 def test_full_sensors_stay_near_the_truth_and_the_instance_is_fixed(log):
     machine = machine_with(**FULL)
-    first, again = (sensors.measured_signals(log, machine, 100.0, np.random.default_rng(s)) for s in (4, 4))
+    first, again = (sensors.measure_signals(log, machine, 100.0, np.random.default_rng(s)) for s in (4, 4))
     np.testing.assert_array_equal(first, again)
-    other = sensors.measured_signals(log, machine, 100.0, np.random.default_rng(5))
+    other = sensors.measure_signals(log, machine, 100.0, np.random.default_rng(5))
     assert (other[:, :12] != first[:, :12]).any()
     truth = log[:, at.HEAD : at.HEAD + 6]
     means = [(shown[:, 6:12] - truth).mean(axis=0) for shown in (first, other)]

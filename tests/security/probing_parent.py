@@ -21,7 +21,7 @@ from native_probes import Aims
 
 from edp.errors import EdpError
 from edp.logs import open_log
-from edp.sandbox.layers import seen_layers
+from edp.sandbox.layers import get_seen_layers
 from edp.signals import SignalMap
 
 
@@ -79,7 +79,7 @@ def main(folder: Path, groups: list[str]) -> None:
                 "reached": {probe: what for probe, what in found.items() if what},
                 "refused": refused,
                 "warned": [str(each.message) for each in caught],
-                "layers": seen_layers(),
+                "layers": get_seen_layers(),
                 "files": changed + sorted(set(os.listdir(folder)) ^ set(names)),
                 "process": [str(now) for was, now in zip(before, own_state()) if was != now] + heard,
                 "connected": len(ready),

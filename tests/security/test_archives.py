@@ -18,7 +18,7 @@ import pytest
 import edp
 from edp.errors import DataError
 from edp.storage.archives import ArchiveLimits, ZipReader, zip_bytes
-from edp.storage.unpacking import unpack_to, unpacked_size
+from edp.storage.unpacking import measure_unpacked, unpack_to
 
 LIMITS = ArchiveLimits(file_bytes=1 << 26, unpacked_bytes=1 << 24, entries=1000)
 SOUND = {"a": b"first", "folder/b": bytes(3000), "c": b""}
@@ -288,11 +288,11 @@ def test_streams_end_at_the_announced_size(packing):
     tracemalloc.start()
     try:
         assert len(unpack_to(packing, packed, 1000)) == 1001
-        assert 1000 < unpacked_size(packing, packed, 1000) <= 1000 + (2 << 20)
+        assert 1000 < measure_unpacked(packing, packed, 1000) <= 1000 + (2 << 20)
         assert tracemalloc.get_traced_memory()[1] < 8 << 20
     finally:
         tracemalloc.stop()
-    assert unpacked_size(packing, packed, 1 << 30) == len(data)
+    assert measure_unpacked(packing, packed, 1 << 30) == len(data)
     with pytest.raises(Exception):  # noqa: B017, PT011 - each packing has its own
         unpack_to(packing, packed[: len(packed) // 2], 1 << 30)
 

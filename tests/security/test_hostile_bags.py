@@ -22,7 +22,7 @@ from edp.logs import read_recording, write_recording
 from edp.logs.formats.bag_guard import definitions_of
 from edp.recording import Recording
 from edp.signals import TABLE_A1
-from edp.storage.unpacking import unpack_to, unpacked_size
+from edp.storage.unpacking import measure_unpacked, unpack_to
 
 BOMB = 1 << 32
 
@@ -71,7 +71,7 @@ def little_memory():
 def test_unpacking_ends_at_what_is_announced(kind, little_memory, zstd_bomb):
     packed = zstd_bomb if kind == "zstd" else bomb(kind)
     assert len(unpack_to(kind, packed, 4000)) == 4001
-    assert 4000 < unpacked_size(kind, packed, 4000) < 1 << 22
+    assert 4000 < measure_unpacked(kind, packed, 4000) < 1 << 22
 
 
 @pytest.mark.parametrize("kind", ["zlib", "zstd", "lz4", "bz2"])
@@ -82,7 +82,7 @@ def test_what_is_packed_well_is_unpacked_whole(kind):
     for size in (1, 1000, 65536, 3_000_001):
         content = np.random.default_rng(size).integers(0, 7, size, dtype=np.uint8).tobytes()
         assert unpack_to(kind, pack(content), size) == content
-        assert unpacked_size(kind, pack(content), size) == size
+        assert measure_unpacked(kind, pack(content), size) == size
         assert len(unpack_to(kind, pack(content), size - 1)) == size
         with pytest.raises(EOFError):
             unpack_to(kind, pack(content)[:-9], size)

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from edp.errors import BusyError, StorageError
-from edp.storage import check_held, check_writable, held_by, hold, release, replacing, write_bytes
+from edp.storage import check_held, check_writable, find_holder, hold, release, replacing, write_bytes
 from edp.storage.ledger import Ledger, Record, TrainingIdentity, TrainingStatus, claim
 from edp.storage.runs import Run
 
@@ -60,7 +60,7 @@ def test_what_is_no_file_is_one_message(folder, kind, make):
     make(folder / name)
     with pytest.raises(StorageError, match="not a lock file but a"):
         open_it(folder)
-    assert held_by(folder / name) is None
+    assert find_holder(folder / name) is None
 
 
 def test_a_file_of_the_user_keeps_its_content(folder):
@@ -74,7 +74,7 @@ def test_locks_of_killed_holders_and_of_lost_power_are_taken(folder):
     for left in ("", "\0" * 60, "17 on some-host since 2026-01-31 23:59:59"):
         (folder / ".lock").write_text(left)
         with Run(folder):
-            assert held_by(folder / ".lock").startswith(f"{os.getpid()} on ")
+            assert find_holder(folder / ".lock").startswith(f"{os.getpid()} on ")
 
 
 def test_a_second_holder_is_told_who_holds(folder):

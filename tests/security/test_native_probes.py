@@ -16,7 +16,7 @@ from edp.errors import ConfigError, DataError
 from edp.logs import open_log, read_recording, write_recording
 from edp.recording import Recording
 from edp.sandbox import end, layers
-from edp.sandbox.environment import BUILD_NAMES, reduced_environment
+from edp.sandbox.environment import BUILD_NAMES, reduce_environment
 from edp.signals import TABLE_A1, SignalMap
 from edp.workflows.parity.base import called
 
@@ -175,7 +175,7 @@ def test_a_reader_sees_only_listed_variables(look):
         assert "of the user" not in seen
         assert SECRET not in seen
     own = {"PYTHONPATH", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"}
-    assert set(look["environment"]) <= set(reduced_environment()) | own | {"MIMALLOC_ARENA_RESERVE"}
+    assert set(look["environment"]) <= set(reduce_environment()) | own | {"MIMALLOC_ARENA_RESERVE"}
 
 
 def test_a_reader_holds_two_pipes_and_nothing_else(look):
@@ -189,7 +189,7 @@ def test_exported_code_that_is_run_sees_only_listed_variables(tmp_path, monkeypa
     said = called([sys.executable, "-c", "import os; print(dict(os.environ))"], tmp_path).decode()
     assert "of the user" not in said
     assert "'CC': 'gcc'" in said
-    assert "CC" not in reduced_environment()
+    assert "CC" not in reduce_environment()
     assert "CC" in BUILD_NAMES
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from edp.report.common.picture import NOT_XML, write_drawings
 from edp.report.common.templates import json_text, template
 from edp.table import Column, Table
-from edp.wording import in_cell, in_markdown, printable
+from edp.wording import escape_csv, escape_markdown, printable
 
 HOSTILE = [
     '=HYPERLINK("http://a.b")',
@@ -51,14 +51,14 @@ def test_tables_for_spreadsheets_hold_no_formulas(name):
 
 
 def test_text_that_is_a_number_stays_one():
-    assert [in_cell(text) for text in ("-1.5", "+2", "1e-3", "-", "-a", "a=b")] == [
+    assert [escape_csv(text) for text in ("-1.5", "+2", "1e-3", "-", "-a", "a=b")] == [
         "-1.5", "+2", "1e-3", "'-", "'-a", "a=b",
     ]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_documents_hold_neither_elements_nor_links(name):
-    for text in (sheet(name).markdown(), in_markdown(f"The network of {name} is better.")):
+    for text in (sheet(name).markdown(), escape_markdown(f"The network of {name} is better.")):
         assert "<" not in text
         assert "](" not in text
         assert not [c for c in text if c != "\n" and not c.isprintable()]
@@ -68,7 +68,7 @@ def test_documents_hold_neither_elements_nor_links(name):
 
 @given(st.text(st.characters(codec=None)))
 def test_any_text_is_one_line_of_a_document(text):
-    shown = in_markdown(text)
+    shown = escape_markdown(text)
     assert "\n" not in shown
     assert "<" not in shown
     assert printable(printable(text)) == printable(text)
@@ -76,7 +76,7 @@ def test_any_text_is_one_line_of_a_document(text):
 
 def test_sentences_without_names_are_as_they_were():
     text = "MAE 7.9 mm/s, interval [0.1, 0.2] (k = 10), squeeze_excitation at 5 > 4"
-    assert in_markdown(text) == text
+    assert escape_markdown(text) == text
 
 
 @pytest.mark.filterwarnings("ignore:Glyph")

@@ -34,7 +34,7 @@ if __name__ == "__main__":
         units = [WorkUnit("forever:forever", name, {"name": name}, where={"folder": "FOLDER"}) for name in "abc"]
         list(Workers(count=2).map(units))
     except KeyboardInterrupt:
-        sys.exit(process.stopped_code(130))
+        sys.exit(process.exit_code_of_stop(130))
 """
 
 

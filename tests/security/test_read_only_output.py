@@ -23,7 +23,9 @@ def full(target: Path) -> tuple[int, str]:
 @pytest.mark.parametrize("command", ["evaluate", "channel_importance"])
 def test_a_run_that_cannot_be_written_is_told_before_it_is_read(command, tmp_path, monkeypatch):
     monkeypatch.setattr(edp.storage.writing, "_temporary", full)
-    monkeypatch.setattr(edp.workflows.train_evaluate, "trained_run", lambda folder: pytest.fail("it was read first"))
+    monkeypatch.setattr(
+        edp.workflows.train_evaluate, "read_trained_run", lambda folder: pytest.fail("it was read first")
+    )
     with pytest.raises(StorageError, match="Read-only file system"):
         getattr(edp.workflows.train_evaluate, command)(tmp_path)
 
@@ -33,7 +35,7 @@ def test_a_run_in_integers_that_cannot_be_written_is_told_before_it_is_computed(
         sys.modules[quantise.__module__],
         SimpleNamespace(predictor=SimpleNamespace(number_format="float32")),
     )
-    monkeypatch.setattr(module, "trained_run", lambda folder: (bundle, None, {}, None))
+    monkeypatch.setattr(module, "read_trained_run", lambda folder: (bundle, None, {}, None))
     monkeypatch.setattr(module, "integer_predictor", lambda *_: pytest.fail("it was computed first"))
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError, match="cannot create folder"):

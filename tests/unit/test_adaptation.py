@@ -25,9 +25,9 @@ from edp.training import load_bundle, save_bundle, upgrade_bundle
 from edp.training.bundle import ADAPTED_SCHEMA, HASH, SCHEMA, content_digest
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 from edp.workflows.adaptation import adapt, fit_adaptation, replay, replay_run
-from edp.workflows.adaptation.with_twin import TwinMoves, correction_of, tuned_spec
+from edp.workflows.adaptation.with_twin import TwinMoves, choose_tuned_spec, correction_of
 from edp.workflows.deployment import footprint_of
-from edp.workflows.train_evaluate import evaluate, train, trained_run
+from edp.workflows.train_evaluate import evaluate, read_trained_run, train
 
 SETTINGS = (
     'task.features={name="levers", channels=["speed", "lever"]}',
@@ -62,7 +62,7 @@ def adapted(run, tmp_path_factory):
 
 def test_its_numbers_are_those_of_the_runs_recordings(run, adapted):
     _, made = adapted
-    bundle, _, _, data = trained_run(run)
+    bundle, _, _, data = read_trained_run(run)
     inputs = np.concatenate([part.inputs for part in data.train])
     np.testing.assert_allclose(made.offset, inputs.mean(axis=0), rtol=1e-4)
     np.testing.assert_allclose(made.scale, inputs.std(axis=0), rtol=1e-4)
@@ -112,7 +112,7 @@ def test_an_adapted_bundle_of_the_former_words_is_upgraded_and_keeps_its_digest(
 
 def test_a_stream_and_a_replay_give_the_same_numbers(run, adapted):
     folder, made = adapted
-    bundle, data = load_bundle(folder), trained_run(run)[3]
+    bundle, data = load_bundle(folder), read_trained_run(run)[3]
     part = data.test[0]
     held = replay(bundle.predictor, made, [part]).recordings[0]
     stream = AdaptedStream(bundle.predictor, bundle.adaptation)
@@ -134,7 +134,7 @@ def test_a_stream_and_a_replay_give_the_same_numbers(run, adapted):
 
 def test_what_was_learned_can_be_carried_from_one_recording_to_the_next(run, adapted):
     _, made = adapted
-    bundle, _, _, data = trained_run(run)
+    bundle, _, _, data = read_trained_run(run)
     alone, carried = (replay(bundle.predictor, made, data.train[:2], carry=carry) for carry in (False, True))
     np.testing.assert_array_equal(alone.recordings[0].adapted, carried.recordings[0].adapted)
     assert not np.array_equal(alone.recordings[1].adapted, carried.recordings[1].adapted)
@@ -202,8 +202,8 @@ def test_a_grey_box_that_follows_the_machine_moves_what_is_replayed(adapted, lev
 def test_a_thermometer_in_the_logs_of_twin_and_replay_moves_its_numbers(adapted, lever_sessions, tmp_path):
     bundle = load_bundle(adapted[0])
     grey = load_twin(saved_twin(GreyBox(), lever_sessions, tmp_path / "grey"))
-    assert math.isnan(tuned_spec(grey).oil_c)
-    spec = tuned_spec(dataclasses.replace(grey, provenance=Provenance(more={"oil_c": 20.0})))
+    assert math.isnan(choose_tuned_spec(grey).oil_c)
+    spec = choose_tuned_spec(dataclasses.replace(grey, provenance=Provenance(more={"oil_c": 20.0})))
     moves, recordings = (
         TwinMoves(grey.twin, correction_of(grey.twin, bundle.adaptation, bundle.task, spec)),
         lever_sessions.read(),
@@ -217,7 +217,7 @@ def test_a_thermometer_in_the_logs_of_twin_and_replay_moves_its_numbers(adapted,
         assert moves.correction.tuned.factors["oil"] == pytest.approx(viscosity)
     for wrong in (True, "hot", 4000.0, [20.0]):
         with pytest.raises(BundleError, match="no temperature of oil"):
-            tuned_spec(dataclasses.replace(grey, provenance=Provenance(more={"oil_c": wrong})))
+            choose_tuned_spec(dataclasses.replace(grey, provenance=Provenance(more={"oil_c": wrong})))
 
 
 def with_channel(recording, channel, value):
@@ -254,7 +254,7 @@ def test_what_cannot_be_is_refused_before_anything_is_written(run, adapted, leve
     with pytest.raises(ConfigError, match="only 1 inputs"):
         adapt(run, out, AdaptationSpec(rank=2))
     assert not out.exists()
-    bundle, _, _, data = trained_run(run)
+    bundle, _, _, data = read_trained_run(run)
     blind = dataclasses.replace(data.task, targets=("other",), mode="absolute")
     with pytest.raises(ConfigError, match="other is predicted, but not measured"):
         fit_adaptation(bundle.predictor, dataclasses.replace(data, task=blind), SPEC)

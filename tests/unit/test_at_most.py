@@ -10,11 +10,11 @@ from edp.cli import app
 from edp.config.experiment import load_experiment
 from edp.errors import ConfigError
 from edp.logs import write_recording
-from edp.logs.drawn import drawn_recordings
+from edp.logs.drawn import draw_recordings
 from edp.logs.source import DataSource
 from edp.recording import Recording
 from edp.workflows.judged_data import judged_data
-from edp.workflows.train_evaluate import train, trained_run
+from edp.workflows.train_evaluate import read_trained_run, train
 
 from .test_workflow import CHANNELS, SMALL
 
@@ -57,7 +57,7 @@ def test_an_inspection_says_that_it_looked_at_a_part_of_the_data(store):
     source = DataSource(store, at_most_h=0.2)
     ours = source.inspect()
     (note,) = [finding for finding in ours.findings if "--at-most" in finding.advice]
-    stretches = drawn_recordings(DataSource.of(store).read(), 0.2)
+    stretches = draw_recordings(DataSource.of(store).read(), 0.2)
     assert note.what.startswith(f"looked at 0.2 of 0.6278 h: {len(stretches)} evenly spread")
     assert not DataSource(store, at_most_h=5.0).inspect().findings
 
@@ -93,7 +93,7 @@ def test_an_evaluation_judges_on_stretches_and_says_so(run):
 
 
 def test_other_recordings_are_drawn_before_they_are_read(run, store):
-    bundle, _, _, data = trained_run(run)
+    bundle, _, _, data = read_trained_run(run)
     others = DataSource.of(store).read()
     judged, drawn = judged_data(bundle, data, others, 0.2)
     assert drawn is not None

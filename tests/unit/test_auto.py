@@ -23,7 +23,7 @@ from edp.wording import MISSING
 from edp.workflows.auto import load_auto, train_auto
 from edp.workflows.auto.candidates import CANDIDATES, Amount, RecurrentTrial, spans_of, tree_plan
 from edp.workflows.auto.promise import Promise, choose
-from edp.workflows.train_evaluate import DataSource, evaluate, trained_run
+from edp.workflows.train_evaluate import DataSource, evaluate, read_trained_run
 
 pytestmark = pytest.mark.processes
 
@@ -59,7 +59,7 @@ def test_the_run_is_that_of_the_chosen_candidate(result):
     _, folder, found = result
     assert found.choice.to_table()["chosen"] in found.choice.to_table()["candidates"]
     assert json.loads((folder / "auto.json").read_text())["sentence"] == found.sentence
-    bundle, experiment, provenance, _ = trained_run(folder)
+    bundle, experiment, provenance, _ = read_trained_run(folder)
     assert provenance.more["auto"] == found.sentence
     assert experiment.training.bagging is not None
     assert load_bundle(folder).predictor.spec == bundle.predictor.spec
@@ -176,7 +176,7 @@ def test_recordings_are_divided_by_time_where_whole_ones_are_no_parts(tmp_path, 
     source = DataSource.of(tmp_path / "logs", tmp_path / "map.toml")
     settings = [*SET[:3], "auto.candidates=['linear']", "judge.baselines=[]"]
     train_auto(source, load_auto(None, settings), tmp_path / "run")
-    _, experiment, _, data = trained_run(tmp_path / "run")
+    _, experiment, _, data = read_trained_run(tmp_path / "run")
     assert SPLITS.name_of(experiment.split) == kind
     assert sum(part.samples for part in data.train) > 0.5 * sum(lengths)
 

@@ -11,7 +11,7 @@ import pytest
 from edp.config.experiment import load_experiment
 from edp.errors import ConfigError, DataError
 from edp.workflows.auto import load_auto, train_auto
-from edp.workflows.train_evaluate import DataSource, evaluate, train, trained_run
+from edp.workflows.train_evaluate import DataSource, evaluate, read_trained_run, train
 
 pytestmark = pytest.mark.processes
 
@@ -66,7 +66,7 @@ def test_alone_it_is_kept_as_a_run_like_any_other(pretrained, tmp_path):
     changes = [*AUTO, f"auto.foundation='{pretrained}'", "auto.candidates=['foundation']"]
     found = train_auto(source, load_auto(None, changes), tmp_path / "run")
     assert found.choice.to_table()["chosen"] == "foundation"
-    bundle, experiment, _, _ = trained_run(tmp_path / "run")
+    bundle, experiment, _, _ = read_trained_run(tmp_path / "run")
     assert experiment.model == bundle.predictor.spec
     assert experiment.training.bagging is None
     assert train_auto(source, load_auto(None, changes), tmp_path / "run").choice.to_table() == found.choice.to_table()

@@ -13,7 +13,7 @@ import edp.training.bagging.table
 from edp.config.experiment import build
 from edp.data.features import FeatureSet
 from edp.data.fold_ridge import LEAST_GAIN, PENALTIES, fold_ridge
-from edp.data.folds import blocked_folds, recording_folds
+from edp.data.folds import make_block_folds, recording_folds
 from edp.data.prepared import prepare
 from edp.data.splits import ByRecording, ByTime
 from edp.data.task import TargetMode, Task
@@ -415,7 +415,7 @@ def test_long_recordings_are_thinned_out_evenly():
     assert found.table.stride > 1
     data = data_of(recording())
     truth = [np.zeros((part.samples - 4, 2)) for part in (*data.train, *data.validation)]
-    assert [len(one) for one in found.at_every_tick(truth)] == [len(one) for one in truth]
+    assert [len(one) for one in found.predict_all(truth)] == [len(one) for one in truth]
 
 
 def test_a_channel_that_never_moved_moves_no_prediction_later():
@@ -487,7 +487,7 @@ def test_too_few_rows_for_the_folds_are_refused():
 
 @pytest.mark.parametrize("pieces", [1, 2, 3])
 def test_a_fold_leaves_its_rows_and_their_neighbours_out(pieces):
-    folds = blocked_folds([100, 60], 4, gap=5, pieces=pieces)
+    folds = make_block_folds([100, 60], 4, gap=5, pieces=pieces)
     assert [len(folds.left_out(fold)) for fold in range(4)] == pytest.approx([40] * 4, abs=2)
     # Unbroken pieces, which the folds take in turn.
     assert np.count_nonzero(np.diff(folds.owner)) == 4 * pieces - 1
@@ -503,7 +503,7 @@ def test_fold_ridge_leaves_useless_columns_out():
     rng = np.random.default_rng(0)
     table = rng.normal(size=(400, 30))
     targets = table[:, :2] @ np.array([[1.0], [-2.0]]) + 0.5 * rng.normal(size=(400, 1))
-    found = fold_ridge(table, targets, blocked_folds([400], 5, 0), [np.arange(2), np.arange(30)])
+    found = fold_ridge(table, targets, make_block_folds([400], 5, 0), [np.arange(2), np.arange(30)])
     assert np.abs(found.mean()[0][2:]).max() == 0
     np.testing.assert_allclose(found.mean()[0][:2, 0], [1.0, -2.0], atol=0.1)
 
@@ -516,7 +516,7 @@ def test_fold_ridge_is_the_ridge_regression_of_each_fold(of_fold):
     targets = table[:, :3] @ np.ones((3, 1)) + 3.0 * rng.normal(size=(300, 1)) + 7.0
     if of_fold:
         targets = np.stack([targets + 0.1 * fold for fold in range(4)])
-    folds = blocked_folds([180, 120], 4, 7)
+    folds = make_block_folds([180, 120], 4, 7)
     assert any(len(folds.training[fold]) + len(folds.left_out(fold)) < 300 for fold in range(4))
     own = targets if of_fold else np.stack([targets] * 4)
     best, wanted = np.inf, np.zeros((300, 1))

@@ -62,7 +62,7 @@ def test_the_preset_auto_and_evaluations_run_within_one_thread(tmp_path, monkeyp
 
     # By its module: the package gives the function under the same name.
     monkeypatch.setattr(sys.modules[train_auto.__module__], "ReadOnce", tell)
-    monkeypatch.setattr(train_evaluate, "trained_run", tell)
+    monkeypatch.setattr(train_evaluate, "read_trained_run", tell)
     with threadpool_limits(limits=2, user_api="blas"):
         for call in (lambda: train_auto(Recordings(), None, tmp_path), lambda: evaluate(tmp_path)):
             with pytest.raises(Told) as told:

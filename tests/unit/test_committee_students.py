@@ -25,11 +25,11 @@ from edp.training.bagging.spec import BaggingSpec
 from edp.training.bagging.table import bank_rows
 from edp.training.compression.committee import committee_start
 from edp.training.compression.distillation import DistillationSpec
-from edp.training.compression.imitation import CommitteeImitation, moved_rows, predict_rows
+from edp.training.compression.imitation import CommitteeImitation, move_rows, predict_rows
 from edp.training.compression.pruning import check_pruning
 from edp.training.compression.qat import RoundingSpec
 from edp.training.fit import fit
-from edp.training.spec import TrainingSpec, by_gradient
+from edp.training.spec import TrainingSpec, to_gradient_training
 from edp.training.warm_start import WarmStart
 from edp.workflows.compression.bench import CompressionRequest
 
@@ -108,7 +108,7 @@ def test_moved_rows_combine_what_was_never_recorded_together():
     ticks = torch.arange(400.0)
     moving = torch.stack([torch.full((400,), 5.0), torch.sin(ticks / 5)], dim=1)
     rows = torch.cat([moving, torch.zeros(400, 2)])
-    moved = moved_rows(rows, 2000, torch.Generator().manual_seed(0))
+    moved = move_rows(rows, 2000, torch.Generator().manual_seed(0))
     at_rest = moved[moved[:, 0].abs() < 1e-6]
     assert moved.shape == (2000, 2)
     assert at_rest[:, 1].abs().max() > 1.0
@@ -173,14 +173,14 @@ def test_a_committee_trains_on_by_gradient_and_keeps_its_trees(data, teacher):
 
 def test_training_by_gradient_obeys_all_settings_that_were_given():
     spec = TrainingSpec(bagging=BaggingSpec(), epochs=3, patience=2)
-    plain = by_gradient(spec)
+    plain = to_gradient_training(spec)
     assert plain.bagging is None
     assert (plain.epochs, plain.patience) == (3, 2)
     assert plain.updates > 0
     assert plain.chunks.burn_in == 0
     own = replace(spec, chunks=ChunkSpec(length=32), updates=7)
-    assert by_gradient(own) == replace(own, bagging=None)
-    assert by_gradient(plain) is plain
+    assert to_gradient_training(own) == replace(own, bagging=None)
+    assert to_gradient_training(plain) is plain
 
 
 def test_committees_and_heads_without_hidden_features_are_not_pruned():

@@ -12,7 +12,7 @@ from edp.recording import Recording
 from edp.report.coverage.page import build_coverage_page
 from edp.signals import Channel, Kind
 from edp.testing.twins import sample_actuators
-from edp.workflows.twin.prepare_twin import prepared_twin
+from edp.workflows.twin.prepare_twin import cut_recordings
 
 RATE = 50.0
 
@@ -62,17 +62,17 @@ def test_a_twin_is_not_trained_on_a_stroke_in_another_unit():
     with pytest.raises(
         DataError, match=r"'stroke_2' changes by 1e\+03 times what velocity 'speed_2' adds up to.*scale"
     ):
-        prepared_twin(recordings, TwinExperiment(twin=StaticMap(prefix_ticks=5)))
+        cut_recordings(recordings, TwinExperiment(twin=StaticMap(prefix_ticks=5)))
     fine = [sample_actuators(seed=seed) for seed in range(4)]
-    assert prepared_twin(fine, TwinExperiment(twin=StaticMap(prefix_ticks=5)))[0].strokes
+    assert cut_recordings(fine, TwinExperiment(twin=StaticMap(prefix_ticks=5)))[0].strokes
 
 
 def test_a_twin_is_not_trained_on_commands_that_never_move():
     recordings = [rescaled(rescaled(sample_actuators(seed=seed), "lever_1", 0.0), "lever_2", 0.0) for seed in range(4)]
     with pytest.raises(DataError, match=r"no command \('lever_1', 'lever_2'\) changes in the training recordings"):
-        prepared_twin(recordings, TwinExperiment(twin=StaticMap(prefix_ticks=5)))
+        cut_recordings(recordings, TwinExperiment(twin=StaticMap(prefix_ticks=5)))
     one = [rescaled(sample_actuators(seed=seed), "lever_1", 0.0) for seed in range(4)]
-    assert prepared_twin(one, TwinExperiment(twin=StaticMap(prefix_ticks=5)))[0].commands
+    assert cut_recordings(one, TwinExperiment(twin=StaticMap(prefix_ticks=5)))[0].commands
 
 
 def test_coverage_says_so_and_asks_nothing_of_what_is_no_velocity():

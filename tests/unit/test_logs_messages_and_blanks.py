@@ -66,7 +66,7 @@ def test_a_table_of_messages_has_times_of_its_own_a_column(tmp_path):
     proposal = propose(path)
     assert proposal.repairs == ()
     assert proposal.targets == ("boom/position",)
-    assert "boom/lever" in [guess.channel for guess in proposal.proposal.of_role("command")]
+    assert "boom/lever" in [guess.channel for guess in proposal.proposal.select_role("command")]
 
 
 def test_empty_cells_of_a_usual_table_stay_missing_values(tmp_path):

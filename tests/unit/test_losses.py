@@ -21,8 +21,8 @@ from edp.networks.losses import (
     Prediction,
     Quantile,
     Smoothness,
+    compute_masked_loss,
     horizon_weights,
-    masked_loss,
     output_weights,
 )
 
@@ -81,7 +81,7 @@ def test_masked_loss_is_the_mean_over_valid_ticks():
     prediction, target = torch.randn(2, 2, 5, 3, 2).double()
     valid = torch.tensor([[True, False, True, True, False], [False] * 5])
     weights = torch.tensor([[0.5, 1.5], [1.0, 1.0], [1.2, 0.8]]).double()
-    found = masked_loss(MeanSquared(), point(prediction), target, valid, weights)
+    found = compute_masked_loss(MeanSquared(), point(prediction), target, valid, weights)
     rows = [(prediction[0, t] - target[0, t]).square() * weights for t in (0, 2, 3)]
     torch.testing.assert_close(found, torch.stack(rows).mean())
 
@@ -89,13 +89,13 @@ def test_masked_loss_is_the_mean_over_valid_ticks():
 def test_ticks_that_do_not_count_give_no_gradient():
     prediction = torch.zeros(1, 4, 1, 1, requires_grad=True)
     valid = torch.tensor([[False, True, False, True]])
-    masked_loss(Huber(), point(prediction), torch.ones(1, 4, 1, 1), valid, torch.ones(1)).backward()
+    compute_masked_loss(Huber(), point(prediction), torch.ones(1, 4, 1, 1), valid, torch.ones(1)).backward()
     assert prediction.grad.flatten().tolist() == [0.0, -0.5, 0.0, -0.5]
 
 
 def test_a_batch_without_valid_ticks_costs_nothing():
     nothing = torch.zeros(2, 3, dtype=torch.bool)
-    loss = masked_loss(Huber(), point(torch.ones(2, 3, 1, 1)), torch.zeros(2, 3, 1, 1), nothing, torch.ones(1))
+    loss = compute_masked_loss(Huber(), point(torch.ones(2, 3, 1, 1)), torch.zeros(2, 3, 1, 1), nothing, torch.ones(1))
     assert loss == 0
 
 

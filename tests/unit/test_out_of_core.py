@@ -11,7 +11,7 @@ from noted_progress import NotedProgress
 
 from edp.data.chunks import ChunkSampler, ChunkSpec
 from edp.data.features import Derived, FeatureSet
-from edp.data.gathered import LastMade, made_when_read, on_demand, some_columns
+from edp.data.gathered import LastMade, make_lazy_array, on_demand, some_columns
 from edp.data.moments import Moments
 from edp.data.order import RandomOrder
 from edp.data.prepared import prepare
@@ -191,7 +191,7 @@ def test_features_are_made_when_they_are_read_one_recording_at_a_time(stored):
     for part, one in zip(parts, columns, strict=True):
         np.testing.assert_array_equal(one[10:20], feature_matrix(task, part)[10:20, places])
     made = []
-    values = made_when_read((3, 1), lambda: made.append(1) or np.zeros((3, 1), dtype=np.float32), slot)
+    values = make_lazy_array((3, 1), lambda: made.append(1) or np.zeros((3, 1), dtype=np.float32), slot)
     for _ in range(4):
         values[0:2]
     assert len(made) == 1

@@ -4,7 +4,7 @@ import torch
 
 from edp.data.features import Derived, FeatureSet
 from edp.data.lags import LagTask
-from edp.data.ridge import crossed_solution, ridge_solution
+from edp.data.ridge import cross_validate_ridge, ridge_solution
 from edp.data.scaling import fit_scaler
 from edp.data.series import Series
 from edp.data.task import TargetMode, Task
@@ -120,7 +120,7 @@ def test_the_crossed_regression_is_the_plain_one_on_all_stretches():
     task = Task(FEATURES, ("speed",), (1, 3), TargetMode.DELTA, 100.0)
     parts = [series(task, 1, 57), series(task, 2, 41)]
     lags = LagTask((1, 3), (0,), 4)
-    got = crossed_solution(parts, lags, penalties=[1e-3], histories=[4])
+    got = cross_validate_ridge(parts, lags, penalties=[1e-3], histories=[4])
     wanted = ridge_solution(parts, lags, penalties=[1e-3], histories=[4])
     np.testing.assert_allclose(got.predict(parts[0].inputs), wanted.predict(parts[0].inputs), rtol=1e-7)
 
@@ -134,7 +134,7 @@ def test_cross_validation_chooses_penalty_and_history_that_generalise():
         y = np.concatenate([[0.0], x[:-1, 0]]) + 0.5 * rng.normal(size=samples)
         return Series("made", x.astype(np.float32), y[:, None].astype(np.float32))
 
-    got = crossed_solution([made(150)], task, penalties=[1e-6, 1e-2])
+    got = cross_validate_ridge([made(150)], task, penalties=[1e-6, 1e-2])
     test = made(2000)
     error = np.std(got.predict(test.inputs)[:-1, 0, 0] - test.targets[20:, 0])
     assert got.history[0, 0] == 3
@@ -145,7 +145,7 @@ def test_a_crossed_start_learns_from_validation_too_and_is_kept_whole():
     task = Task(FEATURES, ("speed",), (3,), TargetMode.DELTA, 100.0)
     predictor, train, validation = start(task, start="crossed")
     parts = [Series(part.name, features_of(part), part.targets) for part in [*train, *validation]]
-    wanted = crossed_solution(parts, LagTask((3,), (0,), TAPS))
+    wanted = cross_validate_ridge(parts, LagTask((3,), (0,), TAPS))
     test = series(task, 4, 90)
     x = torch.from_numpy(test.inputs).double()[None]
     with torch.no_grad():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from edp.data.screening import FlagKind, ScreeningSpec
-from edp.data.screening.artefacts import broken_flags
+from edp.data.screening.artefacts import flag_broken
 from edp.data.screening.table import build_table
 from edp.recording import Recording
 from edp.signals import Channel, Kind
@@ -35,7 +35,7 @@ def table():
 
 
 def test_one_gain_with_two_signs_is_an_artefact(table):
-    turned, sometimes = broken_flags(table, list(range(6)), [1, 2, 3, 4, 5], [0])
+    turned, sometimes = flag_broken(table, list(range(6)), [1, 2, 3, 4, 5], [0])
     assert (turned.channel, turned.kind, turned.source) == ("turned", FlagKind.ARTEFACT, "v")
     assert "other sign in 4 of them" in turned.evidence
     assert (sometimes.channel, sometimes.kind, sometimes.source) == ("sometimes", FlagKind.ARTEFACT, "v")
@@ -43,5 +43,5 @@ def test_one_gain_with_two_signs_is_an_artefact(table):
 
 
 def test_only_what_is_judged_is_flagged(table):
-    assert broken_flags(table, list(range(6)), [1, 3], [0]) != []
-    assert broken_flags(table, list(range(6)), [3, 4], [0]) == []
+    assert flag_broken(table, list(range(6)), [1, 3], [0]) != []
+    assert flag_broken(table, list(range(6)), [3, 4], [0]) == []

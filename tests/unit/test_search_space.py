@@ -12,7 +12,7 @@ from edp.config.experiment import Experiment, build, load_experiment, merged, pl
 from edp.errors import ConfigError
 from edp.networks.blocks import BLOCKS
 from edp.networks.predictor import check_combination
-from edp.workflows.search.modules import MODULES, THESIS_MODULES, conflicts, contradicting, fitting, with_modules
+from edp.workflows.search.modules import MODULES, THESIS_MODULES, add_modules, conflicts, contradicting, fitting
 from edp.workflows.search.space import DIMENSIONS, THESIS, Choice, Real, applicable, apply, check, elastic, names
 
 PAGE = Path(__file__).parents[2] / "docs" / "settings.md"
@@ -32,7 +32,7 @@ def listed():
 @pytest.mark.parametrize(("title", "setting"), listed(), ids=lambda value: value if "=" not in value else "")
 def test_each_module_is_what_the_settings_page_says(title, setting):
     (name,) = [name for name, module in MODULES.items() if module.title == title]
-    made = build(Experiment, with_modules(settings(), [name]), "test")
+    made = build(Experiment, add_modules(settings(), [name]), "test")
     wanted = load_experiment(None, "quick", ["model.blocks=[]", 'model.backbone={kind="hybrid"}', setting])
     assert made == wanted
 
@@ -55,9 +55,9 @@ def test_modules_that_fit_can_be_built_in_any_pair_that_does_not_contradict(back
     for pair in combinations(free, 2):
         if frozenset(pair) in barred:
             with pytest.raises(ConfigError, match="modules: "):
-                with_modules(base, pair)
+                add_modules(base, pair)
             continue
-        made = build(Experiment, with_modules(base, pair), "test")
+        made = build(Experiment, add_modules(base, pair), "test")
         check_combination(made.task.resolve(100.0, physics=made.model.physics), made.model)
 
 
@@ -69,11 +69,11 @@ def test_what_fits_depends_on_the_network():
     assert not {"gru", "zoneout", "temporal_difference"} & set(fitting(settings("tcn")))
     has_it = settings("hybrid", 'model.blocks=["temporal_difference"]')
     assert "temporal_difference" not in fitting(has_it)
-    assert with_modules(has_it, ["temporal_difference"]) == has_it
+    assert add_modules(has_it, ["temporal_difference"]) == has_it
 
 
 def test_all_less_the_contradictions_go_together():
-    made = with_modules(settings(), set(MODULES) - {"gru", "physics_residual"})
+    made = add_modules(settings(), set(MODULES) - {"gru", "physics_residual"})
     kinds = [block["kind"] for block in made["model"]["blocks"]]
     assert sorted(kinds) == sorted(set(MODULES) & set(BLOCKS))
     assert build(Experiment, made, "test").model.backbone.zoneout == 0.1
@@ -81,7 +81,7 @@ def test_all_less_the_contradictions_go_together():
 
 @given(st.permutations(["squeeze_excitation", "temporal_difference", "glu_head", "stanh"]))
 def test_the_order_of_modules_does_not_matter(order):
-    assert with_modules(BASE, order) == with_modules(BASE, sorted(order))
+    assert add_modules(BASE, order) == add_modules(BASE, sorted(order))
 
 
 BASE = settings()
@@ -91,9 +91,9 @@ def test_contradictions_say_why():
     (reason,) = conflicts(settings(), ["gru", "layer_norm_lstm"])
     assert reason == "'gru' and 'layer_norm_lstm' both set model.backbone.cell.kind; keep one of them"
     with pytest.raises(ConfigError, match=r"with gru, zoneout[\s\S]*zoneout keeps the h and c"):
-        with_modules(settings(), ["zoneout", "gru"])
+        add_modules(settings(), ["zoneout", "gru"])
     with pytest.raises(ConfigError, match=r"unknown module 'sqeeze_excitation'.*squeeze_excitation"):
-        with_modules(settings(), ["sqeeze_excitation"])
+        add_modules(settings(), ["sqeeze_excitation"])
 
 
 def test_the_feature_set_of_all_channels_needs_their_names():

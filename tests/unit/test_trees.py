@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from sklearn.ensemble import HistGradientBoostingRegressor
 
 from edp.ir import Graph
-from edp.ir.descent import reached_leaves, summed
+from edp.ir.descent import find_leaves, summed
 from edp.ir.layers import NEVER, BinaryOperation, Dense, Elementwise, Gather, Standardise, TreeSums
 from edp.ir.reference import Reference
 from edp.ir.w8a16 import Formats, quantise
@@ -18,7 +18,7 @@ from edp.ir.w8a16.balance import balanced
 from edp.ir.w8a16.quantise import halves
 from edp.networks import trees as trees_file
 from edp.networks.trees import Trees
-from edp.training.tree_tables import below_or_equal, complete_tables, stacked_tables
+from edp.training.tree_tables import below_or_equal, complete_tables, stack_tables
 
 SIZES = st.tuples(st.integers(1, 6), st.integers(1, 3), st.integers(1, 5), st.integers(1, 4))
 """Width, outputs, trees, depth."""
@@ -61,7 +61,7 @@ def module_of(sizes, feature, threshold, leaf):
 def test_a_tick_goes_from_node_to_node(sizes, seed):
     feature, threshold, leaf, rows = drawn(sizes, seed)
     wanted = np.array([walked(feature, threshold, leaf, row) for row in rows])
-    leaves = reached_leaves(feature.astype(np.uint16), threshold, leaf, rows)
+    leaves = find_leaves(feature.astype(np.uint16), threshold, leaf, rows)
     np.testing.assert_array_equal(summed(leaves), wanted)
     module, x = module_of(sizes, feature, threshold, leaf), torch.from_numpy(rows)[None]
     torch.testing.assert_close(module(x, ())[0][0], torch.from_numpy(wanted), rtol=1e-6, atol=1e-6)
@@ -142,7 +142,7 @@ def fitted():
 @pytest.mark.parametrize("depth", [4, 6])
 def test_fitted_trees_predict_the_same_as_tables(fitted, depth):
     model, x = fitted
-    feature, threshold, leaf = stacked_tables([complete_tables(model, depth)], 33)
+    feature, threshold, leaf = stack_tables([complete_tables(model, depth)], 33)
     assert feature.shape == (1, 33, 2**depth - 1)
     wanted = model.predict(x)
     module = module_of((6, 1, 33, depth), feature, threshold, leaf)
@@ -155,7 +155,7 @@ def test_trees_that_do_not_fit_into_the_tables_are_refused(fitted):
     with pytest.raises(ValueError, match="deeper than 3; grow trees with max_depth = 3"):
         complete_tables(model, 3)
     with pytest.raises(ValueError, match="an output has 30 trees; at most 29"):
-        stacked_tables([complete_tables(model, 4)], 29)
+        stack_tables([complete_tables(model, 4)], 29)
     draw = np.random.default_rng(1)
     x, y = draw.integers(0, 4, (200, 1)), draw.normal(size=200)
     by_category = HistGradientBoostingRegressor(categorical_features=[0], max_iter=2).fit(x, y + (x[:, 0] == 2))
@@ -173,7 +173,7 @@ def test_integer_thresholds_split_the_grid_as_the_real_one(threshold, frac, seed
     chosen = integer_layer(layer, frac, 3)
     q = np.append(np.random.default_rng(seed).integers(-32767, 32768, 50), [-32767, 32767, 0])
     q = np.append(q, np.clip(np.floor(float(limit) * 2.0**frac) + np.arange(-1, 2), -32767, 32767)).astype(np.int64)
-    found = reached_leaves(chosen.feature, chosen.threshold, chosen.leaf, q[:, None])[:, 0, 0] > 0
+    found = find_leaves(chosen.feature, chosen.threshold, chosen.leaf, q[:, None])[:, 0, 0] > 0
     np.testing.assert_array_equal(found, q * 2.0**-frac > float(limit))
 
 

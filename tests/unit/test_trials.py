@@ -18,8 +18,8 @@ from edp.workflows.feature_selection.trials import (
     TrialSpec,
     _difference,
     _drawn,
+    add_differences,
     try_feature_sets,
-    with_differences,
 )
 
 pytestmark = pytest.mark.processes
@@ -137,9 +137,9 @@ def test_differences_are_paired():
 
 def test_pressures_get_their_differences():
     settings = FeatureSettings(channels=("v", "p"), derived=(Derived("dv", "v"),))
-    named = with_differences(settings, drive("d", 1), "with")
+    named = add_differences(settings, drive("d", 1), "with")
     assert named.derived == (Derived("dv", "v"), Derived("dp", "p", "difference", Kind.PRESSURE))
-    assert with_differences(named, drive("d", 1), "with") == named
+    assert add_differences(named, drive("d", 1), "with") == named
 
 
 @pytest.mark.parametrize(

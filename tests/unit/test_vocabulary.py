@@ -9,7 +9,7 @@ import pytest
 from edp.errors import ConfigError, DataError, closest
 from edp.logs.read import read_recording
 from edp.logs.source import DataSource
-from edp.logs.units import mapped_channel
+from edp.logs.units import channel_from_entry
 from edp.recording import Recording
 from edp.registry import Registry
 from edp.settings.tree import plain_tree
@@ -71,9 +71,9 @@ def test_report_units_invert_to_si():
 
 
 def test_map_entries_take_the_kind_of_the_vocabulary_or_their_own():
-    assert mapped_channel(ChannelMap("CylVels_1", "v")) is TABLE_A1["CylVels_1"]
-    assert mapped_channel(ChannelMap("Load", "F", kind=Kind.FORCE)) == Channel("Load", Kind.FORCE)
-    assert mapped_channel(ChannelMap("x", "x")).kind is Kind.GENERIC
+    assert channel_from_entry(ChannelMap("CylVels_1", "v")) is TABLE_A1["CylVels_1"]
+    assert channel_from_entry(ChannelMap("Load", "F", kind=Kind.FORCE)) == Channel("Load", Kind.FORCE)
+    assert channel_from_entry(ChannelMap("x", "x")).kind is Kind.GENERIC
     with pytest.raises(ConfigError, match=r"names channel.*twice: a"):
         SignalMap((ChannelMap("a", "x"), ChannelMap("a", "y")))
 
@@ -106,9 +106,9 @@ def test_models_of_earlier_versions_read_logs_as_they_were_trained():
     signal_map = SignalMap((ChannelMap("Load", "F", unit="kN"), ChannelMap("CylVels_1", "v", unit="mm/s")))
     source = DataSource(Path("log.csv"), signal_map)
     again = DataSource.from_plain(source.to_plain()).signal_map
-    assert [mapped_channel(entry).kind for entry in again.channels] == [Kind.FORCE, Kind.VELOCITY]
+    assert [channel_from_entry(entry).kind for entry in again.channels] == [Kind.FORCE, Kind.VELOCITY]
     before = DataSource.from_plain({"path": "log.csv", "map": plain_tree(signal_map)}).signal_map
-    assert [mapped_channel(entry).kind for entry in before.channels] == [Kind.GENERIC, Kind.VELOCITY]
+    assert [channel_from_entry(entry).kind for entry in before.channels] == [Kind.GENERIC, Kind.VELOCITY]
 
 
 def test_closest_names():

@@ -9,7 +9,7 @@ import typer
 
 from edp.cli.console import JsonFlag, emit, out, table
 from edp.cli.options import LogsArgument, MapOption, RepairOption, SettingsOption, source_of
-from edp.cli.progress import shown_progress
+from edp.cli.progress import show_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.wording import figure, percent
 
@@ -84,7 +84,7 @@ def replay(
     from edp.evaluation.guard import adaptation_verdict
     from edp.workflows.adaptation import replay_run
 
-    with shown_progress("replay", as_json, "done") as progress:
+    with show_progress("replay", as_json, "done") as progress:
         content = replay_run(run, source_of(logs, signal_map, repair), carry, not frozen, progress, twin)
 
     verdict = adaptation_verdict(content)

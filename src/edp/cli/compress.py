@@ -10,7 +10,7 @@ import typer
 
 from edp.cli.console import JsonFlag, emit, out, print_table
 from edp.cli.options import DataOption, MapOption, RepairOption, SettingsOption, source_if_given
-from edp.cli.progress import shown_progress
+from edp.cli.progress import show_progress
 
 if TYPE_CHECKING:
     from edp.evaluation.compression import CompressionResult
@@ -55,7 +55,7 @@ def compress(
     spec, others = command_settings("compress", CompressionSearchSpec, config, [*changes, *own], TRAINING_TABLES)
     request = CompressionSearchRequest(spec=spec, again=again, changes=others)
     source = source_if_given(data, signal_map, repair)
-    with shown_progress("compress", as_json) as progress:
+    with show_progress("compress", as_json) as progress:
         compression = search(bundle, request, folder, source, progress)
     page = write_compression_page(folder)
 

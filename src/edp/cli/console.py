@@ -22,7 +22,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from edp.cli.options import check_belonging, setting_of
-from edp.cli.process import memory_message, out_of_memory, stopped_code
+from edp.cli.process import exit_code_of_stop, memory_message, out_of_memory
 from edp.errors import ConfigError, EdpError
 from edp.table import Column, Table
 
@@ -72,10 +72,10 @@ class Terminal(Console):
 
     def print(self, *objects: Any, **options: Any) -> None:
         """Print text, or a renderable of this module."""
-        super().print(*(_shown(part) if isinstance(part, str) else part for part in objects), **options)
+        super().print(*(_to_text(part) if isinstance(part, str) else part for part in objects), **options)
 
 
-def _shown(text: str) -> Text:
+def _to_text(text: str) -> Text:
     return Text("\n".join(map(visible, KEPT_BREAK.split(text))))
 
 
@@ -127,13 +127,13 @@ def print_table(table: Table) -> None:
 
     Figures that do not fit beside each other stand below each other, each block with the first column.
     """
-    table = table.without_empty_columns()
-    headings, rows = table.heads(), [[_shown(cell) for cell in row] for row in table.texts()]
+    table = table.drop_empty_columns()
+    headings, rows = table.heads(), [[_to_text(cell) for cell in row] for row in table.texts()]
     widths = _widths(headings, rows)
     has_words = any(column.is_text for column in table.columns[1:])
     for i, block in enumerate([list(range(len(widths)))] if has_words else _blocks(widths, out.width)):
         printed_table = RichTable(
-            title=_shown(table.caption) if table.caption and not i else None,
+            title=_to_text(table.caption) if table.caption and not i else None,
             title_justify="left",
             title_style="bold",
             header_style="bold",
@@ -146,7 +146,7 @@ def print_table(table: Table) -> None:
             wide = len(block) == 2 and sum(widths[other] + _GAP for other in block) > out.width
             folded = column == 0 or wide or table.columns[column].is_text
             printed_table.add_column(
-                _shown(headings[column]), justify="left" if folded else "right", overflow="fold", no_wrap=not folded
+                _to_text(headings[column]), justify="left" if folded else "right", overflow="fold", no_wrap=not folded
             )
         for row, cells in enumerate(rows):
             printed_table.add_row(
@@ -173,7 +173,7 @@ def _cell(value: Any) -> str:
 def _widths(headings: Sequence[str], rows: Sequence[Sequence[Text]]) -> list[int]:
     """Return the width of each column."""
     return [
-        max([_shown(heading).cell_len, *(row[i].cell_len for row in rows if i < len(row))])
+        max([_to_text(heading).cell_len, *(row[i].cell_len for row in rows if i < len(row))])
         for i, heading in enumerate(headings)
     ]
 
@@ -201,7 +201,7 @@ class Words(ProgressColumn):
 
     def render(self, task: Task) -> Text:
         """Return the present words."""
-        return _shown(self.of_task(task))
+        return _to_text(self.of_task(task))
 
 
 class BoundedProgress(Progress):
@@ -228,10 +228,10 @@ class TimeLeft(ProgressColumn):
         """Return the time now."""
         if task.finished:
             return Text("" if task.finished_time is None else duration(task.finished_time))
-        return Text("" if task.time_remaining is None else left_text(task.time_remaining).removeprefix(", "))
+        return Text("" if task.time_remaining is None else format_time_left(task.time_remaining).removeprefix(", "))
 
 
-def left_text(seconds: float) -> str:
+def format_time_left(seconds: float) -> str:
     """Return ``, 5 s left`` for a line of progress; empty where the estimate is used up or not finite.
 
     Args:
@@ -341,7 +341,7 @@ def run_app(app: typer.Typer | Callable[..., Any]) -> int:
         return done.exit_code
     except (KeyboardInterrupt, typer.Abort):
         err.print("stopped; what was finished is on disk: give the same command again to go on")
-        return stopped_code(INTERRUPTED)
+        return exit_code_of_stop(INTERRUPTED)
     except OSError as error:
         return _say_system(error)
     except Exception as error:

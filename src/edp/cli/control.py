@@ -10,7 +10,7 @@ import typer
 from edp.cli.consent import ask_for_fmus
 from edp.cli.console import JsonFlag, emit, out, table
 from edp.cli.options import MOST_LOOPS, ClusterOption, OpenOption, WorkersOption, workers_of
-from edp.cli.progress import shown_progress
+from edp.cli.progress import show_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.storage.paths import full_path
 from edp.wording import figure, number
@@ -79,7 +79,7 @@ def control(
 
         guard = monitor_guard(monitor)
     experiment = load_control_experiment(config, changes, _options(task, machine, controller, seeds))
-    with shown_progress("control", as_json, "loops run") as progress:
+    with show_progress("control", as_json, "loops run") as progress:
         sources = ControlSources(plant, twin, predictor, trusted=True)
         divided = workers_of(workers, cluster, open_cluster)
         run = control_loops(experiment, folder, sources, progress, guard, divided)
@@ -128,7 +128,7 @@ def tune(
 
     ask_for_fmus(yes, on, plant)
     experiment = load_control_experiment(config, changes, _options(task, machine, controller, seeds))
-    with shown_progress("tune", as_json, "trials run") as progress:
+    with show_progress("tune", as_json, "trials run") as progress:
         tuned_on, judged_on = (ControlSources(where, twin, predictor, trusted=True) for where in (on, plant))
         tuning_spec, divided = TuningSpec(trials=trials, loops=loops), workers_of(workers, cluster, open_cluster)
         tuning = tune_gains(experiment, folder, tuned_on, judged_on, tuning_spec, progress, divided)

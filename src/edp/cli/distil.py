@@ -10,7 +10,7 @@ import typer
 
 from edp.cli.console import JsonFlag, duration, emit, out, table
 from edp.cli.options import DataOption, MapOption, RepairOption, SettingsOption, source_if_given
-from edp.cli.progress import shown_progress
+from edp.cli.progress import show_progress
 from edp.errors import ConfigError
 from edp.storage.reading import Table
 from edp.wording import figure
@@ -67,7 +67,7 @@ def distil(
         changes=others,
     )
     source = source_if_given(data, signal_map, repair)
-    with shown_progress("distil", as_json) as progress:
+    with show_progress("distil", as_json) as progress:
         bundle = make(run, request, folder, source, progress)
     counts = {"teacher": footprint(load_bundle(run).predictor), "student": footprint(bundle.predictor)}
     facts = {

@@ -186,9 +186,9 @@ def sandbox_layers() -> list[InstallationCheck]:
 
     Looks at nothing by itself: `reading` reads a log.
     """
-    from edp.sandbox.layers import LAYERS, seen_layers
+    from edp.sandbox.layers import LAYERS, get_seen_layers
 
-    seen = seen_layers()
+    seen = get_seen_layers()
     checks = []
     for layer in LAYERS:
         reason = "not tried: no log was read" if seen is None else seen[layer.name]

@@ -24,7 +24,7 @@ from edp.cli.options import (
     within,
     workers_of,
 )
-from edp.cli.progress import shown_progress
+from edp.cli.progress import show_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.settings.bounds import above, span
 from edp.wording import figure, number, percent, setting_text
@@ -91,12 +91,12 @@ def evaluate(
         return
     from edp.evaluation.guard import network_verdict
     from edp.report.run.choice import promise_line, read_choice
-    from edp.report.run.outputs import judged_line, losses_line, minutes_of, situation_line
+    from edp.report.run.outputs import describe_evaluation, losses_line, minutes_of, situation_line
     from edp.settings.provenance import read_provenance
 
     folder, scores = run_evaluation(run, source, names, as_json, minutes, divided, at_most)
     verdict = network_verdict(scores, minutes_of(run))
-    lost, judged = losses_line(scores), judged_line(scores, read_provenance(run))
+    lost, judged = losses_line(scores), describe_evaluation(scores, read_provenance(run))
     choice = read_choice(run) if source is None else None
     beyond, promise = situation_line(scores), "" if choice is None else promise_line(choice)
     importances = run_importance(run, source, as_json, at_most) if channel_importance else None
@@ -122,7 +122,7 @@ def evaluate(
 def show_scores(scores: ScoresFile, sentences: Sequence[str], minutes: float | None) -> None:
     """Print the tables of an evaluation, its messages, and the parts omitted for lack of time."""
     score_table(scores)
-    by_situation_table(scores)
+    print_situation_table(scores)
     for sentence in sentences:
         if sentence:
             out.print(sentence)
@@ -146,23 +146,23 @@ def baseline_names(text: str) -> list[str]:
 
 def evaluate_twin_run(run: Path, source: DataSource | None, predictor: Path | None, as_json: bool) -> None:
     """Judge a twin with a progress display, and print its scores."""
-    from edp.cli.twin import ahead_table, coverage_table, score_table, situation_table
-    from edp.evaluation.beyond import beyond_sentence
+    from edp.cli.twin import coverage_table, print_ahead_table, score_table, situation_table
+    from edp.evaluation.beyond import describe_excess
     from edp.evaluation.free_run_file import TWIN, FreeRunFile
     from edp.evaluation.guard import twin_verdict
     from edp.workflows.twin import evaluate_twin
 
-    with shown_progress("evaluate", as_json) as progress:
+    with show_progress("evaluate", as_json) as progress:
         folder = evaluate_twin(run, source, predictor, progress)
     scores = FreeRunFile.read(folder)
     verdict = twin_verdict(scores.models)
 
     def show() -> None:
         show_verdict(verdict)
-        if note := beyond_sentence(scores.models[TWIN].beyond):
+        if note := describe_excess(scores.models[TWIN].beyond):
             out.print(note, style="bold")
         score_table(scores.models)
-        for show_table in (coverage_table, situation_table, ahead_table):
+        for show_table in (coverage_table, situation_table, print_ahead_table):
             show_table(scores.models[TWIN])
         out.print(f"scores in {folder / FreeRunFile.NAME}")
         out.print(f"next: edp report {folder}")
@@ -185,7 +185,7 @@ def run_evaluation(
     from edp.jobs import IN_PROCESS
     from edp.workflows.train_evaluate import evaluate as judge_run
 
-    with shown_progress("evaluate", quiet, timed=True) as progress:
+    with show_progress("evaluate", quiet, timed=True) as progress:
         folder = judge_run(run, source, names, progress, minutes, workers or IN_PROCESS, at_most_h)
     return folder, ScoresFile.read(folder)
 
@@ -196,7 +196,7 @@ def run_importance(
     """Take channels away with a progress display."""
     from edp.workflows.train_evaluate import channel_importance
 
-    with shown_progress("channel importance", quiet, "removed") as progress:
+    with show_progress("channel importance", quiet, "removed") as progress:
         importances, _ = channel_importance(run, source, progress=progress, at_most_h=at_most_h)
     return importances
 
@@ -238,7 +238,7 @@ def score_table(scores: ScoresFile) -> None:
             figures = [figure(metric(s, key)) for key in (MEASURE, "mae", "p95", "p99", "composite")]
             rows.append((metric(s, MEASURE), [model.label, *figures, r2]))
         rows.sort(key=lambda row: row[0])
-        ahead = _ahead(scores, horizon)
+        ahead = _horizon_text(scores, horizon)
         heads = ["model", MEASURE_NAME, "MAE", "P95", "P99", "composite", "R2"]
         table(f"{ahead}, mean over outputs, {unit}", heads, [row for _, row in rows])
     interval_rows(scores, unit)
@@ -249,12 +249,12 @@ def score_table(scores: ScoresFile) -> None:
             )
 
 
-def _ahead(scores: ScoresFile, horizon: int) -> str:
+def _horizon_text(scores: ScoresFile, horizon: int) -> str:
     rate = scores.task.rate_hz
     return f"k = {horizon}" if rate is None else f"{number(1e3 * horizon / rate, 0)} ms ahead (k = {horizon})"
 
 
-def by_situation_table(scores: ScoresFile) -> None:
+def print_situation_table(scores: ScoresFile) -> None:
     """Print the network's error by motion of the axes, at the longest horizon, if the scores contain it."""
     from edp.report.run.tables import situation_table
 
@@ -276,7 +276,7 @@ def _tables_by_output(scores: ScoresFile) -> None:
             model.label: [metric(model.overall[str(horizon)][t.name], MEASURE) for t in targets]
             for model in scores.models.values()
         }
-        ahead = _ahead(scores, horizon)
+        ahead = _horizon_text(scores, horizon)
         rows = [[label, *(figure(value) for value in values)] for label, values in errors.items()]
         table(f"{ahead}, {MEASURE_NAME} of each output", heads, rows)
     for name, model in scores.models.items():

@@ -18,7 +18,7 @@ from edp.cli.options import (
     source_of,
     workers_of,
 )
-from edp.cli.progress import shown_progress
+from edp.cli.progress import show_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.errors import ConfigError
 from edp.wording import figure
@@ -93,9 +93,11 @@ def finetune(
         return
     if not logs or delta_kb is not None:
         raise ConfigError("give LOGS of one machine, or --fleet with a store of many, to which --delta-kb belongs")
-    order = FinetuneRequest(spec=spec, method=method, baselines=_named(baselines, tuple(METHODS)), changes=others)
+    order = FinetuneRequest(
+        spec=spec, method=method, baselines=_parse_baselines(baselines, tuple(METHODS)), changes=others
+    )
     source = source_of(logs, signal_map, repair)
-    with shown_progress("finetune", as_json) as progress:
+    with show_progress("finetune", as_json) as progress:
         result = make(bundle, source, order, folder, progress, divided)
     page = write_transfer_page(folder)
     facts = read_transfer(folder)
@@ -118,7 +120,7 @@ def _finetune_fleet(
     """Fine-tune for every machine of a store with a progress display, and print the results."""
     from edp.workflows.fleet.personal import finetune_fleet
 
-    with shown_progress("finetune", as_json) as progress:
+    with show_progress("finetune", as_json) as progress:
         content = finetune_fleet(workers, bundle, store, order, folder, progress)
 
     def show() -> None:
@@ -138,7 +140,7 @@ def _finetune_fleet(
     emit(as_json, content.to_table(), show)
 
 
-def _named(baselines: str, every: tuple[str, ...]) -> tuple[str, ...]:
+def _parse_baselines(baselines: str, every: tuple[str, ...]) -> tuple[str, ...]:
     """Names of methods from the text of ``--baselines``."""
     special = {"all": every, "none": ()}
     return (

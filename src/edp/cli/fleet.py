@@ -9,7 +9,7 @@ import typer
 
 from edp.cli.console import JsonFlag, emit, out, print_table
 from edp.cli.options import ClusterOption, OpenOption, WorkersOption, workers_of
-from edp.cli.progress import shown_progress
+from edp.cli.progress import show_progress
 from edp.storage.paths import full_path
 
 app = typer.Typer(
@@ -42,7 +42,7 @@ def report(
     from edp.workflows.fleet.judge_fleet import PAGE, FleetQuestion, report_fleet
 
     question = FleetQuestion(network=network, store=store, deltas=deltas, monitor=monitor)
-    with shown_progress("judge", as_json) as progress:
+    with show_progress("judge", as_json) as progress:
         facts = report_fleet(workers_of(workers, cluster, open_cluster), question, folder, progress)
     page = full_path(folder / PAGE)
 

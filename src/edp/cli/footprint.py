@@ -33,7 +33,7 @@ def footprint(
 
     limits_of = Budget() if budget is None else load_budget(budget)
     if holds_monitor(file):
-        _of_monitor(file, limits_of, as_json)
+        _print_monitor_footprint(file, limits_of, as_json)
         return
     counts, name = footprint_of(file, None if budget is None else limits_of)
     facts = {"name": name, **counts.to_json(limits_of)}
@@ -59,7 +59,7 @@ def footprint(
     emit(as_json, facts, show)
 
 
-def _of_monitor(file: Path, limits: Budget, as_json: bool) -> None:
+def _print_monitor_footprint(file: Path, limits: Budget, as_json: bool) -> None:
     """Networks of a monitor, the chain behind them, and both against a budget."""
     from edp.evaluation.controller import CORES
     from edp.workflows.monitor.export_monitor import monitor_footprint_of

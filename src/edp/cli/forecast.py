@@ -9,7 +9,7 @@ import typer
 
 from edp.cli.console import JsonFlag, emit, out, table
 from edp.cli.options import LogsArgument, MapOption, RepairOption, source_of
-from edp.cli.progress import shown_progress
+from edp.cli.progress import show_progress
 from edp.errors import count_of
 from edp.settings.results import plain_value
 from edp.wording import figure
@@ -44,7 +44,7 @@ def forecast(
     """
     from edp.workflows.twin import forecast_logs
 
-    with shown_progress("forecast", as_json) as progress:
+    with show_progress("forecast", as_json) as progress:
         result = forecast_logs(run, source_of(data, signal_map, repair), ahead, folder, answer, gain, progress)
     facts = {
         "folder": str(folder),

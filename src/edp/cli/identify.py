@@ -9,7 +9,7 @@ import typer
 
 from edp.cli.console import JsonFlag, emit, out, table
 from edp.cli.options import LogsArgument, MapOption, RepairOption, source_of
-from edp.cli.progress import shown_progress
+from edp.cli.progress import show_progress
 from edp.cli.twin import score_table
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.settings.results import plain_value
@@ -50,7 +50,7 @@ def identify(
     if config is not None or changes:
         # A file says which kind it is of.
         experiment = load_twin_experiment(config, changes if config else ["twin.kind=greybox", *changes])
-    with shown_progress("identify", as_json) as progress:
+    with show_progress("identify", as_json) as progress:
         result = run_identify(source_of(data, signal_map, repair), file, machine, experiment, run, progress)
     numbers = [row.plain() for row in result.rows]
     verdict = machine_verdict(result.scores)

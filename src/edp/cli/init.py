@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, err, listing, out
-from edp.cli.progress import shown_progress
+from edp.cli.progress import show_progress
 from edp.errors import ConfigError, count_of
 from edp.wording import figure
 
@@ -49,7 +49,7 @@ def init(
     if not yes and not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise ConfigError("edp init asks before it writes, and there is no terminal to ask on; give --yes")
     check_kind(folder, what="edp init")
-    with shown_progress("read", as_json) as progress:
+    with show_progress("read", as_json) as progress:
         proposal = propose(logs, progress)
     if not as_json:
         show_proposal(proposal)

@@ -12,7 +12,7 @@ import typer
 
 from edp.cli.console import JsonFlag, emit, err, out, print_table, table
 from edp.cli.options import ClusterOption, LogsArgument, MapOption, OpenOption, WorkersOption, workers_of
-from edp.cli.progress import shown_progress
+from edp.cli.progress import show_progress
 from edp.cli.quality import AtMostOption, show_between, show_lines, show_report, verdict_text
 from edp.errors import DataError, EdpError, count_of
 from edp.storage.paths import full_path, is_file_at
@@ -70,7 +70,7 @@ def inspect(
     source = replace(DataSource.of(data, signal_map), at_most_h=at_most)
     asked = page is not None or bool(split or inputs)
     names = tuple(filter(None, inputs.split(",")))
-    with shown_progress("read", as_json) as progress:
+    with show_progress("read", as_json) as progress:
         quality = source.inspect(progress, workers_of(workers, cluster, open_cluster))
     errors = quality.errors
     coverage_facts, why = None, "" if covered or asked else "not asked for"
@@ -102,7 +102,7 @@ def inspect(
         if coverage_facts is not None and page is not None:
             out.print(f"page: {full_path(page)}")
         out.print(verdict_text(quality))
-        if quality.proposed or (errors and signal_map is None and _undescribed(quality)):
+        if quality.proposed or (errors and signal_map is None and _lacks_map(quality)):
             out.print(
                 f"next: edp init {shlex.join(map(str, data))}, which writes a signal map and settings; then edp train "
                 "with both"
@@ -121,7 +121,7 @@ def inspect(
         raise typer.Exit(FAULTY)
 
 
-def _undescribed(quality: DataQuality) -> bool:
+def _lacks_map(quality: DataQuality) -> bool:
     """Whether no channel of a log was taken, which a signal map mends."""
     return any(not report.channels for report in quality.reports)
 
@@ -152,7 +152,7 @@ def _coverage(source: DataSource, split: str, inputs: tuple[str, ...], asked: bo
 
 def show_coverage(coverage: Coverage, whole: bool = True) -> None:
     """Print the coverage of a data set; only figures with a target unless `whole`."""
-    from edp.report.coverage.page import activity_table, events_table, joints_table, together_table, wanted_table
+    from edp.report.coverage.page import activity_table, events_table, joints_table, tabulate_targets, together_table
 
     rows: list[tuple[Any, ...]] = []
     if coverage.singular:
@@ -183,7 +183,7 @@ def show_coverage(coverage: Coverage, whole: bool = True) -> None:
         rows,
     )
     out.print()
-    tables = [wanted_table(coverage)]
+    tables = [tabulate_targets(coverage)]
     if whole:
         tables += [make(coverage) for make in (activity_table, together_table, events_table, joints_table)]
     for one in tables:

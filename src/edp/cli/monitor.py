@@ -20,7 +20,7 @@ from edp.cli.options import (
     source_of,
     workers_of,
 )
-from edp.cli.progress import shown_progress
+from edp.cli.progress import show_progress
 from edp.errors import ConfigError, count_of
 from edp.storage.paths import full_path
 from edp.storage.reading import Table
@@ -101,7 +101,7 @@ def fit(
     source = source_of(logs, signal_map, repair)
     divided = workers_of(workers, cluster, open_cluster)
     began = time.monotonic()
-    with shown_progress("monitor", as_json) as progress:
+    with show_progress("monitor", as_json) as progress:
         fitted = fit_monitor(runs, source, experiment, folder, progress, divided)
     monitor = fitted.monitor
     facts: Table = {
@@ -174,7 +174,7 @@ def run(
     from edp.workflows.monitor import run_monitor
 
     divided = workers_of(workers, cluster, open_cluster)
-    with shown_progress("monitor", as_json, "recordings watched") as progress:
+    with show_progress("monitor", as_json, "recordings watched") as progress:
         watched = run_monitor(folder, source_of(logs, signal_map, repair), target, progress, divided)
 
     if mdf is not None:

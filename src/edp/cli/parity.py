@@ -59,14 +59,14 @@ def parity(
     Example: `edp parity runs/first`
     """
     from edp.workflows.deployment import load_exported
-    from edp.workflows.parity import compare, from_own_run, golden_case, recorded_case
+    from edp.workflows.parity import compare, from_own_run, golden_case, record_case
 
     check_effects(context, {"interpreters": not forms or any(form.startswith("onnx_") for form in forms)})
     if not (yes or from_own_run(bundle)):
         _ask(bundle)
     loaded = load_exported(bundle)
     source = source_if_given(data, signal_map, repair)
-    case = golden_case(loaded, ticks) if source is None else recorded_case(loaded, source, ticks)
+    case = golden_case(loaded, ticks) if source is None else record_case(loaded, source, ticks)
 
     def tell(row: Row) -> None:
         if not as_json:

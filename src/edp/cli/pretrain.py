@@ -19,7 +19,7 @@ from edp.cli.options import (
     source_of,
     workers_of,
 )
-from edp.cli.progress import shown_progress
+from edp.cli.progress import show_progress
 
 if TYPE_CHECKING:
     from edp.evaluation.foundation_file import FoundationFile
@@ -62,7 +62,7 @@ def pretrain(
     order = Pretrain(method=method, meta=meta, start=start)
     # Other splits are refused; the default makes the usual call short.
     experiment = load_experiment(config, preset, ['split.kind="machines"', *changes], aside=("pretrain",))
-    with shown_progress("pretrain", as_json) as progress:
+    with show_progress("pretrain", as_json) as progress:
         source = source_of(data, signal_map, repair)
         if cluster:
             progress.note(f"on a node of the cluster at {cluster}")

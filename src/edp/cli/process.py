@@ -39,7 +39,7 @@ def _stop(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-def stopped_code(usual: int) -> int:
+def exit_code_of_stop(usual: int) -> int:
     """Return the exit code of a stopped command: 128 plus the signal number, or `usual` after Ctrl-C."""
     return 128 + _stopped_by[-1] if _stopped_by else usual
 

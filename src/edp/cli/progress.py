@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from edp.cli.console import Steps, count_text, duration, left_text, progress
+from edp.cli.console import Steps, count_text, duration, format_time_left, progress
 from edp.wording import figure, number
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ class StageDisplay:
         line = not self.text and (bool(values) or done != self.done)
         self.text, self.done, self.values = "", done, values
         self.share = values.get("share", done / max(1, self.total or 1))
-        left = left_text(values["seconds_left"]) if "seconds_left" in values else self._estimated()
+        left = format_time_left(values["seconds_left"]) if "seconds_left" in values else self._estimate_time_left()
         if left and self.outer is not None and self.outer.total is not None:
             left = f"{left} of it"
         # The end of an epoch has a line of its own.
@@ -108,15 +108,15 @@ class StageDisplay:
         self._clear_outer()
         counts = self.total is not None
         spent = f", {duration(time.monotonic() - self.display.began)} so far" if self.display.timed else ""
-        left = self._estimated() if counts else spent
+        left = self._estimate_time_left() if counts else spent
         force = not counts or (not self.display.counted and (self.total or 0) <= FEW)
         self.display.show(self._path(), self._share() if counts else None, left, force=force)
 
-    def _estimated(self) -> str:
+    def _estimate_time_left(self) -> str:
         """Return the time left, estimated from the complete units; an empty text before the first one."""
         if not self.display.counted or not self.done or self.total is None:
             return ""
-        return left_text((time.monotonic() - self.began) / self.done * (self.total - self.done))
+        return format_time_left((time.monotonic() - self.began) / self.done * (self.total - self.done))
 
     def _clear_outer(self) -> None:
         """Remove the notes of stages around this one that do not count units."""
@@ -139,7 +139,7 @@ class StageDisplay:
         texts = [self.outer._path()] if self.outer is not None else []
         return ", ".join(text for text in (*texts, self._phrase()) if text)
 
-    def _stated(self) -> list[tuple[str, float]]:
+    def _select_values(self) -> list[tuple[str, float]]:
         """Return the values of the last step that the text states: a count of zero is left out."""
         return [(name, value) for name, value in self.values.items() if name in WORDS and (value or name != "refused")]
 
@@ -151,7 +151,7 @@ class StageDisplay:
             return f"{count_text(self.done, self.total, '/')} {self.display.counted}{now}"
         if self.text:
             return f"{self.name} {count_text(self.done + 1, self.total)}, {self.text}"
-        values = [WORDS[name].format(_figure(name, value)) for name, value in self._stated()]
+        values = [WORDS[name].format(_figure(name, value)) for name, value in self._select_values()]
         return ", ".join([f"{self.name} {count_text(self.done, self.total, '/')}", *values])
 
 
@@ -160,7 +160,7 @@ def _figure(name: str, value: float) -> str:
 
 
 @contextmanager
-def shown_progress(command: str, quiet: bool, counted: str = "", timed: bool = False) -> Iterator[StageDisplay]:
+def show_progress(command: str, quiet: bool, counted: str = "", timed: bool = False) -> Iterator[StageDisplay]:
     """Show the progress of a command; see `Display`.
 
     Args:

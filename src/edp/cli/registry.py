@@ -94,7 +94,7 @@ def show_entry(
             f"{entry.kind} of {registry}", ["", ""], [*facts, *_rows("data", entry.data), *_rows("judge", entry.judge)]
         )
         for step in steps:
-            out.print(f"from: {_named(step)}")
+            out.print(f"from: {_format_entry(step)}")
         if not steps:
             out.print("from: random weights")
 
@@ -106,5 +106,5 @@ def _rows(what: str, facts: Any) -> list[tuple[str, str]]:
     return [(f"{what}: {key}", str(value)) for key, value in facts.items()]
 
 
-def _named(step: RegistryEntry | str) -> str:
+def _format_entry(step: RegistryEntry | str) -> str:
     return f"{step} (not in this registry)" if isinstance(step, str) else f"{step.name} ({step.id}): {step.label}"

@@ -31,7 +31,7 @@ def report(
     """
     from edp.report import build_report, build_twin_report, headline, holds_free_runs, read_facts
     from edp.report.run.facts import limit_line, main_horizon
-    from edp.report.run.outputs import judged_line
+    from edp.report.run.outputs import describe_evaluation
 
     is_twin = holds_free_runs(run)
     check_effects(context, {"limit": not is_twin, "budget": not is_twin})
@@ -47,7 +47,7 @@ def report(
     page = build_report(run, output, title, limit)
     facts = read_facts(run, limit)
     line, least = headline(facts), limit_line(facts, main_horizon(facts))
-    judged = judged_line(facts.scores, facts.provenance) if facts.scores else ""
+    judged = describe_evaluation(facts.scores, facts.provenance) if facts.scores else ""
 
     def show() -> None:
         out.print(line)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, count_text, emit, left_text, out, print_table, progress
+from edp.cli.console import JsonFlag, Steps, count_text, emit, format_time_left, out, print_table, progress
 from edp.cli.options import (
     TRIAL_TABLES,
     ClusterOption,
@@ -170,7 +170,7 @@ class ScreeningDisplay:
         self.shares[what] = share = max(min(share, 1.0), self.shares.get(what, 0.0))  # a refit begins its epochs again
         first_share, began = self.began.setdefault(what, (share, now))
         gained, elapsed = share - first_share, now - began
-        tail = left_text(elapsed / gained * (1.0 - share)) if gained >= TOLD_SHARE else ""
+        tail = format_time_left(elapsed / gained * (1.0 - share)) if gained >= TOLD_SHARE else ""
         self.shown.update(self.bars[what], completed=share, note=note)
         self.steps.say(f"{what}: {note}, {percent(share)}{tail}")
 
@@ -180,7 +180,7 @@ def show_selection(selection: Selection) -> None:
     from edp.report.screening import tables
 
     screening, page = selection.screening, selection.files["page"]
-    proposed, flags = tables.kept_table(screening), tables.flags_table(screening)
+    proposed, flags = tables.tabulate_kept(screening), tables.flags_table(screening)
     _print_first(proposed, f"keep: {len(proposed.rows)} of {count_of(len(screening.channels), 'channel')}", SHOWN, page)
     if flags.rows:
         _print_first(flags, f"flags: {len(flags.rows)}", SHOWN_FLAGS, page)

@@ -13,7 +13,7 @@ from typer.core import TyperGroup
 
 from edp.cli.console import JsonFlag, duration, emit, out, table
 from edp.cli.options import LogsArgument, MapOption, RepairOption, check_effects, source_of
-from edp.cli.progress import shown_progress
+from edp.cli.progress import show_progress
 from edp.errors import count_of
 from edp.wording import number
 
@@ -112,7 +112,7 @@ def run(
         open_cluster=open_cluster,
     )
     source = source_of(data, signal_map, repair)
-    with shown_progress("search", as_json, "trainings done") as progress:
+    with show_progress("search", as_json, "trainings done") as progress:
         result = run_search(source, plan, study, resources, phase, progress)
         # Pictures take long; an unfinished study is drawn when it is asked for.
         page = _write_report(study, None, pictures=result.state == "finished")

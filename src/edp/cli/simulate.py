@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, count_text, emit, err, left_text, out, progress, table
+from edp.cli.console import JsonFlag, Steps, count_text, emit, err, format_time_left, out, progress, table
 from edp.cli.options import ClusterOption, OpenOption, WorkersOption, check_effects, workers_of
-from edp.cli.progress import shown_progress
+from edp.cli.progress import show_progress
 from edp.errors import count_of
 from edp.storage.reading import Table
 from edp.wording import figure, number
@@ -148,7 +148,9 @@ def run(folder: Path, order: SimulationOrder, workers: Workers | None = None, qu
             left = elapsed / max(1, counts["new"]) * (order.recordings - done)
             note = f"{number(counts['seconds'] / max(1e-9, elapsed), 0)} simulated s per s"
             shown.update(bar, advance=1, note=note)
-            steps.say(f"simulate: recordings {count_text(round(done), order.recordings)}, {note}{left_text(left)}")
+            steps.say(
+                f"simulate: recordings {count_text(round(done), order.recordings)}, {note}{format_time_left(left)}"
+            )
 
         return simulate_data_set(folder, order, workers or ONE_PER_CORE, on_done)
 
@@ -157,7 +159,7 @@ def run_limit(folder: Path, order: SimulationOrder, spec: LimitSpec, workers: Wo
     """Find the limit of predictability with a progress display."""
     from edp.sim.data_set import find_data_set_limit
 
-    with shown_progress("limit", quiet, "branched", timed=True) as progress:
+    with show_progress("limit", quiet, "branched", timed=True) as progress:
         return find_data_set_limit(folder, order, spec, workers, progress)
 
 

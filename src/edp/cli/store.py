@@ -10,7 +10,7 @@ import typer
 from edp.cli.console import JsonFlag, emit, err, listing, out, table
 from edp.cli.inspect import FAULTY
 from edp.cli.options import ClusterOption, MapOption, OpenOption, RepairOption, source_of, workers_of
-from edp.cli.progress import shown_progress
+from edp.cli.progress import show_progress
 from edp.errors import count_of
 from edp.storage.reading import Table
 from edp.wording import number
@@ -58,7 +58,7 @@ def build(
     Example: `edp store build logs/ --map mine.toml --out store`, then `edp train store --out runs/first`
     """
     source = source_of(data, signal_map, repair)
-    with shown_progress("store", as_json) as progress:
+    with show_progress("store", as_json) as progress:
         index = source.store(folder, workers_of(workers, cluster, open_cluster, usual=0), progress)
     _show(index, folder, as_json)
     if index.refused:

@@ -21,7 +21,7 @@ from edp.cli.options import (
     source_of,
     workers_of,
 )
-from edp.cli.progress import shown_progress
+from edp.cli.progress import show_progress
 from edp.wording import figure, number, percent
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def _train_auto(
     if not quiet:
         limit = f"{figure(settings.auto.minutes)} min"
         err.print(f"train: reads the logs, then trains for at most about {limit} of processor time (--minutes)")
-    with shown_progress("train", quiet) as progress:
+    with show_progress("train", quiet) as progress:
         result = train_auto(source, settings, folder, progress, workers)
     facts = {"run": str(folder), "bundle": str(folder / "bundle"), **result.choice.to_table()}
 
@@ -117,7 +117,7 @@ def _train_auto(
         for note in result.choice.notes or ():
             out.print(note)
         _promise_table(result.choice)
-        _expected_table(result.choice)
+        _print_expected_errors(result.choice)
         out.print(f"bundle in {folder / 'bundle'}")
         out.print(f"next: edp evaluate {folder}")
 
@@ -135,7 +135,7 @@ def _promise_table(choice: AutoChoice) -> None:
     table(title, ["model", "parameters", "trained in", "error"], rows)
 
 
-def _expected_table(choice: AutoChoice) -> None:
+def _print_expected_errors(choice: AutoChoice) -> None:
     """Print the error to expect of each output at the longest horizon."""
     interval, skill = choice.interval, choice.skill
     if interval is None or skill is None:
@@ -172,6 +172,6 @@ def run(
     from edp.workflows.train_evaluate import train as run_training
 
     experiment = load_experiment(config, preset, changes)
-    with shown_progress("train", quiet) as progress:
+    with show_progress("train", quiet) as progress:
         bundle = run_training(source or DataSource.of(data), experiment, folder, training_steps(progress))
     return bundle, progress.display.measured("validation_mae")

@@ -23,7 +23,7 @@ from edp.cli.options import (
     within,
     workers_of,
 )
-from edp.cli.progress import shown_progress
+from edp.cli.progress import show_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.errors import count_of
 from edp.settings.bounds import MIN_MINUTES, above, span
@@ -71,7 +71,7 @@ def twin(
 
     Example: `edp twin data/m22 --out runs/twin`
     """
-    from edp.config.twin import has_choice, load_twin_experiment, trains_several, with_budget
+    from edp.config.twin import has_choice, limit_processor_time, load_twin_experiment, trains_several
     from edp.evaluation.guard import twin_verdict
     from edp.report.twin.candidates import choice_sentence, read_candidates
     from edp.workflows.twin import train_twin
@@ -83,9 +83,9 @@ def twin(
     }
     check_effects(context, {name: effect and not experiment.ground for name, effect in effects.items()})
     if minutes is not None:
-        experiment = with_budget(experiment, minutes)
+        experiment = limit_processor_time(experiment, minutes)
     divided = workers_of(workers, cluster, open_cluster, usual=0)
-    with shown_progress("twin", as_json) as progress:
+    with show_progress("twin", as_json) as progress:
         source = source_of(data, signal_map, repair)
         trained = train_twin(source, experiment, folder, progress, divided, start)
     seconds = trained.bundle.provenance.seconds or 0.0
@@ -120,13 +120,13 @@ def twin(
 
 def show_trained(trained: TrainedTwin) -> None:
     """Print the free-run errors of a trained twin, and what it learned of ground and network."""
-    from edp.evaluation.beyond import beyond_sentence
+    from edp.evaluation.beyond import describe_excess
     from edp.report.twin.facts import ground_line
 
     provenance = trained.bundle.provenance
     if trained.bundle.ground is not None:
         out.print(ground_line(provenance))
-    if note := beyond_sentence(trained.scores["twin"].beyond if trained.scores else {}):
+    if note := describe_excess(trained.scores["twin"].beyond if trained.scores else {}):
         out.print(note, style="bold")
     score_table(trained.scores)
     network = provenance.more.get("residual")
@@ -165,7 +165,7 @@ def rollout(
 
     Example: `edp rollout runs/twin logs/monday.parquet --seconds 60 --from 12.5 --out monday_free.parquet`
     """
-    from edp.evaluation.beyond import beyond_sentence
+    from edp.evaluation.beyond import describe_excess
     from edp.workflows.twin import RolloutRequest, rollout_log
 
     request = RolloutRequest(seconds=seconds, start_s=start_s, measured=measured, out=file, plots=plots, page=page)
@@ -176,7 +176,7 @@ def rollout(
 
     def show() -> None:
         if result.beyond:
-            out.print(beyond_sentence(result.beyond), style="bold")
+            out.print(describe_excess(result.beyond), style="bold")
         error_table(result.scores)
         if result.coverage is not None and result.calibrated_s is not None:
             promise = f"{percent(result.coverage)} up to {figure(result.calibrated_s)} s"
@@ -217,9 +217,9 @@ def score_table(models: Mapping[str, FreeRunScores]) -> None:
         actuator_tables(models)
         return
     velocity, strokes = first.velocity_mae, first.stroke_error
-    rows = [[_with_unit("velocity", velocity), *(_number(one.velocity_mae.mean) for one in models.values())]]
+    rows = [[_add_unit("velocity", velocity), *(_number(one.velocity_mae.mean) for one in models.values())]]
     for k, row in enumerate(strokes):
-        name = _with_unit(f"stroke after {figure(row.at_s)} s", row)
+        name = _add_unit(f"stroke after {figure(row.at_s)} s", row)
         rows.append([name, *(_number(one.stroke_error[k].mean) for one in models.values())])
     rows.append(["pressure, deviations", *(_number(one.pressure_nrmse.mean) for one in models.values())])
     rows.append(["diverged runs", *(percent(one.diverged) for one in models.values())])
@@ -285,11 +285,11 @@ def situation_table(scores: FreeRunScores) -> None:
         strokes = None if row.stroke_error is None else row.stroke_error.mean
         cells = [percent(row.share), *map(_number, (row.velocity_mae.mean, strokes, row.pressure_nrmse.mean))]
         rows.append([name.replace("_", " "), *cells])
-    heads = ["", "share of the time", _with_unit("velocity", scores.velocity_mae), "stroke", "pressure (NRMSE)"]
+    heads = ["", "share of the time", _add_unit("velocity", scores.velocity_mae), "stroke", "pressure (NRMSE)"]
     table("errors by what the actuators did", heads, rows)
 
 
-def ahead_table(scores: FreeRunScores) -> None:
+def print_ahead_table(scores: FreeRunScores) -> None:
     """Print the k-step-ahead errors, together with those of a look-ahead predictor if one was given."""
     ahead, beside = scores.ahead, scores.beside
     if ahead is not None:
@@ -308,7 +308,7 @@ def ahead_table(scores: FreeRunScores) -> None:
             out.print(f"the predictor was trained on {len(beside.trained_on)} of these recordings: it is flattered")
 
 
-def _with_unit(text: str, row: ChannelErrors) -> str:
+def _add_unit(text: str, row: ChannelErrors) -> str:
     return text if row.unit is None else f"{text}, {row.unit}"
 
 

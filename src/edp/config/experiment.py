@@ -36,6 +36,7 @@ __all__ = [
     "Table",
     "TaskSettings",
     "build",
+    "embed_feature_set",
     "experiment_toml",
     "load_experiment",
     "merged",
@@ -44,7 +45,6 @@ __all__ = [
     "preset_table",
     "read_layers",
     "read_toml",
-    "with_set_file",
 ]
 
 SETTINGS = SettingsTree(
@@ -185,8 +185,8 @@ def read_layers(path: str | Path | None = None, overrides: Sequence[Change] = ()
         ConfigError: a file or an override that cannot be read.
     """
     # Files named in settings lie beside the settings file, files named on the command line in the working directory.
-    first = [] if path is None else [with_set_file(read_toml(path), Path(path).parent)]
-    every = combined([with_set_file(override(change), Path()) for change in overrides])
+    first = [] if path is None else [embed_feature_set(read_toml(path), Path(path).parent)]
+    every = combined([embed_feature_set(override(change), Path()) for change in overrides])
     return first + ([every] if every else [])
 
 
@@ -210,7 +210,7 @@ def experiment_toml(experiment: Experiment) -> str:
     return tomli_w.dumps(plain_tree(experiment))
 
 
-def with_set_file(table: Table, folder: Path) -> Table:
+def embed_feature_set(table: Table, folder: Path) -> Table:
     """Return `table` with the feature set in place of its file name, so that a run folder is self-contained."""
     task = table.get("task")
     if not isinstance(task, dict) or not is_set_file(task.get("features")):

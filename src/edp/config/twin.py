@@ -72,7 +72,7 @@ def load_twin_experiment(path: str | Path | None = None, overrides: Sequence[str
     return TWIN_SETTINGS.load(TwinExperiment, path, overrides, "of a twin")
 
 
-def with_budget(experiment: TwinExperiment, minutes: float) -> TwinExperiment:
+def limit_processor_time(experiment: TwinExperiment, minutes: float) -> TwinExperiment:
     """Return the settings with a bound on the processor time of an automatic choice; return other settings unchanged.
 
     Raises:

@@ -180,7 +180,7 @@ class Controller(ABC):
             tick: row of the reference that belongs to now.
             verdict: what a guard says of this tick.
         """
-        asked, fault = self._asked(observation, tick, verdict)
+        asked, fault = self._compute_levers(observation, tick, verdict)
         if fault:
             self._log(tick, fault)
             self.missed(tick)
@@ -200,7 +200,7 @@ class Controller(ABC):
         self._before = self.limits.applied(np.zeros(AXES), before, self.plant.rate_hz)
         return self._before.copy()
 
-    def _asked(self, observation: Array, tick: int, verdict: GuardVerdict) -> tuple[Array, str]:
+    def _compute_levers(self, observation: Array, tick: int, verdict: GuardVerdict) -> tuple[Array, str]:
         """Levers before limits, and the fault for which they are neutral; empty without one."""
         values = np.asarray(observation, float)
         neutral = np.zeros(AXES)
@@ -250,7 +250,7 @@ class ControllerSpec(Protocol):
         ...
 
 
-def unused_models(needs: Sequence[str], available: Collection[str]) -> list[str]:
+def list_unused_models(needs: Sequence[str], available: Collection[str]) -> list[str]:
     """Return the available models that a controller does not use.
 
     Args:

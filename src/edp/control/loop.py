@@ -103,10 +103,10 @@ def run_loop(
     if guard is not None:
         guard.reset(controller.plant)
     watched = _Watched(controller, guard, deadline_s)
-    rows, infos = _driven(env, watched, reference.ticks, names, (observation, info))
+    rows, infos = _run_loop(env, watched, reference.ticks, names, (observation, info))
     trace = _trace(rows, names, geometry, controller)
     score = scored(trace, reference, task.limits, sum(event.ticks for event in controller.events))
-    recording = _recorded(rows, names, task, controller)
+    recording = _make_recording(rows, names, task, controller)
     return LoopResult(recording, score, tuple(controller.events), rows.solve_s, infos, tuple(watched.warnings))
 
 
@@ -131,7 +131,7 @@ class _Watched:
         return levers, spent
 
 
-def _driven(
+def _run_loop(
     env: Any, watched: _Watched, ticks: int, names: tuple[str, ...], start: tuple[Any, Table]
 ) -> tuple[_Rows, dict[str, Array]]:
     """Run tick by tick from an observation and its info; ends early where the plant does."""
@@ -175,7 +175,7 @@ def _trace(rows: _Rows, names: tuple[str, ...], geometry: TipGeometry, controlle
     return LoopTrace(tip, strokes / geometry.full_m, rows.levers, stacked, None if power is None else np.asarray(power))
 
 
-def _recorded(rows: _Rows, names: tuple[str, ...], task: ControlTask, controller: Controller) -> Recording:
+def _make_recording(rows: _Rows, names: tuple[str, ...], task: ControlTask, controller: Controller) -> Recording:
     reference, plant = task.reference, controller.plant
     # The ground has no sensor, so that its heights need no other name; side views look for them.
     true = tuple(

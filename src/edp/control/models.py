@@ -24,7 +24,7 @@ class ControlModels:
     twin: Twin | None = None
     predictor: Bundle | None = None
 
-    def needed_map(self, who: str) -> ValveMap:
+    def require_map(self, who: str) -> ValveMap:
         """Return the valve map.
 
         Raises:
@@ -34,7 +34,7 @@ class ControlModels:
             raise ConfigError(f"controller '{who}' needs a valve map; measure one with measure_valve_map")
         return self.valve_map
 
-    def needed_twin(self, who: str) -> Twin:
+    def require_twin(self, who: str) -> Twin:
         """Return the twin.
 
         Raises:

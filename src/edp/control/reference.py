@@ -78,7 +78,7 @@ def reference_of_tip(
             f"of {np.degrees(attitude):.1f} deg, asked for at t = {tick / rate_hz:.2f} s; choose a line nearer to the "
             "middle of its reach or another attitude"
         )
-    return _checked(
+    return _check_strokes(
         name, TipReference(rate_hz, strokes, np.asarray(poses, float), _mask(judged, strokes)), geometry, margin
     )
 
@@ -98,14 +98,14 @@ def reference_of_strokes(
     """
     strokes = np.asarray(strokes_m, float)
     reference = TipReference(rate_hz, strokes, geometry.tip(strokes), _mask(judged, strokes))
-    return _checked(name, reference, geometry, margin)
+    return _check_strokes(name, reference, geometry, margin)
 
 
 def _mask(judged: NDArray[np.bool_] | None, strokes: Array) -> NDArray[np.bool_]:
     return np.ones(len(strokes), bool) if judged is None else judged
 
 
-def _checked(name: str, reference: TipReference, geometry: TipGeometry, margin: float) -> TipReference:
+def _check_strokes(name: str, reference: TipReference, geometry: TipGeometry, margin: float) -> TipReference:
     """Return the reference; raises ConfigError if a stroke is within the margin of an end."""
     if reference.ticks < 2:
         raise ConfigError(f"reference '{name}' has {reference.ticks} ticks; at least 2 must hold")

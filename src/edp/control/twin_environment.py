@@ -139,12 +139,12 @@ class TwinEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self._state is None:
             raise ConfigError("the environment has no episode under way; call reset() before step()")
         command = self._start.pilots(levers)
-        answer = self._moved(command)
+        answer = self._advance(command)
         self._tick += 1
         row = np.concatenate([answer, command]).astype(np.float32)
         return row, 0.0, False, self._tick >= self._ticks, self._info(row)
 
-    def _moved(self, command: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _advance(self, command: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the output for a command, and advance the state."""
         if self._grounded is not None and self._digs:
             self._state = self._grounded.step(command, self._state, self._free)

@@ -182,7 +182,7 @@ def cover(
             f"are of these {shown:.1f} h of {hours:,.1f} h"
         )
     moving, constant = _inputs(recordings, roles)
-    axes = _known_axes(first, roles, absent)
+    axes = _select_axes(first, roles, absent)
     occupancy = _occupancy(recordings, roles.axes, absent)
     if not roles.inputs:
         absent.append("excitation: no channel is known to command; name the inputs")
@@ -205,7 +205,7 @@ def cover(
     )
 
 
-def _known_axes(first: Recording, roles: Roles, absent: list[str]) -> tuple[Axis, ...]:
+def _select_axes(first: Recording, roles: Roles, absent: list[str]) -> tuple[Axis, ...]:
     """Return the axes whose velocity has a known kind; names of the other axes are added to `absent`."""
     kinds = {channel.name: channel.kind for channel in first.channels}
     unknown = [axis.velocity for axis in roles.axes if kinds.get(axis.velocity) is Kind.GENERIC]
@@ -274,7 +274,7 @@ def _occupancy(recordings: Sequence[Recording], axes: Sequence[Axis], absent: li
             "strokes are not recorded: the occupancy integrates velocities, each recording about its own mean, so that "
             "offsets between recordings and drift are in it"
         )
-        places = np.concatenate([_integrated(r, names) for r in recordings])
+        places = np.concatenate([_integrate(r, names) for r in recordings])
     full: Any = recordings[0].meta.get("full_strokes_m") if source == MEASURED else None
     has_ranges = isinstance(full, list | tuple) and len(full) == len(names)
     if has_ranges:
@@ -282,7 +282,7 @@ def _occupancy(recordings: Sequence[Recording], axes: Sequence[Axis], absent: li
     else:
         span = tuple((float(low), float(high)) for low, high in zip(places.min(axis=0), places.max(axis=0)))
     cells = [_cell(places[:, i], *span[i], CELLS) for i in range(len(names))]
-    samples = _counted(cells, (CELLS,) * len(names))
+    samples = _count_cells(cells, (CELLS,) * len(names))
     return Occupancy(source, names, span, has_ranges, samples)
 
 
@@ -290,7 +290,7 @@ def _ends(occupancy: Occupancy) -> dict[str, tuple[float, float]]:
     return dict(zip(occupancy.names, occupancy.span, strict=True))
 
 
-def _integrated(recording: Recording, names: Sequence[str]) -> Array:
+def _integrate(recording: Recording, names: Sequence[str]) -> Array:
     way = np.cumsum(recording.select(names).astype(np.float64), axis=0) / recording.rate_hz
     # An integral has no origin; its mean stands for mid stroke.
     return np.asarray(way - way.mean(axis=0))
@@ -302,7 +302,7 @@ def _cell(values: NDArray[Any], low: float, high: float, count: int) -> NDArray[
     return np.clip(np.floor(share * count), 0, count - 1).astype(np.intp)
 
 
-def _counted(cells: Sequence[NDArray[np.intp]], shape: tuple[int, ...]) -> NDArray[np.int64]:
+def _count_cells(cells: Sequence[NDArray[np.intp]], shape: tuple[int, ...]) -> NDArray[np.int64]:
     """How often each cell occurs; one array of places an axis."""
     flat = np.ravel_multi_index(tuple(cells), shape)
     return np.bincount(flat, minlength=int(np.prod(shape))).reshape(shape)
@@ -328,7 +328,7 @@ def _joint(recordings: Sequence[Recording], group: str, x: tuple[str, ...], y: t
     (x_low, x_high), (y_low, y_high) = _range(x_values), _range(y_values)
     inside = (x_values >= x_low) & (x_values <= x_high) & (y_values >= y_low) & (y_values <= y_high)
     cells = [_cell(x_values[inside], x_low, x_high, BINS), _cell(y_values[inside], y_low, y_high, BINS)]
-    counts = _counted(cells, (BINS, BINS))
+    counts = _count_cells(cells, (BINS, BINS))
     with np.errstate(invalid="ignore"):
         alike = x_values.std() > 0 and y_values.std() > 0
         correlation = float(np.corrcoef(x_values, y_values)[0, 1]) if alike else 0.0
@@ -374,7 +374,7 @@ def mutual_information(x: Array, y: Array, bins: int = QUANTILES) -> float:
     step = max(1, len(x) // INFORMED)
     x, y = x[::step], y[::step]
     a, b = ranked(x), ranked(y)
-    table = _counted([a, b], (int(a.max()) + 1, int(b.max()) + 1))
+    table = _count_cells([a, b], (int(a.max()) + 1, int(b.max()) + 1))
     share = table / len(x)
     outer = share.sum(axis=1, keepdims=True) * share.sum(axis=0, keepdims=True)
     seen = share > 0

@@ -41,7 +41,7 @@ def complete_velocities(
     if not positions or any(kind not in RATE_OF for kind in kinds):
         return list(recordings), settings
     velocities = tuple(f"{name}{SUFFIX}" for name in positions)
-    completed = [_with_velocities(recording, positions) for recording in recordings]
+    completed = [_add_velocities(recording, positions) for recording in recordings]
     return completed, replace(settings, velocities=velocities, strokes=positions)
 
 
@@ -59,12 +59,12 @@ def matched(channels: TwinChannels, recording: Recording) -> Recording:
         for velocity, stroke in zip(channels.velocities, channels.strokes, strict=False)
         if velocity.name == f"{stroke.name}{SUFFIX}" and velocity.name not in names and stroke.name in names
     ]
-    completed = _with_velocities(recording, positions) if positions else recording
+    completed = _add_velocities(recording, positions) if positions else recording
     same_channels(channels, completed)
     return completed
 
 
-def _with_velocities(recording: Recording, positions: Sequence[str]) -> Recording:
+def _add_velocities(recording: Recording, positions: Sequence[str]) -> Recording:
     """Add the backward difference of each position times the sampling rate. The first sample is zero."""
     columns, channels = [recording.values], list(recording.channels)
     for name in positions:

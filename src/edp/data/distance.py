@@ -73,7 +73,7 @@ def _states(recordings: Sequence[Recording], axes: Sequence[Axis], stretches: Se
         # A stretch shorter than the delay keeps its last sample.
         back = min(round(EARLIER_S * recording.rate_hz), stretch.stop - stretch.start - 1)
         rows = slice(stretch.start + back, stretch.stop)
-        commands = [axis.signed_command(recording) for axis in axes if axis.command]
+        commands = [axis.read_signed_command(recording) for axis in axes if axis.command]
         columns = [u[rows] for u in commands] + [u[rows.start - back : rows.stop - back] for u in commands]
         names = [name for axis in axes for name in (axis.velocity, *axis.pressures) if name]
         parts.append(np.column_stack([*columns, recording.select(names)[rows]])[::every].astype(np.float64))

@@ -42,7 +42,7 @@ class EpisodeSampler:
                 "2 * shots must hold"
             )
         self.machines = spec.batch // (2 * shots)
-        self.owned = by_machine(self.series)
+        self.owned = group_by_machine(self.series)
         needed = 2 * shots
         for machine, places in self.owned.items():
             piece_count = sum(self._pieces(self.series[series_index], 0) for series_index in places)
@@ -90,7 +90,7 @@ class EpisodeSampler:
         ]
 
 
-def by_machine(series: Sequence[Series]) -> dict[str, list[int]]:
+def group_by_machine(series: Sequence[Series]) -> dict[str, list[int]]:
     """Places of the series of each machine, machines in the order in which they come.
 
     Raises:

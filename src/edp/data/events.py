@@ -65,7 +65,7 @@ def reversals(command: Array, threshold: float) -> int:
 def thresholds(recordings: Sequence[Recording], axes: Sequence[Axis], dead_band: float) -> list[float]:
     """Return the dead band of each axis in units of its command."""
     return [
-        dead_band * max(float(np.abs(axis.signed_command(r)).max()) for r in recordings) if axis.command else 0.0
+        dead_band * max(float(np.abs(axis.read_signed_command(r)).max()) for r in recordings) if axis.command else 0.0
         for axis in axes
     ]
 
@@ -76,7 +76,7 @@ def activity_of(recordings: Sequence[Recording], axes: Sequence[Axis], dead_band
     for axis, level in zip(axes, thresholds(recordings, axes, dead_band), strict=True):
         turned = crossed = active = None
         if axis.command:
-            commands = [axis.signed_command(r) for r in recordings]
+            commands = [axis.read_signed_command(r) for r in recordings]
             turned = sum(reversals(u, level) for u in commands)
             crossed = sum(rises(u > level) + rises(-u > level) for u in commands)
             active = sum(int(np.count_nonzero(np.abs(u) > level)) for u in commands) / sum(len(u) for u in commands)
@@ -94,7 +94,10 @@ def together(recordings: Sequence[Recording], axes: Sequence[Axis], dead_band: f
         return {}
     levels = thresholds(recordings, commanded, dead_band)
     on = np.concatenate(
-        [np.stack([np.abs(a.signed_command(r)) > x for a, x in zip(commanded, levels)], axis=1) for r in recordings]
+        [
+            np.stack([np.abs(a.read_signed_command(r)) > x for a, x in zip(commanded, levels)], axis=1)
+            for r in recordings
+        ]
     )
     count = on.sum(axis=1)
     shares = {f"{n} axes" if n != 1 else "1 axis": float((count == n).mean()) for n in range(len(commanded) + 1)}

@@ -55,8 +55,8 @@ def fold_ridge(
     weights = np.zeros((folds.count, columns, outputs))
     intercepts = np.zeros((folds.count, outputs))
     for chosen in column_sets:
-        spectra = [_Spectrum.of(moments.of_columns(chosen)) for moments in trained]
-        others = [moments.of_columns(chosen) for moments in judged]
+        spectra = [_Spectrum.of(moments.select_columns(chosen)) for moments in trained]
+        others = [moments.select_columns(chosen) for moments in judged]
         for penalty in sorted(PENALTIES, reverse=True):  # the strongest first: a weaker one must earn its place
             solved = [spectrum.solve(penalty) for spectrum in spectra]
             losses = [share * one.squared_error(*maps) for share, one, maps in zip(shares, others, solved, strict=True)]
@@ -93,7 +93,7 @@ class TableMoments:
     level: DoubleArray
     variance: DoubleArray
 
-    def of_columns(self, chosen: NDArray[np.int64]) -> TableMoments:
+    def select_columns(self, chosen: NDArray[np.int64]) -> TableMoments:
         """Those of some columns."""
         covariance = self.covariance[np.ix_(chosen, chosen)]
         return TableMoments(covariance, self.cross[chosen], self.mean[chosen], self.level, self.variance)

@@ -44,7 +44,7 @@ class Folds:
         return Folds(self.owner[::stride], training)
 
 
-def blocked_folds(lengths: Sequence[int], folds: int, gap: int, pieces: int = 1) -> Folds:
+def make_block_folds(lengths: Sequence[int], folds: int, gap: int, pieces: int = 1) -> Folds:
     """Return folds of nearly equal size over the concatenated segments, each of `pieces` contiguous parts.
 
     Args:

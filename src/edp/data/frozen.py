@@ -121,10 +121,10 @@ class ByFrozen:
             i for i, recording in enumerate(recordings) if recording.digest not in self.frozen and i not in validation
         ]
         if self.missing == "draw" or not validation:
-            return self._drawn(recordings, free, test, validation, gap)
+            return self._draw_parts(recordings, free, test, validation, gap)
         return _whole(recordings, {"train": free, "validation": validation, "test": test})
 
-    def _drawn(
+    def _draw_parts(
         self, recordings: Sequence[Recording], free: list[int], test: list[int], validation: list[int], gap: int
     ) -> Split:
         """Fill the parts that have no session by a random draw from the free sessions."""
@@ -162,7 +162,7 @@ class ByFrozen:
         )
 
 
-def frozen_of(split: SplitSpec) -> dict[str, str]:
+def list_frozen(split: SplitSpec) -> dict[str, str]:
     """Return the names of the frozen sessions by digest; empty for a split without frozen sessions."""
     return split.frozen if isinstance(split, ByFrozen) else {}
 
@@ -192,7 +192,7 @@ def keep_frozen(before: SplitSpec, after: SplitSpec) -> None:
     Raises:
         ConfigError: it does.
     """
-    lost = set(frozen_of(before)) - set(frozen_of(after))
+    lost = set(list_frozen(before)) - set(list_frozen(after))
     if lost:
         raise ConfigError(
             f"the run comes from a search, and --set split lets go of {len(lost)} of its frozen sessions; they stay "

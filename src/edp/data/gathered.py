@@ -119,7 +119,7 @@ class _Made(_OnDemand):
         return self._slot.values(self, self._make).astype(dtype or np.float32, copy=False)
 
 
-def made_when_read(shape: tuple[int, int], make: Make, slot: LastMade) -> FloatArray:
+def make_lazy_array(shape: tuple[int, int], make: Make, slot: LastMade) -> FloatArray:
     """Return an array ``(time, column)`` that is computed on access, for data that are read recording by recording.
 
     Args:
@@ -160,7 +160,7 @@ def on_demand(values: FloatArray, places: Sequence[int]) -> FloatArray:
     return cast(FloatArray, _Gathered(values, places, [0.0] * len(places), (0, len(values))))
 
 
-def stored_columns(
+def read_stored_columns(
     recording: Recording, names: Sequence[str], derived: Sequence[Derived], start: int, stop: int | None
 ) -> FloatArray:
     """Return logged and derived channels of a segment whose samples are on disk, ``(time, column)``.

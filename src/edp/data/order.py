@@ -37,14 +37,14 @@ class RandomOrder:
         stop = min(stop, self.count)
         if self._listed is not None:
             return self._listed[start:stop]
-        numbers = self._permuted(np.arange(start, stop, dtype=np.uint64))
+        numbers = self._permute(np.arange(start, stop, dtype=np.uint64))
         outside = numbers >= self.count
         while outside.any():
-            numbers[outside] = self._permuted(numbers[outside])
+            numbers[outside] = self._permute(numbers[outside])
             outside = numbers >= self.count
         return numbers.astype(np.int64)
 
-    def _permuted(self, numbers: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    def _permute(self, numbers: NDArray[np.uint64]) -> NDArray[np.uint64]:
         bits, mask = np.uint64(self._bits), np.uint64((1 << self._bits) - 1)
         left, right = numbers >> bits, numbers & mask
         for factor, offset in self._keys if self._keys is not None else ():

@@ -95,7 +95,7 @@ def ridge_solution(
     for samples in reversed(tried):
         for relative in sorted(penalties):
             candidate = _solve(fitted, samples * inputs, relative)
-            loss = _squared_error(held_out, fitted, candidate)
+            loss = _compute_squared_error(held_out, fitted, candidate)
             better = loss < best
             best[better], penalty[better], history[better] = loss[better], relative, samples
             weights[:, better] = 0.0
@@ -103,7 +103,7 @@ def ridge_solution(
     return _physical(weights, fitted, standard, task, penalty, history)
 
 
-def crossed_solution(
+def cross_validate_ridge(
     parts: Sequence[Series],
     task: LagTask,
     folds: int = 5,
@@ -140,7 +140,9 @@ def crossed_solution(
             for rest, fold in pairs:
                 if rest.rows:
                     loss += (
-                        fold.rows / whole.rows * _squared_error(fold, rest, _solve(rest, samples * inputs, relative))
+                        fold.rows
+                        / whole.rows
+                        * _compute_squared_error(fold, rest, _solve(rest, samples * inputs, relative))
                     )
             better = loss < best
             if better.any():
@@ -191,7 +193,7 @@ def _solve(fitted: RidgeMoments, size: int, relative: float) -> DoubleArray:
     return np.asarray(linalg.cho_solve(factor, cross, check_finite=False))
 
 
-def _squared_error(held_out: RidgeMoments, fitted: RidgeMoments, weights: DoubleArray) -> DoubleArray:
+def _compute_squared_error(held_out: RidgeMoments, fitted: RidgeMoments, weights: DoubleArray) -> DoubleArray:
     """Return the mean squared validation error per output from the moments; zero without validation rows."""
     if held_out.rows == 0:
         return np.zeros(weights.shape[1])

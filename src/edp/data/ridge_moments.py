@@ -94,8 +94,8 @@ def moments_of(series: Sequence[Series], task: LagTask, standard: Standard) -> R
             yy += (change**2).sum(axis=0)
             rows += stop - start
         if len(ticks) and lags > 1:
-            head = _reversed_rows(one, standard, ticks.start - 1, lags - 1)
-            tail = _reversed_rows(one, standard, ticks.stop - 1, lags - 1)
+            head = _reverse_rows(one, standard, ticks.start - 1, lags - 1)
+            tail = _reverse_rows(one, standard, ticks.stop - 1, lags - 1)
             # One tick earlier the sum gains the row before the first and loses the last one.
             edges += np.outer(head, head) - np.outer(tail, tail)
     gram = _gram(first[:, :inputs, :], edges)
@@ -115,7 +115,7 @@ def _changes(series: Series, task: LagTask, standard: Standard, ticks: np.ndarra
     return (future(series, task, ticks) - start[:, None, :]).reshape(len(ticks), task.outputs)
 
 
-def _reversed_rows(series: Series, standard: Standard, newest: int, count: int) -> DoubleArray:
+def _reverse_rows(series: Series, standard: Standard, newest: int, count: int) -> DoubleArray:
     """Standardised rows newest, newest - 1, ... as one vector ``(count * input,)``."""
     rows = series.inputs[newest - count + 1 : newest + 1][::-1]
     return ((rows - standard.centre) / standard.scale).ravel()

@@ -42,7 +42,7 @@ class Axis:
     stroke: str = ""
     conflux: tuple[str, ...] = ()
 
-    def signed_command(self, recording: Recording) -> Array:
+    def read_signed_command(self, recording: Recording) -> Array:
         """Command, extension positive, shape ``(time,)``."""
         return signed(recording, self.command)
 
@@ -80,13 +80,13 @@ def roles_of(recording: Recording, inputs: Sequence[str] = ()) -> Roles:
 def roles_of_channels(channels: Sequence[Channel], inputs: Sequence[str] = ()) -> Roles:
     """Return the roles of channels given without values; `inputs` names the commands."""
     names = [channel.name for channel in channels]
-    table_axes = [] if inputs else [axis for i in range(3) if (axis := _of_table(i, names)) is not None]
+    table_axes = [] if inputs else [axis for i in range(3) if (axis := _find_table_axis(i, names)) is not None]
     if table_axes:
         return Roles(tuple(table_axes), tuple(name for axis in table_axes for name in axis.command))
-    return _by_kind(channels, tuple(inputs))
+    return _find_axes_by_kind(channels, tuple(inputs))
 
 
-def _of_table(i: int, names: Sequence[str]) -> Axis | None:
+def _find_table_axis(i: int, names: Sequence[str]) -> Axis | None:
     title, command, conflux = _TABLE_A1[i]
 
     def there(*candidates: str) -> tuple[str, ...]:
@@ -103,7 +103,7 @@ def _of_table(i: int, names: Sequence[str]) -> Axis | None:
     return axis if axis.command or axis.velocity else None
 
 
-def _by_kind(channels: Sequence[Channel], inputs: tuple[str, ...]) -> Roles:
+def _find_axes_by_kind(channels: Sequence[Channel], inputs: tuple[str, ...]) -> Roles:
     """Create an axis for each velocity.
 
     Commands, pressures and positions are assigned in order if their counts match.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.data.features import STARTING, derive
-from edp.data.gathered import LastMade, made_when_read, some_columns
+from edp.data.gathered import LastMade, make_lazy_array, some_columns
 from edp.data.moments import Moments
 from edp.data.series import Series
 from edp.data.task import TargetMode, Task
@@ -81,7 +81,7 @@ def feature_columns(task: Task, series: Series, places: Sequence[int], slot: Las
     if max(places, default=0) < len(task.features.channels):
         return some_columns(series.inputs, places)
     shape = (series.samples, len(places))
-    return made_when_read(shape, lambda: feature_matrix(task, series)[:, list(places)], slot)
+    return make_lazy_array(shape, lambda: feature_matrix(task, series)[:, list(places)], slot)
 
 
 def fit_scaler(task: Task, train: Sequence[Series], kinds: Sequence[Kind]) -> Scaler:
@@ -127,10 +127,10 @@ def _moments(task: Task, train: Sequence[Series]) -> tuple[Moments, list[Moments
         targets = np.asarray(series.targets)
         for moments, horizon in zip(changes, task.horizons, strict=True):
             if series.samples > horizon:
-                moments.update(_encoded(task, targets, horizon))
+                moments.update(_encode_targets(task, targets, horizon))
     return features, changes
 
 
-def _encoded(task: Task, targets: NDArray[np.float32], horizon: int) -> NDArray[np.float32]:
+def _encode_targets(task: Task, targets: NDArray[np.float32], horizon: int) -> NDArray[np.float32]:
     future = targets[horizon:]
     return future - targets[: len(future)] if task.mode is TargetMode.DELTA else future

@@ -95,7 +95,7 @@ class ByRecording:
         test, validation = list(self.test), list(self.validation)
         free = [name for name in names if name not in {*test, *validation}]
         families = self._families(recordings)
-        drawn = _spread(self._drawn(free), families)
+        drawn = _spread(self._shuffle_names(free), families)
         if not test:
             test, drawn = _take(drawn, self.test_share, len(names))
             drawn = _spread(drawn, families)
@@ -109,13 +109,13 @@ class ByRecording:
         }
         if not parts["validation"]:
             parts = _hold_tail(parts, self.tail_share, gap)
-        return _checked(parts, recordings, gap)
+        return _check_parts(parts, recordings, gap)
 
     def _families(self, recordings: Sequence[Recording]) -> dict[str, str]:
         """Return the family of each recording by name; each part receives its fraction of every family."""
         return {recording.name: str(recording.meta.get(FAMILY, "")) for recording in recordings}
 
-    def _drawn(self, names: Sequence[str]) -> list[str]:
+    def _shuffle_names(self, names: Sequence[str]) -> list[str]:
         """Names in the order of the draw."""
         return [names[i] for i in np.random.default_rng(self.seed).permutation(len(names))]
 
@@ -133,7 +133,7 @@ class ByName(ByRecording):
     def _families(self, recordings: Sequence[Recording]) -> dict[str, str]:
         return {recording.name: kind_of_name(recording.name) for recording in recordings}
 
-    def _drawn(self, names: Sequence[str]) -> list[str]:
+    def _shuffle_names(self, names: Sequence[str]) -> list[str]:
         # A hash, since a permutation of places would follow the order in which a folder is listed.
         return sorted(names, key=lambda name: hashlib.blake2b(f"{self.seed}/{name}".encode()).digest())
 
@@ -180,7 +180,7 @@ class ByTime:
             parts["train"].append(Stretch(i, 0, validation - gap))
             parts["validation"].append(Stretch(i, validation, test - gap))
             parts["test"].append(Stretch(i, test, n))
-        return _checked(parts, recordings, gap)
+        return _check_parts(parts, recordings, gap)
 
 
 @SPLITS.register("blocks")
@@ -233,7 +233,7 @@ class ByBlocks:
                 if after and part != "test" and part != after[0]:
                     stop -= gap
                 parts[part].append(Stretch(i, start, stop))
-        return _checked(parts, recordings, gap)
+        return _check_parts(parts, recordings, gap)
 
     def _owner(self, number: int, turn: Iterator[int]) -> str:
         """Part of block `number`; `turn` counts the blocks that do not test, over all recordings."""
@@ -315,7 +315,7 @@ class ByMachine:
         machines_by_part = {"train": set(drawn), "validation": set(validation), "test": set(test)}
         whole = [Stretch(i, 0, recording.samples) for i, recording in enumerate(recordings)]
         parts = {part: [s for s in whole if owners[s.recording] in names] for part, names in machines_by_part.items()}
-        return _checked(parts, recordings, gap)
+        return _check_parts(parts, recordings, gap)
 
     def _heavy(self, recordings: Sequence[Recording], owners: Sequence[str]) -> list[str]:
         """Return the machines whose mass is in the test range."""
@@ -380,7 +380,7 @@ def _hold_tail(parts: dict[str, list[Stretch]], share: float, gap: int) -> dict[
     return {"train": train, "validation": validation, "test": parts["test"]}
 
 
-def _checked(parts: dict[str, list[Stretch]], recordings: Sequence[Recording], gap: int) -> Split:
+def _check_parts(parts: dict[str, list[Stretch]], recordings: Sequence[Recording], gap: int) -> Split:
     for part in PARTS:
         if not parts[part]:
             raise DataError(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.data.folds import blocked_folds
+from edp.data.folds import make_block_folds
 from edp.data.series import Series
 
 
@@ -26,7 +26,7 @@ class StretchFold:
 
 
 def stretch_folds(series: Sequence[Series], count: int, gap: int, shortest: int, seed: int) -> list[StretchFold]:
-    """Divide segments `count` times; each sample is left out in at most one fold (see `blocked_folds`).
+    """Divide segments `count` times; each sample is left out in at most one fold (see `make_block_folds`).
 
     Args:
         series: at least one stretch. They are laid end to end in an order drawn by the seed, since files often lie in
@@ -41,7 +41,7 @@ def stretch_folds(series: Sequence[Series], count: int, gap: int, shortest: int,
     """
     dealt = [series[i] for i in np.random.default_rng(seed).permutation(len(series))]
     lengths = [part.samples for part in dealt]
-    divided = blocked_folds(lengths, count, gap)
+    divided = make_block_folds(lengths, count, gap)
     rows = [(divided.training[i], divided.left_out(i)) for i in range(count)]
     sides = [[_stretches(dealt, lengths, side) for side in both] for both in rows]
     return [StretchFold(*([part for part in side if part.samples >= shortest] for side in both)) for both in sides]

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from edp.data.features import Derived, FeatureSet, column, kind_of
-from edp.data.gathered import stored_columns
+from edp.data.gathered import read_stored_columns
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError, closest
 from edp.recording import MACHINE, FloatArray, Recording
@@ -170,8 +170,8 @@ class Task:
             )
         if recording.on_disk:
             # What a store keeps on disk is not copied into memory.
-            inputs = stored_columns(recording, self.inputs, (), start, stop)
-            targets = stored_columns(recording, self.targets, self.derived, start, stop)
+            inputs = read_stored_columns(recording, self.inputs, (), start, stop)
+            targets = read_stored_columns(recording, self.targets, self.derived, start, stop)
         else:
             rows = slice(start, stop)
             inputs = np.ascontiguousarray(recording.select(self.inputs)[rows])

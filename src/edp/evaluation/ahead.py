@@ -56,7 +56,7 @@ def look_ahead(twin: Twin, series: Sequence[Series], ticks: int, first: int = 0)
         earliest, latest = max(first, prefix), part.samples - ticks - 1
         at = np.unique(np.linspace(earliest, latest, EACH).astype(np.int64)) if latest >= earliest else np.zeros(0, int)
         # A start beyond an end stop is one that the twin refuses.
-        at = at[twin.within_stops(part.targets[at - prefix])]
+        at = at[twin.is_within_stops(part.targets[at - prefix])]
         moments.append(at)
         if not len(at):
             continue
@@ -74,7 +74,7 @@ def look_ahead(twin: Twin, series: Sequence[Series], ticks: int, first: int = 0)
     return Ahead(twin.channels, ticks, tuple(moments), np.concatenate(answers), np.concatenate(truths))
 
 
-def ahead_scores(ahead: Ahead) -> AheadErrors:
+def score_ahead(ahead: Ahead) -> AheadErrors:
     """Velocity MAE, stroke error and pressure NRMSE that far ahead, never averaged together."""
     channels = ahead.channels
     errors = np.abs(ahead.answers - ahead.truth).astype(np.float64)

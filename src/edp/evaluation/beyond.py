@@ -71,7 +71,7 @@ def _ends(value: Any) -> tuple[float, float] | None:
     return float(value[0]), float(value[1])
 
 
-def beyond_sentence(beyond: Mapping[str, CommandExcess]) -> str:
+def describe_excess(beyond: Mapping[str, CommandExcess]) -> str:
     """Return a warning about errors and intervals outside the training range; empty if there is no excess."""
     if not beyond:
         return ""

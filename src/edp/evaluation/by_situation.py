@@ -62,7 +62,7 @@ class Situations:
     """
 
     def __init__(self, data: Prepared) -> None:
-        self.axes = _seen_axes(data)
+        self.axes = _find_axes(data)
 
     def of(self, series: Series, horizon: int, ticks: int) -> list[tuple[int, Mapping[str, Ticks]]]:
         """Return per axis its target column and a mask ``(ticks,)`` of each situation.
@@ -88,7 +88,7 @@ def _ticks_of(axis: SeenAxis, series: Series, horizon: int, ticks: int) -> dict[
         "fast": np.abs(now) > FAST * axis.fastest,
     }
     if axis.command:
-        asked = _signed(series, axis.command, ticks)
+        asked = _read_signed(series, axis.command, ticks)
         # A lever at neutral says nothing of an axis that stands: `rest` has those ticks.
         masks["dead_band"] = (np.abs(asked) <= axis.dead_band) & ~masks["rest"]
     if axis.stroke is not None:
@@ -100,12 +100,12 @@ def _ticks_of(axis: SeenAxis, series: Series, horizon: int, ticks: int) -> dict[
     return masks
 
 
-def _signed(series: Series, columns: Sequence[int], ticks: int) -> Values:
+def _read_signed(series: Series, columns: Sequence[int], ticks: int) -> Values:
     first = series.inputs[:ticks, columns[0]].astype(np.float64)
     return first - series.inputs[:ticks, columns[1]] if len(columns) > 1 else first
 
 
-def _seen_axes(data: Prepared) -> tuple[SeenAxis, ...]:
+def _find_axes(data: Prepared) -> tuple[SeenAxis, ...]:
     names, roles = [channel.name for channel in data.inputs], roles_of_channels(data.inputs)
     parts = [part for part in (*data.train, *data.validation, *data.test) if part.samples]
     by_velocity: dict[str, Axis] = {axis.velocity: axis for axis in roles.axes if axis.velocity}
@@ -117,7 +117,7 @@ def _seen_axes(data: Prepared) -> tuple[SeenAxis, ...]:
         axis = by_velocity.get(name, Axis(name))
         command = tuple(names.index(one) for one in axis.command)
         largest = max(
-            (float(np.abs(_signed(part, command, part.samples)).max()) for part in parts if command), default=0.0
+            (float(np.abs(_read_signed(part, command, part.samples)).max()) for part in parts if command), default=0.0
         )
         axes.append(SeenAxis(number, fastest, _range(data, axis.stroke, kind, parts), command, DEAD_BAND * largest))
     return tuple(axes)

@@ -163,7 +163,7 @@ def measure_channel_importance(
         growths = []
         for base in ([np.zeros_like(values) for values in expected[done]], expected[done]):
             # All changed recordings go through the network together: streams side by side cost little more than one.
-            changed = [part for turn in donors for part in _exchanged(data.test, columns, base, turn)]
+            changed = [part for turn in donors for part in _exchange_channels(data.test, columns, base, turn)]
             predictions, count = stream_predictions(predictor, changed), len(data.test)
             each = [ruler.errors(predictions[i * count : (i + 1) * count]) for i in range(spec.repeats)]
             growths.append(np.mean(each, axis=0) - plain)
@@ -206,7 +206,7 @@ def _donors(series: Sequence[Series], rng: np.random.Generator) -> list[_Donor]:
     return [_Donor(other, int(rng.integers(0, series[other].samples))) for other in others]
 
 
-def _exchanged(
+def _exchange_channels(
     series: Sequence[Series], columns: Sequence[int], base: Sequence[NDArray[np.float32]], donors: Sequence[_Donor]
 ) -> list[Series]:
     """Return the series with `columns` replaced by `base` plus the donor's deviation from its own base."""

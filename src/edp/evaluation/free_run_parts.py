@@ -42,12 +42,12 @@ def by_channel(channels: Sequence[Channel], values: NDArray[Any], integral: bool
         integral: whether they are integrals of the channels over seconds.
     """
     unit_of = {
-        channel.name: _integrated(KINDS[channel.kind].report_unit) if integral else KINDS[channel.kind].report_unit
+        channel.name: _integrate_unit(KINDS[channel.kind].report_unit) if integral else KINDS[channel.kind].report_unit
         for channel in channels
     }
     units = set(unit_of.values())
     unit = units.pop() if len(units) == 1 else None
-    by_run = _reported(channels, values)
+    by_run = _convert_to_report_units(channels, values)
     return ChannelErrors(
         unit=unit,
         by_channel={c.name: float(x) for c, x in zip(channels, by_run.mean(axis=0), strict=True)},
@@ -59,11 +59,11 @@ def by_channel(channels: Sequence[Channel], values: NDArray[Any], integral: bool
 def stroke_errors(channels: Sequence[Channel], at_s: float, values: NDArray[Any], integral: bool) -> StrokeErrors:
     """Return the means of `by_channel` of runs ``(run, channel)`` at a time, with the median over runs."""
     means = by_channel(channels, values, integral)
-    median = None if means.unit is None else float(np.median(_reported(channels, values)))
+    median = None if means.unit is None else float(np.median(_convert_to_report_units(channels, values)))
     return StrokeErrors(at_s=at_s, **vars(means), median=median)
 
 
-def _reported(channels: Sequence[Channel], values: NDArray[Any]) -> NDArray[Any]:
+def _convert_to_report_units(channels: Sequence[Channel], values: NDArray[Any]) -> NDArray[Any]:
     """Return values ``(run, channel)`` in units of reports."""
     return np.atleast_2d(values * np.array([KINDS[channel.kind].report_factor for channel in channels]))
 
@@ -175,6 +175,6 @@ def _where(channels: Sequence[Channel], errors: Array, axes: NDArray[np.bool_]) 
     return replace(row, by_channel={channel.name: row.by_channel.get(channel.name) for channel in channels})
 
 
-def _integrated(unit: str) -> str:
+def _integrate_unit(unit: str) -> str:
     """Return the unit of the integral over seconds of a quantity in `unit`."""
     return unit.removesuffix("/s")

@@ -230,7 +230,7 @@ def network_verdict(scores: ScoresFile, minutes: float | None = None) -> ErrorVe
         if name != NETWORK:
             by_target = {t.name: _logarithm(network.overall, model.overall, t.name, horizons) for t in scores.targets}
             finite = {target: [value] for target, value in by_target.items() if math.isfinite(value)}
-            ratios.append(ErrorRatios(model.label, finite, _by_recording(network, model, scores)))
+            ratios.append(ErrorRatios(model.label, finite, _compare_recordings(network, model, scores)))
     return best_verdict(ratios, ErrorVerdict("", 0.0, (), NETWORK, advice))
 
 
@@ -243,7 +243,7 @@ def _if_worse(verdict: ErrorVerdict | None) -> ErrorVerdict | None:
     return verdict if verdict is not None and verdict.outcome is ErrorOutcome.WORSE else None
 
 
-def _by_recording(network: ModelScores, model: ModelScores, scores: ScoresFile) -> dict[str, float]:
+def _compare_recordings(network: ModelScores, model: ModelScores, scores: ScoresFile) -> dict[str, float]:
     """Logarithms of the ratio of errors of the recordings that both have."""
     logs = {}
     for name, ours in network.recordings.items():
@@ -278,7 +278,7 @@ class LostOutput:
     horizon: int
 
 
-def lost_outputs(scores: ScoresFile) -> list[LostOutput]:
+def find_lost_outputs(scores: ScoresFile) -> list[LostOutput]:
     """Return the outputs on which a baseline has a lower RMSE at some horizon, the worst first.
 
     Args:

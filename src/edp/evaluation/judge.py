@@ -146,7 +146,7 @@ def judge(
     progress.note("network")
     models = {"network": bench.network(label, seconds)}
     start, left_out = time.perf_counter(), []
-    for name in by_effort(spec.baselines):
+    for name in sort_by_effort(spec.baselines):
         if minutes is not None and time.perf_counter() - start > 60 * minutes:
             left_out.append(name)
             continue
@@ -155,7 +155,7 @@ def judge(
     return bench.together(models, left_out)
 
 
-def by_effort(names: Sequence[str]) -> list[str]:
+def sort_by_effort(names: Sequence[str]) -> list[str]:
     """Names of baselines, the cheapest first."""
     return sorted(names, key=lambda name: BASELINES[name].effort)
 
@@ -252,13 +252,13 @@ class ModelBench:
         measured, within = self.ruler.gathered(predictions).state(), None
         if coverages:
             bounds = pictures.bounds(streamed(net, net.intervals, test, groups=groups), nearest_to_shown(coverages))
-            within = self.ruler.gathered_intervals(bounds, coverages).state()
+            within = self.ruler.gather_intervals(bounds, coverages).state()
         return JudgedPart(measured, within, pictures.tensors)
 
     def network_of(self, parts: Iterable[JudgedPart], label: str, seconds: float) -> JudgedModel:
         """Return the network's entry from its parts, in order; label and training time appear in reports."""
         coverages = self.predictor.spec.output.coverages
-        measured, within = self.ruler.unmeasured(), self.ruler.unmeasured_intervals(coverages)
+        measured, within = self.ruler.unmeasured(), self.ruler.new_interval_metrics(coverages)
         tensors: dict[str, NDArray[np.float32]] = {}
         for part in parts:
             measured.add(part.measured)
@@ -268,16 +268,16 @@ class ModelBench:
         scores = replace(self.ruler.scores(measured), label=label, seconds=seconds)
         if coverages:
             intervals = self.ruler.intervals(within, coverages)
-            weighted = _weighted(scores.overall, intervals)
+            weighted = _weight_intervals(scores.overall, intervals)
             scores = replace(scores, intervals=intervals, weighted_interval_score=weighted)
         return JudgedModel(scores, tensors)
 
     def baseline(self, name: str) -> JudgedModel:
         """Fit a baseline on the training part, and run it along test and validation part."""
         began, pictures = time.perf_counter(), _Kept(self.data.test)
-        baseline = _fitted(BASELINES[name], self.data, self.spec)
-        measured = self.ruler.measure(pictures.seen(_predicted(baseline, self.data, self.data.test), name))
-        validation = _on_validation(baseline, self.data, max(self.skip, self.spec.history))
+        baseline = _fit_baseline(BASELINES[name], self.data, self.spec)
+        measured = self.ruler.measure(pictures.seen(_predict_parts(baseline, self.data, self.data.test), name))
+        validation = _score_on_validation(baseline, self.data, max(self.skip, self.spec.history))
         seconds = time.perf_counter() - began
         scores = replace(measured, label=baseline.label, seconds=seconds, validation=validation)
         return JudgedModel(scores, pictures.tensors)
@@ -292,7 +292,7 @@ class ModelBench:
         return Evaluation(self.ruler.file({name: model.entry for name, model in models.items()}, left_out), tensors)
 
 
-def _weighted(overall: ByHorizon, intervals: Mapping[str, Sequence[IntervalScores]]) -> dict[str, Means]:
+def _weight_intervals(overall: ByHorizon, intervals: Mapping[str, Sequence[IntervalScores]]) -> dict[str, Means]:
     """Weighted interval score by horizon and target, of medians and intervals of the same ticks."""
     return {
         horizon: {
@@ -305,7 +305,7 @@ def _weighted(overall: ByHorizon, intervals: Mapping[str, Sequence[IntervalScore
     }
 
 
-def _on_validation(baseline: Baseline, data: Prepared, skip: int) -> ByHorizon:
+def _score_on_validation(baseline: Baseline, data: Prepared, skip: int) -> ByHorizon:
     """Return overall scores on the validation part, which also selected the baseline's sizes.
 
     Empty if it is too short.
@@ -315,7 +315,7 @@ def _on_validation(baseline: Baseline, data: Prepared, skip: int) -> ByHorizon:
     # As epochs are judged: of a large validation part evenly spread stretches.
     parts = spread_series(data.validation, 100 * (skip + data.task.max_horizon), MOST_VALIDATED)
     ruler = Ruler(replace(data, test=parts), skip)
-    return ruler.measure(_predicted(baseline, data, parts)).overall
+    return ruler.measure(_predict_parts(baseline, data, parts)).overall
 
 
 def _check_memory(predictor: Predictor, data: Prepared, spec: JudgeSpec) -> None:
@@ -334,20 +334,20 @@ def _check_memory(predictor: Predictor, data: Prepared, spec: JudgeSpec) -> None
 
 def baseline_predictions(kind: type[B], data: Prepared, spec: JudgeSpec) -> tuple[Callable[[Prepared], Predictions], B]:
     """Fit a baseline to the training part; return a function for its predictions on test data, and the baseline."""
-    baseline = _fitted(kind, data, spec)
-    return lambda other: [values for _, values in _predicted(baseline, other, other.test)], baseline
+    baseline = _fit_baseline(kind, data, spec)
+    return lambda other: [values for _, values in _predict_parts(baseline, other, other.test)], baseline
 
 
-def _fitted(kind: type[B], data: Prepared, spec: JudgeSpec) -> B:
+def _fit_baseline(kind: type[B], data: Prepared, spec: JudgeSpec) -> B:
     baseline = kind(baseline_task(data, spec))
-    baseline.fit(_as_baselines_read(data, data.train), _as_baselines_read(data, data.validation))
+    baseline.fit(_select_baseline_inputs(data, data.train), _select_baseline_inputs(data, data.validation))
     return baseline
 
 
-def _predicted(
+def _predict_parts(
     baseline: Baseline, data: Prepared, parts: Sequence[Series]
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    for number, part in enumerate(_as_baselines_read(data, parts)):
+    for number, part in enumerate(_select_baseline_inputs(data, parts)):
         yield number, baseline.predict(part)
 
 
@@ -372,7 +372,7 @@ def score_network(predictor: Predictor, data: Prepared, skip: int) -> ModelScore
 
 def baseline_task(data: Prepared, spec: JudgeSpec) -> BaselineTask:
     """Return the task of the baselines: present values only where an input, or a derived feature, measures them."""
-    inputs = (*data.task.features.channels, *_derived(data))
+    inputs = (*data.task.features.channels, *_list_derived_features(data))
     present = tuple(inputs.index(target) if target in inputs else None for target in data.task.targets)
     longest = min(series.samples for series in [*data.train, *data.test]) - data.task.max_horizon - 1
     # At most half of the shortest recording, so that every recording still has ticks to score.
@@ -380,7 +380,7 @@ def baseline_task(data: Prepared, spec: JudgeSpec) -> BaselineTask:
     return BaselineTask(horizons=data.task.horizons, present=present, history=history, seed=spec.seed)
 
 
-def _derived(data: Prepared) -> list[str]:
+def _list_derived_features(data: Prepared) -> list[str]:
     """Return the derived features that baselines read: those not contained in their channel history.
 
     These are the targets' present values, and what is derived from channels that are hidden from the network: a
@@ -390,9 +390,9 @@ def _derived(data: Prepared) -> list[str]:
     return [one.name for one in features.derived if one.name in data.task.targets or one.source in features.hidden]
 
 
-def _as_baselines_read(data: Prepared, parts: Sequence[Series]) -> list[Series]:
+def _select_baseline_inputs(data: Prepared, parts: Sequence[Series]) -> list[Series]:
     """Return series with channels and derived features as inputs, without hidden, initialisation or physics inputs."""
-    names, own = _derived(data), len(data.task.features.channels)
+    names, own = _list_derived_features(data), len(data.task.features.channels)
     if not names and own == len(data.task.inputs):
         return list(parts)
     places = [*range(own), *(data.task.features.features.index(name) for name in names)]

@@ -256,7 +256,9 @@ def _network(part: NetworkPart | TwinPart) -> NetworkCost:
     network = part.bundle.predictor
     whole = isinstance(network, IntegerPredictor)
     counted = (
-        network.in_float() if isinstance(network, IntegerPredictor) and not isinstance(network, TwinPlant) else network
+        network.to_float_network()
+        if isinstance(network, IntegerPredictor) and not isinstance(network, TwinPlant)
+        else network
     )
     form = "w8a16" if whole else "float32"
     if isinstance(part, TwinPart):

@@ -24,7 +24,7 @@ from edp.evaluation.scores_file import (
     ScoresFile,
 )
 from edp.evaluation.situation import situation_of
-from edp.evaluation.tally import Values, named_scores
+from edp.evaluation.tally import Values, name_scores
 from edp.signals import KINDS
 from edp.stats.metrics import interval_score, interval_scores, score, spread
 from edp.stats.sketch import QuantileSketch
@@ -117,11 +117,11 @@ class Ruler:
                 p, t = self._ticks(predicted[:, h], truth[:, h])
                 measured.tallies[h].update(p, t)
                 measured.speeds[h].update(p, t)
-                self._by_situation(measured.by_situation[h], number, horizon, predicted[:, h], truth[:, h])
+                self._add_situations(measured.by_situation[h], number, horizon, predicted[:, h], truth[:, h])
                 if len(t):
-                    measured.recordings.setdefault(number, {})[str(horizon)] = self._of_recording(p, t)
+                    measured.recordings.setdefault(number, {})[str(horizon)] = self._score_recording(p, t)
             for target, sums in measured.integrals.items():
-                sums += self._integrated(target, predicted, truth)
+                sums += self._integrate_errors(target, predicted, truth)
         return measured
 
     def scores(self, measured: Measured) -> ModelScores:
@@ -144,13 +144,13 @@ class Ruler:
             },
         )
 
-    def unmeasured_intervals(self, coverages: Sequence[float]) -> MeasuredIntervals:
+    def new_interval_metrics(self, coverages: Sequence[float]) -> MeasuredIntervals:
         """Return empty accumulators of interval metrics."""
         return MeasuredIntervals((len(self.task.horizons), len(coverages), len(self.task.targets)))
 
-    def gathered_intervals(self, bounds: Numbered, coverages: Sequence[float]) -> MeasuredIntervals:
+    def gather_intervals(self, bounds: Numbered, coverages: Sequence[float]) -> MeasuredIntervals:
         """Return the metrics of intervals of all recordings, or of a part."""
-        measured = self.unmeasured_intervals(coverages)
+        measured = self.new_interval_metrics(coverages)
         for number, pairs in bounds:
             truth = self.truth(number)[self.skip :]
             if not len(truth):
@@ -174,27 +174,27 @@ class Ruler:
             str(horizon): tuple(
                 IntervalScores(
                     coverage=coverage,
-                    covered=self._named(measured.covered[h, which] / ticks),
-                    width=self._named(measured.wide[h, which] / ticks),
-                    score=self._named(measured.scored[h, which] / ticks),
+                    covered=self._name_values(measured.covered[h, which] / ticks),
+                    width=self._name_values(measured.wide[h, which] / ticks),
+                    score=self._name_values(measured.scored[h, which] / ticks),
                 )
                 for which, coverage in enumerate(coverages)
             )
             for h, horizon in enumerate(self.task.horizons)
         }
 
-    def _named(self, values: Values) -> dict[str, float]:
+    def _name_values(self, values: Values) -> dict[str, float]:
         return {MEAN: float(np.mean(values)), **dict(zip(self.task.targets, map(float, values), strict=True))}
 
-    def _by_situation(
+    def _add_situations(
         self, tally: SituationTally, number: int, horizon: int, predicted: NDArray[Any], truth: NDArray[Any]
     ) -> None:
         """Add one recording's errors at one horizon."""
         if self.situations.axes:
             ticks_of = self.situations.of(self.data.test[number], horizon, len(truth))
-            tally.update(np.abs(predicted - truth), self._scored(predicted), ticks_of)
+            tally.update(np.abs(predicted - truth), self._mask_scored(predicted), ticks_of)
 
-    def _scored(self, predicted: NDArray[Any]) -> NDArray[np.bool_]:
+    def _mask_scored(self, predicted: NDArray[Any]) -> NDArray[np.bool_]:
         """Ticks after start-up at which the model has its history."""
         # A baseline without its history says NaN; a tick counts only where all targets are predicted.
         scored: NDArray[np.bool_] = np.isfinite(predicted).all(axis=1)
@@ -203,12 +203,12 @@ class Ruler:
 
     def _ticks(self, predicted: NDArray[Any], truth: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Scored ticks of both."""
-        scored = self._scored(predicted)
+        scored = self._mask_scored(predicted)
         return predicted[scored], truth[scored]
 
-    def _of_recording(self, predicted: NDArray[Any], truth: NDArray[Any]) -> ByTarget:
+    def _score_recording(self, predicted: NDArray[Any], truth: NDArray[Any]) -> ByTarget:
         """Return all scores of the mean over outputs; of each output errors alone, since runs have many recordings."""
-        scores = named_scores(
+        scores = name_scores(
             self.task.targets, [score(predicted[:, i], truth[:, i]) for i in range(len(self.task.targets))]
         )
         measures = ("mae", "rmse")
@@ -216,7 +216,7 @@ class Ruler:
             name: values if name == MEAN else {key: values[key] for key in measures} for name, values in scores.items()
         }
 
-    def _integrated(self, target: str, predicted: NDArray[Any], truth: NDArray[Any]) -> Values:
+    def _integrate_errors(self, target: str, predicted: NDArray[Any], truth: NDArray[Any]) -> Values:
         """Ticks, and sum of the squared error of the running integral, in report unit times seconds."""
         h, column = self.task.horizons.index(0), self.task.targets.index(target)
         difference = (predicted[:, h, column] - truth[:, h, column])[self.skip :]

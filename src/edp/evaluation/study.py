@@ -265,7 +265,9 @@ def parse_study(content: object, where: str = FILE) -> StudyFile:
             raise StorageError(f"{where}: {name} = {content.get(name)!r}; {', '.join(options)} are known")
     try:
         study = STUDY_TREE.build(StudyFile, {key: content[key] for key in content if key != "schema"}, where)
-        return replace(study, decisions=tuple(_typed(decision, study.mode, where) for decision in study.decisions))
+        return replace(
+            study, decisions=tuple(_parse_facts(decision, study.mode, where) for decision in study.decisions)
+        )
     except ConfigError as error:
         raise StorageError(
             f"{error}\nanother version of EDP wrote it, or it was edited: call `edp search` on the study again, which "
@@ -273,7 +275,7 @@ def parse_study(content: object, where: str = FILE) -> StudyFile:
         ) from error
 
 
-def _typed(decision: Decision, mode: str, where: str) -> Decision:
+def _parse_facts(decision: Decision, mode: str, where: str) -> Decision:
     kind = FACTS[mode].get(decision.phase)
     if kind is None or not isinstance(decision.facts, Mapping):
         return decision

@@ -85,9 +85,9 @@ class Tally:
     def scores(self) -> ByTarget:
         """Return the scores by target, and their mean."""
         if self._sums is not None:
-            return named_scores(self.targets, self._sums.scores())
+            return name_scores(self.targets, self._sums.scores())
         predicted, truth = (np.concatenate(side) for side in zip(*self._kept, strict=True))
-        return named_scores(self.targets, [score(predicted[:, i], truth[:, i]) for i in range(len(self.targets))])
+        return name_scores(self.targets, [score(predicted[:, i], truth[:, i]) for i in range(len(self.targets))])
 
 
 class _Sums:
@@ -129,7 +129,7 @@ class _Sums:
         return each
 
 
-def named_scores(targets: Sequence[str], each: Sequence[Scores]) -> ByTarget:
+def name_scores(targets: Sequence[str], each: Sequence[Scores]) -> ByTarget:
     """Scores of each target by name and their mean, as plain values."""
     named = {MEAN: mean_scores(each), **dict(zip(targets, each, strict=True))}
     return {name: values.to_json() for name, values in named.items()}

@@ -150,18 +150,20 @@ def as_mat(variables: Mapping[str, object]) -> bytes:
     import scipy.io  # late: training and search import this module
 
     buffer = io.BytesIO()
-    scipy.io.savemat(buffer, {name: _for_matlab(value) for name, value in variables.items()}, long_field_names=True)
+    scipy.io.savemat(
+        buffer, {name: _convert_for_matlab(value) for name, value in variables.items()}, long_field_names=True
+    )
     text = f"MATLAB 5.0 MAT-file, written by EDP {__version__}".ljust(116).encode()  # without the time of day
     return text + buffer.getvalue()[len(text) :]
 
 
-def _for_matlab(value: Any) -> Any:
+def _convert_for_matlab(value: Any) -> Any:
     """Convert lists to rows of numbers or cells, and text to valid UTF-8."""
     if isinstance(value, str):
         # A lone surrogate has no UTF-8, in which text is written.
         return value.encode("utf-8", "replace").decode()
     if isinstance(value, Mapping):
-        return {key: _for_matlab(entry) for key, entry in value.items()}
+        return {key: _convert_for_matlab(entry) for key, entry in value.items()}
     if not isinstance(value, list):
         return value
     # An empty list becomes cells, as a list of texts would.
@@ -169,5 +171,5 @@ def _for_matlab(value: Any) -> Any:
         return np.array([value], dtype=float)
     cells = np.empty((1, len(value)), dtype=object)
     for at, entry in enumerate(value):
-        cells[0, at] = _for_matlab(entry)
+        cells[0, at] = _convert_for_matlab(entry)
     return cells

@@ -170,7 +170,7 @@ def distinct(names: Iterable[str], most: int) -> list[str]:
     tried: dict[str, int] = {}
     for name in (label[:most] or UNNAMED for label in names):
         number = tried.get(name, 0)
-        while (candidate := _numbered(name, number, most)) in used_names:
+        while (candidate := _add_number(name, number, most)) in used_names:
             number += 1
         tried[name] = number + 1
         used_names.add(candidate)
@@ -179,7 +179,7 @@ def distinct(names: Iterable[str], most: int) -> list[str]:
     return distinct_names
 
 
-def _numbered(name: str, number: int, most: int) -> str:
+def _add_number(name: str, number: int, most: int) -> str:
     ending = f"_{number}" if number else ""
     return name[: most - len(ending)] + ending
 

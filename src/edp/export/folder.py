@@ -44,10 +44,10 @@ def write_export(folder: str | Path, files: Mapping[str, bytes]) -> list[Path]:
     """
     check_kind(folder, "export", what="edp export")
     path = make_folder(folder)
-    with _held(path):
+    with _lock_folder(path):
         # The hash is of the content in memory, not of what a full disk made of it.
         new = {file: {hashlib.sha256(data).hexdigest()} for file, data in files.items()}
-        old = _listed(path / LIST), _listed(path / UNFINISHED)
+        old = _read_list(path / LIST), _read_list(path / UNFINISHED)
         every: Listed = {}
         for part in (*old, new):
             for file, digests in part.items():
@@ -58,7 +58,7 @@ def write_export(folder: str | Path, files: Mapping[str, bytes]) -> list[Path]:
         for parent in {(path / file).parent for file in files} - {path}:
             _check_place(path, parent)
         # The list of unfinished files lets the next export clean up after a kill.
-        write_bytes(path / UNFINISHED, _as_list(every))
+        write_bytes(path / UNFINISHED, _write_list(every))
         _remove(path / LIST)
         _clean(path, every)
         for file in stale:
@@ -67,13 +67,13 @@ def write_export(folder: str | Path, files: Mapping[str, bytes]) -> list[Path]:
         for file, data in files.items():
             write_bytes(path / file, data)
         # The list comes last: its presence says that all files are whole.
-        write_bytes(path / LIST, _as_list(new))
+        write_bytes(path / LIST, _write_list(new))
         _remove(path / UNFINISHED)
     return [path / file for file in files]
 
 
 @contextlib.contextmanager
-def _held(path: Path) -> Iterator[None]:
+def _lock_folder(path: Path) -> Iterator[None]:
     try:
         lock = hold(path / ".lock")
     except BusyError as error:
@@ -90,7 +90,7 @@ def _held(path: Path) -> Iterator[None]:
         lock.close()
 
 
-def _listed(path: Path) -> Listed:
+def _read_list(path: Path) -> Listed:
     """Return the files of a list with their permitted hashes; empty if the list is absent or malformed."""
     listed: Listed = {}
     try:
@@ -108,7 +108,7 @@ def _listed(path: Path) -> Listed:
     return listed
 
 
-def _as_list(listed: Mapping[str, set[str]]) -> bytes:
+def _write_list(listed: Mapping[str, set[str]]) -> bytes:
     return "".join(f"{digest}  {file}\n" for file in listed for digest in sorted(listed[file])).encode()
 
 
@@ -119,7 +119,7 @@ def _ours(path: Path, file: str, digests: set[str]) -> bool:
         StorageError: it is there with another content.
     """
     target = path / file
-    if _linked(path, target) or not is_file_at(target):
+    if _has_link(path, target) or not is_file_at(target):
         return False
     try:
         digest = hashlib.sha256(target.read_bytes()).hexdigest()
@@ -133,14 +133,14 @@ def _ours(path: Path, file: str, digests: set[str]) -> bool:
     return True
 
 
-def _linked(path: Path, target: Path) -> bool:
+def _has_link(path: Path, target: Path) -> bool:
     """Return whether a path below a folder, or a folder on the way to it, is a symbolic link."""
     steps = target.relative_to(path).parts
     return any(is_link_at(path.joinpath(*steps[: at + 1])) for at in range(len(steps)))
 
 
 def _check_place(path: Path, target: Path) -> None:
-    if _linked(path, target):
+    if _has_link(path, target):
         raise StorageError(
             f"'{target}' is a symbolic link, through which files outside of '{path}' would be written; nothing was "
             "written. Remove it, or choose another folder with --out"
@@ -157,7 +157,7 @@ def _remove(path: Path) -> None:
 def _clean(path: Path, every: Mapping[str, object]) -> None:
     """Remove the temporary files of a killed export."""
     for folder in {path, *((path / file).parent for file in every)}:
-        if is_folder_at(folder) and not (folder != path and _linked(path, folder)):
+        if is_folder_at(folder) and not (folder != path and _has_link(path, folder)):
             for rest in entries_of(folder):
                 if TEMPORARY.fullmatch(rest.name) and is_file_at(rest) and not is_link_at(rest):
                     _remove(rest)

@@ -72,15 +72,15 @@ def grown_tolerance(plant: TwinPlant, inputs: Rows, outputs: Rows) -> Rows:
     by a normal draw of `ROUNDED` standard deviations; at least twice the distance of the plant in single precision.
     """
     graph, ticks = plant.graph(), len(inputs)
-    exact = _disturbed(graph, inputs, None)
+    exact = _compute_with_noise(graph, inputs, None)
     draws = [np.random.default_rng(seed) for seed in range(DISTURBED)]
-    apart = np.max([np.abs(_disturbed(graph, inputs, draw) - exact) for draw in draws], axis=0)
+    apart = np.max([np.abs(_compute_with_noise(graph, inputs, draw) - exact) for draw in draws], axis=0)
     moved = np.maximum.accumulate(np.maximum(apart, 2.0 * np.abs(outputs - exact)), axis=0)
     sigma = plant.code.width.detach().cpu().double().numpy().ravel()
     return np.asarray(SHARE * (sigma + np.abs(outputs).max(axis=0)) + moved[:ticks], dtype=np.float32)
 
 
-def _disturbed(graph: Graph, inputs: Rows, draw: np.random.Generator | None) -> NDArray[np.float64]:
+def _compute_with_noise(graph: Graph, inputs: Rows, draw: np.random.Generator | None) -> NDArray[np.float64]:
     """Return outputs in double precision ``(tick, number)``, with noise on the feedback."""
     run = Reference(graph)
     fed_back = [layer.into for layer in graph.layers if isinstance(layer, Feed)]
@@ -134,14 +134,14 @@ def golden_recording(predictor: Predictor, ticks: int) -> tuple[Rows, Rows, Rows
     # Fixed seeds: the same network gives the same recording, byte by byte.
     draws = (random_inputs(predictor, ticks, seed) for seed in range(TRIES))
     inputs, steps = min(
-        _until_clear((drawn, at_thresholds(predictor, drawn, NEAR_GOLDEN)) for drawn in draws),
+        _take_until_clear((drawn, at_thresholds(predictor, drawn, NEAR_GOLDEN)) for drawn in draws),
         key=lambda draw: float(draw[1].max()),
     )
     outputs = stream(predictor, inputs)
     return inputs, outputs, tolerance(predictor, inputs, outputs) + steps.max(axis=0)
 
 
-def _until_clear(draws: Iterable[tuple[Rows, Rows]]) -> Iterator[tuple[Rows, Rows]]:
+def _take_until_clear(draws: Iterable[tuple[Rows, Rows]]) -> Iterator[tuple[Rows, Rows]]:
     """Yield draws up to the first one without a step."""
     for inputs, steps in draws:
         yield inputs, steps

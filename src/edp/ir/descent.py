@@ -11,7 +11,7 @@ from edp.ir.base import Indices
 from edp.ir.layers import depth_of
 
 
-def reached_leaves(feature: Indices, threshold: NDArray[Any], leaf: NDArray[Any], x: NDArray[Any]) -> NDArray[Any]:
+def find_leaves(feature: Indices, threshold: NDArray[Any], leaf: NDArray[Any], x: NDArray[Any]) -> NDArray[Any]:
     """Return the leaf that an input row reaches in each tree of `edp.ir.layers.TreeSums`.
 
     Args:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edp.ir import layers as plain
 from edp.ir import memory
 from edp.ir.base import INPUT, Graph, Layer
-from edp.ir.descent import reached_leaves, summed
+from edp.ir.descent import find_leaves, summed
 
 Values = NDArray[np.floating]
 Memory = dict[str, Values]
@@ -188,17 +188,17 @@ def _dense(layer: plain.Dense, w: Weights, m: Memory, x: Values) -> Values:
 
 
 @_step(plain.GroupedDense)
-def _grouped(layer: Any, w: Weights, m: Memory, x: Values) -> Values:
+def _grouped_dense(layer: Any, w: Weights, m: Memory, x: Values) -> Values:
     rows = x.reshape(len(w["bias"]), -1)
     return np.asarray((np.einsum("roi,ri->ro", w["weight"], rows) + w["bias"]).ravel())
 
 
 @_step(plain.TreeSums)
 def _trees(layer: plain.TreeSums, w: Weights, m: Memory, x: Values) -> Values:
-    return summed(reached_leaves(layer.feature, w["threshold"], w["leaf"], x))
+    return summed(find_leaves(layer.feature, w["threshold"], w["leaf"], x))
 
 
-def _normed(x: Values, epsilon: float) -> Values:
+def _normalise(x: Values, epsilon: float) -> Values:
     middle = x - x.mean(axis=-1, keepdims=True)
     spread = (middle * middle).mean(axis=-1, keepdims=True)
     return np.asarray(middle / np.sqrt(spread + x.dtype.type(epsilon)))
@@ -206,7 +206,7 @@ def _normed(x: Values, epsilon: float) -> Values:
 
 @_step(plain.LayerNorm)
 def _layer_norm(layer: plain.LayerNorm, w: Weights, m: Memory, x: Values) -> Values:
-    rows = _normed(x.reshape(layer.rows, -1), layer.epsilon)
+    rows = _normalise(x.reshape(layer.rows, -1), layer.epsilon)
     return np.asarray((rows * w["gain"] + w["shift"]).ravel())
 
 
@@ -264,9 +264,9 @@ def _lstm(layer: memory.Lstm, w: Weights, m: Memory, x: Values) -> Values:
 
 @_step(memory.LayerNormLstm)
 def _layer_norm_lstm(layer: memory.LayerNormLstm, w: Weights, m: Memory, x: Values) -> Values:
-    driven = _normed(w["weight_x"] @ x, layer.epsilon) * w["gain_x"]
-    gates = driven + _normed(w["weight_h"] @ m["h"], layer.epsilon) * w["gain_h"] + w["bias"]
-    return _lstm_states(gates, m, layer.share, lambda c: _normed(c, layer.epsilon) * w["gain_c"] + w["shift_c"])
+    driven = _normalise(w["weight_x"] @ x, layer.epsilon) * w["gain_x"]
+    gates = driven + _normalise(w["weight_h"] @ m["h"], layer.epsilon) * w["gain_h"] + w["bias"]
+    return _lstm_states(gates, m, layer.share, lambda c: _normalise(c, layer.epsilon) * w["gain_c"] + w["shift_c"])
 
 
 @_step(memory.Gru)

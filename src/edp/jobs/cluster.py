@@ -26,7 +26,7 @@ from edp.jobs.base import (
 )
 from edp.jobs.processes import LocalPool
 from edp.storage import write_bytes
-from edp.storage.ledger import Record, TrainingStatus, code_version, left_state
+from edp.storage.ledger import Record, TrainingStatus, code_version, state_path
 from edp.storage.paths import is_there
 from edp.storage.provenance import environment
 
@@ -130,7 +130,7 @@ class RayPool(ClosedAtExit):
             record = Record.from_bytes(data)
             if state is not None and job.folder is not None:
                 # The state goes in before the record, which says that it is there.
-                write_bytes(left_state(job.folder, job.key), state)
+                write_bytes(state_path(job.folder, job.key), state)
         except errors.OutOfMemoryError as error:
             record = ended(job, TrainingStatus.OOM, f"the node was out of memory: {_line(error)}")
         except (errors.WorkerCrashedError, errors.NodeDiedError, errors.ObjectLostError) as error:
@@ -214,7 +214,7 @@ def _perform_there(job: Job, threads: int, start: _StateFile | None) -> tuple[by
             pool.cancel(job.key)
         if record is None:
             raise RuntimeError("the pool of a node gave a training up without a word")
-        left = left_state(folder, job.key)
+        left = state_path(folder, job.key)
         return record.to_bytes(), left.read_bytes() if is_there(left) else None
 
 

@@ -45,7 +45,7 @@ def perform(
     with contextlib.ExitStack() as stack:
         if folder is not None:
             try:
-                stack.enter_context(_claimed(folder, identity.key))
+                stack.enter_context(_claim_training(folder, identity.key))
             except (BusyError, StorageError) as error:
                 return Record(identity, TrainingStatus.LOST, None, str(error))
             # Asked again under the claim: another worker may have finished it meanwhile.
@@ -64,7 +64,7 @@ def perform(
         return record
 
 
-def _claimed(folder: str, key: str) -> Any:
+def _claim_training(folder: str, key: str) -> Any:
     patience = time.monotonic() + CLAIM_WAIT_S
     while True:
         try:

@@ -235,7 +235,7 @@ class LocalPool(ClosedAtExit):
         try:
             message = worker.connection.recv_bytes()
         except (EOFError, OSError):
-            self._died(worker)
+            self._restart(worker)
             return
         if message == BEGUN:
             limit = turn.job.seconds
@@ -253,7 +253,7 @@ class LocalPool(ClosedAtExit):
         turn, job = worker.now(), worker.now().job
         if time.monotonic() > worker.deadline:
             if not worker.begun:
-                self._died(worker)
+                self._restart(worker)
                 return
             status, message = TrainingStatus.TIMEOUT, f"it took longer than {typed(job.seconds)} s"
         elif job.memory_mb is not None and worker.resident_mb() > job.memory_mb:
@@ -267,7 +267,7 @@ class LocalPool(ClosedAtExit):
         else:
             self._ready.append(ended(job, status, message, attempts=turn.attempt))
 
-    def _died(self, worker: _Worker) -> None:
+    def _restart(self, worker: _Worker) -> None:
         """Start a training whose process ended again, or give it up."""
         turn, last_output = worker.now(), worker.said()
         self._drop(worker)

@@ -34,7 +34,7 @@ class Pace:
     """
 
     def __init__(self, rate_hz: float, speed: float = 1.0, clock: Callable[[], float] = time.monotonic) -> None:
-        self.rate_hz, self.speed, self.paused, self.stopped, self.late = rate_hz, checked_speed(speed), False, False, 0
+        self.rate_hz, self.speed, self.paused, self.stopped, self.late = rate_hz, check_speed(speed), False, False, 0
         self._clock, self._changed = clock, threading.Condition()
         self._ahead = 0
         self._base: tuple[int, float] | None = None
@@ -92,7 +92,7 @@ class Pace:
             ConfigError: it is none.
         """
         with self._changed:
-            self.speed, self._base = checked_speed(speed), None
+            self.speed, self._base = check_speed(speed), None
             self._changed.notify_all()
 
     def run_ahead(self, tick: int) -> None:
@@ -108,7 +108,7 @@ class Pace:
             self._changed.notify_all()
 
 
-def checked_speed(speed: float) -> float:
+def check_speed(speed: float) -> float:
     """Return a checked speed factor.
 
     Raises:

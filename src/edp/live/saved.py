@@ -41,7 +41,7 @@ def live_page(title: str, host: str) -> tuple[str, str]:
             "frame-ancestors 'none'",
         ]
     )
-    return _rendered(title, connect, {"mode": "live"}), policy
+    return _render_page(title, connect, {"mode": "live"}), policy
 
 
 def session_page(session: LiveSession) -> str:
@@ -59,7 +59,7 @@ def session_page(session: LiveSession) -> str:
         "ended": session.ended,
         "breaks": session.breaks,
     }
-    return _rendered(session.layout.title, "'none'", content)
+    return _render_page(session.layout.title, "'none'", content)
 
 
 def write_session_page(session: LiveSession, target: str | Path) -> Path:
@@ -78,7 +78,7 @@ def parts() -> tuple[str, str]:
     return "\n".join(map(asset, _SCRIPTS)), stylesheet(*_STYLES)
 
 
-def _rendered(title: str, connect: str, content: dict[str, object]) -> str:
+def _render_page(title: str, connect: str, content: dict[str, object]) -> str:
     script, style = parts()
     return template("live.html.jinja").render(
         title=title, connect=connect, style=Markup(style), script=Markup(script), data=json_text(content)

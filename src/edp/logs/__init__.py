@@ -1,6 +1,6 @@
 """Recordings in and out: readers and writers, units, time stamps, repairs and quality reports."""
 
-from edp.logs.detect import format_for, known_suffixes, open_log
+from edp.logs.detect import format_for, list_suffixes, open_log
 from edp.logs.formats import csv as csv
 from edp.logs.formats import mat as mat
 from edp.logs.formats import mdf as mdf
@@ -51,7 +51,7 @@ __all__ = [
     "format_for",
     "inspect",
     "inspect_log",
-    "known_suffixes",
+    "list_suffixes",
     "look_into",
     "open_log",
     "read_data_set",

@@ -92,7 +92,7 @@ class Assembly:
         Raises:
             DataError: a column cannot be read, or holds missing values that may not be repaired.
         """
-        values, repairs = self._mended(start, stop, before)
+        values, repairs = self._repair_columns(start, stop, before)
         meta: Table = dict(self.raw.meta)
         if self.repairs or repairs:
             meta["repairs"] = [*meta.get("repairs", []), *self.repairs, *repairs]
@@ -107,7 +107,7 @@ class Assembly:
             meta=meta,
         )
 
-    def _mended(self, start: int, stop: int, before: FloatArray | None) -> tuple[FloatArray, list[Table]]:
+    def _repair_columns(self, start: int, stop: int, before: FloatArray | None) -> tuple[FloatArray, list[Table]]:
         values = self.values(start, stop)
         missing = self.missing[start:stop]
         if self.repair.gaps != "hold":
@@ -229,10 +229,10 @@ def prepare(
         repairs + gap_facts,
         untouched,
     )
-    return _without_empty_start(assembly) if repair.nan == "hold" and rows is None else assembly
+    return _drop_empty_start(assembly) if repair.nan == "hold" and rows is None else assembly
 
 
-def _without_empty_start(assembly: Assembly) -> Assembly:
+def _drop_empty_start(assembly: Assembly) -> Assembly:
     """Remove the samples before every channel has its first value, since earlier values cannot be held.
 
     Raises:
@@ -329,7 +329,7 @@ def _timelines(
         if key in stamps:
             _check_length(raw, signal, stamps[key].clock, signals[0])
             continue
-        stated = _stated_clock(raw, signal, signal_map)
+        stated = _find_clock(raw, signal, signal_map)
         if stated is not None:
             stamps[key] = _Stamps(stated, None)
             continue
@@ -354,7 +354,7 @@ def _timelines(
     return lines, grid, repairs
 
 
-def _stated_clock(raw: RawLog, signal: RawSignal, signal_map: SignalMap) -> Clock | None:
+def _find_clock(raw: RawLog, signal: RawSignal, signal_map: SignalMap) -> Clock | None:
     """Return the clock of uniform rows, if the map or the file states a rate or sample time."""
     rate = None
     if signal_map.sample_time_s is not None:

@@ -79,7 +79,7 @@ class BucketReader:
                 f"the address of bucket '{self.bucket.rsplit('@', 1)[-1]}' holds credentials or options; leave them "
                 f"out and set them in the environment: {HELP[self.scheme]}"
             )
-        self._files: Any = self._in_time(lambda: _file_system(self.scheme), address)
+        self._files: Any = self._run_step(lambda: _file_system(self.scheme), address)
 
     def objects(self, address: str) -> list[RemoteFile]:
         """Return the objects below an address, or the object at it, sorted by name.
@@ -98,7 +98,7 @@ class BucketReader:
                 return [at]
             return list(self._files.get_file_info(FileSelector(path, recursive=True, allow_not_found=True)))
 
-        files = [entry for entry in self._in_time(listed, address) if entry.type == FileType.File]
+        files = [entry for entry in self._run_step(listed, address) if entry.type == FileType.File]
         if not files:
             raise DataError(f"'{address}' does not exist: the bucket has no object of this name and none below it")
         if len(files) > MOST_OBJECTS:
@@ -137,9 +137,9 @@ class BucketReader:
     def _pieces(self, address: str, most: int) -> Iterator[bytes]:
         # As a stream: of a file, pyarrow asks Google's servers for all bytes, and holds the interpreter's lock,
         # so that no limit of time would count.
-        stream: IO[bytes] = self._in_time(lambda: self._files.open_input_stream(self._path(address), None), address)
+        stream: IO[bytes] = self._run_step(lambda: self._files.open_input_stream(self._path(address), None), address)
         came = 0
-        while piece := self._in_time(lambda: stream.read(PIECE_BYTES), address):
+        while piece := self._run_step(lambda: stream.read(PIECE_BYTES), address):
             came += len(piece)
             if came > most:
                 raise DataError(f"'{address}' has more than the {most:,} bytes expected; it was changed: list it again")
@@ -151,7 +151,7 @@ class BucketReader:
             raise ConfigError(f"'{address}' does not lie in bucket '{self.bucket}'")
         return f"{self.bucket}/{match[3]}" if match[3] else self.bucket
 
-    def _in_time(self, step: Callable[[], Result], address: str) -> Result:
+    def _run_step(self, step: Callable[[], Result], address: str) -> Result:
         """Run a step with the time limit `STEP_S` and translate its errors."""
         results: list[Result] = []
         errors: list[BaseException] = []
@@ -173,9 +173,9 @@ class BucketReader:
                 "and "
                 "try again: what was copied stays"
             )
-        raise self._in_words(errors[0], address) from errors[0]
+        raise self._describe_error(errors[0], address) from errors[0]
 
-    def _in_words(self, error: BaseException, address: str) -> BaseException:
+    def _describe_error(self, error: BaseException, address: str) -> BaseException:
         if isinstance(error, FileNotFoundError):
             return DataError(f"'{address}' does not exist: the bucket has no object of this name")
         from pyarrow import ArrowException

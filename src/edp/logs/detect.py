@@ -72,7 +72,7 @@ _OTHERS = {
 }
 
 
-def known_suffixes() -> tuple[str, ...]:
+def list_suffixes() -> tuple[str, ...]:
     """All file endings that can be read, in the order of the registry."""
     return tuple(suffix for part in FORMATS.values() for suffix in part.suffixes)
 
@@ -104,7 +104,7 @@ def format_for(path: Path) -> LogFormat:
     for part in FORMATS.values():
         if suffix in part.suffixes:
             return part
-    advice = f"; {_EXPORT[suffix]}" if suffix in _EXPORT else closest(suffix, known_suffixes())
+    advice = f"; {_EXPORT[suffix]}" if suffix in _EXPORT else closest(suffix, list_suffixes())
     raise DataError(f"'{path}': files ending in '{suffix}' cannot be read or written{advice}")
 
 

@@ -33,7 +33,7 @@ class Drawn:
         )
 
 
-def checked_hours(hours: float) -> float:
+def check_hours(hours: float) -> float:
     """Hours of a sample.
 
     Raises:
@@ -44,7 +44,7 @@ def checked_hours(hours: float) -> float:
     return hours
 
 
-def drawn_recordings(recordings: Sequence[Recording], hours: float) -> list[Recording]:
+def draw_recordings(recordings: Sequence[Recording], hours: float) -> list[Recording]:
     """Return at most about `hours` of the recordings, as evenly spaced segments of `STRETCH_S` if there are more."""
     most = max(1, round(3600.0 * hours * recordings[0].rate_hz))
     return spread_recordings(recordings, STRETCH_S, most)

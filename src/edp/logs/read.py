@@ -10,7 +10,7 @@ from pathlib import Path
 
 from edp.errors import DataError
 from edp.logs.assemble import assemble, parts, prepare
-from edp.logs.detect import BAG_MARK, export_advice, format_for, is_text_log, known_suffixes, open_log
+from edp.logs.detect import BAG_MARK, export_advice, format_for, is_text_log, list_suffixes, open_log
 from edp.logs.formats.base import TRUTH, RawLog, holds_truth_apart, is_truth
 from edp.logs.formats.names import name_of_file
 from edp.logs.repair import Repair
@@ -40,7 +40,7 @@ def read_recording(
     """Read a log file as a uniformly sampled recording in SI units.
 
     Args:
-        path: a log of any known format (`edp.logs.known_suffixes`), or the folder of a ROS 2 bag.
+        path: a log of any known format (`edp.logs.list_suffixes`), or the folder of a ROS 2 bag.
         signal_map: which columns become which channels; an empty map takes the vocabulary's names with the units
             that the file states (SI where it states none).
         name: the recording's name; default: as the file says, else the file's stem.
@@ -55,7 +55,7 @@ def read_recording(
         DataError: the file, a column, a unit, a time stamp or a value cannot be used; the message says what to change.
     """
     signal_map, repair = signal_map or SignalMap(), repair or Repair()
-    raw, sources = _opened(path, signal_map)
+    raw, sources = _open_with_channels(path, signal_map)
     return assemble(raw, sources, signal_map, repair, name, rows)[0]
 
 
@@ -83,11 +83,11 @@ def read_parts(
     if samples < 1:
         raise DataError(f"parts of {samples} samples asked for; give at least 1")
     signal_map, repair = signal_map or SignalMap(), repair or Repair()
-    raw, sources = _opened(path, signal_map)
+    raw, sources = _open_with_channels(path, signal_map)
     yield from parts(prepare(raw, sources, signal_map, repair), samples, raw.name or name_of_file(raw.path))
 
 
-def _opened(path: str | Path, signal_map: SignalMap) -> tuple[RawLog, list[ChannelSource]]:
+def _open_with_channels(path: str | Path, signal_map: SignalMap) -> tuple[RawLog, list[ChannelSource]]:
     """Open the file and return the requested channels, all of which must exist."""
     raw = open_log(path, signal_map)
     sources, problems = resolve(raw, signal_map)
@@ -131,7 +131,7 @@ def find_recordings(path: str | Path) -> tuple[Path, ...]:
         raise DataError(f"'{source}' does not exist; give a log file or a folder of log files")
     there = list(files_below(source))
     bags = {entry.parent for entry in there if entry.name == BAG_MARK}
-    suffixes = known_suffixes()
+    suffixes = list_suffixes()
     files = [
         entry
         for entry in there
@@ -203,13 +203,13 @@ def alike(recordings: list[Recording], files: Sequence[Path], truth_asked: bool 
         DataError: mixed rates or channels.
     """
     if not truth_asked:
-        recordings = _without_partial_truth(recordings)
+        recordings = _drop_partial_truth(recordings)
     _check_same(recordings, files)
     rate = recordings[0].rate_hz
     return [recording if recording.rate_hz == rate else replace(recording, rate_hz=rate) for recording in recordings]
 
 
-def _without_partial_truth(recordings: list[Recording]) -> list[Recording]:
+def _drop_partial_truth(recordings: list[Recording]) -> list[Recording]:
     """Remove ground truth that only some recordings hold: ground heights exist in soil, not in free air."""
     if len({recording.channel_names for recording in recordings}) == 1:
         return recordings

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from edp.errors import DataError, EdpError, closest
 from edp.logs.formats.base import RawLog, RawSignal
-from edp.logs.units import check_unit, kind_of_unit, mapped_channel, unit_for
+from edp.logs.units import channel_from_entry, check_unit, kind_of_unit, unit_for
 from edp.signals import VOCABULARY, Channel, ChannelMap, SignalMap, Unit
 
 _LOOKED_ROWS = 1000
@@ -108,7 +108,7 @@ def _nothing_known(raw: RawLog) -> DataError:
 
 
 def _one(raw: RawLog, entry: ChannelMap) -> ChannelSource:
-    channel = mapped_channel(entry)
+    channel = channel_from_entry(entry)
     where = f"'{raw.path}', column '{entry.column}'"
     stated = check_unit(entry.unit, f"{where}: signal map, channel '{entry.name}'")
     present = entry.column in raw

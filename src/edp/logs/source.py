@@ -17,8 +17,8 @@ from edp.jobs import IN_PROCESS, Workers
 from edp.jobs.packing import pack, unpack
 from edp.jobs.workers import WorkUnit
 from edp.logs.buckets import BucketReader, RemoteFile, bucket_address
-from edp.logs.detect import known_suffixes
-from edp.logs.drawn import checked_hours, drawn_recordings, findings_of_part
+from edp.logs.detect import list_suffixes
+from edp.logs.drawn import check_hours, draw_recordings, findings_of_part
 from edp.logs.quality.checks import Finding
 from edp.logs.quality.cross_recording import DataQuality, compare
 from edp.logs.quality.inspection import look_into, unreadable
@@ -30,7 +30,7 @@ from edp.logs.store.building import StoredLog, build_store
 from edp.logs.store.index import StoreIndex, is_store, read_index
 from edp.logs.store.opening import read_store
 from edp.logs.store.remote import is_remote_store, local_store
-from edp.logs.units import with_kinds, without_derived_kinds
+from edp.logs.units import add_kinds, drop_derived_kinds
 from edp.progress import SILENT, Progress
 from edp.recording import MACHINE, Recording
 from edp.settings.provenance import DataOrigin
@@ -109,7 +109,7 @@ class DataSource:
                     "data-set file, a store or an address alone"
                 )
         if self.at_most_h is not None:
-            checked_hours(self.at_most_h)
+            check_hours(self.at_most_h)
 
     @staticmethod
     def of(
@@ -167,7 +167,7 @@ class DataSource:
         plain: Table = {"path": self.address or str(full_path(self.path))}
         if self.signal_map is not None:
             # Kinds that units tell are written out: an entry without one was read by an earlier version.
-            plain["map"] = plain_tree(with_kinds(self.signal_map))
+            plain["map"] = plain_tree(add_kinds(self.signal_map))
         if self.repair is not None:
             plain["repair"] = plain_tree(self.repair)
         if self.at_most_h is not None:
@@ -179,7 +179,7 @@ class DataSource:
     @staticmethod
     def from_plain(plain: Table) -> DataSource:
         """Create the source that `to_plain` described."""
-        signal_map = without_derived_kinds(build(SignalMap, plain["map"], "provenance map")) if "map" in plain else None
+        signal_map = drop_derived_kinds(build(SignalMap, plain["map"], "provenance map")) if "map" in plain else None
         repair = build(Repair, plain["repair"], "provenance repair") if "repair" in plain else None
         more = tuple(Path(path) for path in plain.get("more", ()))
         return DataSource(Path(plain["path"]), signal_map, repair, plain.get("at_most_h"), more)
@@ -195,9 +195,9 @@ class DataSource:
         if self.stored:
             return []
         if self.path.suffix == ".toml":
-            return _listed(self.path, self.signal_map, self.repair)
+            return _read_data_set(self.path, self.signal_map, self.repair)
         if self.address:
-            return _in_bucket(self.address, self.signal_map, self.repair)
+            return _list_bucket(self.address, self.signal_map, self.repair)
         files = dict.fromkeys(file for path in self.paths for file in find_recordings(path))
         return [Log(path, self.signal_map, self.repair) for path in files]
 
@@ -211,7 +211,7 @@ class DataSource:
         if self.stored:
             self.check_store_options()
             stored = read_store(self.store_folder())
-            return stored if self.at_most_h is None else drawn_recordings(stored, self.at_most_h)
+            return stored if self.at_most_h is None else draw_recordings(stored, self.at_most_h)
         self._refuse_bucket_and_sample()
         if self.path.suffix != ".toml":
             return read_data_set(self.paths, self.signal_map, repair=self.repair)
@@ -298,7 +298,7 @@ class DataSource:
             for one in part.sketches:
                 if one is not None:
                     sketches.add(one)
-        return compare(reports, sketches, self._drawn_findings(recordings))
+        return compare(reports, sketches, self._note_selection(recordings))
 
     def _units_of_store(self, recordings: Sequence[Recording], are_at_hand: bool) -> list[WorkUnit]:
         """Parts of the recordings of a store; recordings at hand are not read again."""
@@ -315,7 +315,7 @@ class DataSource:
             units.append(WorkUnit(f"{__name__}:inspect_stored", part[0].name, arguments, digest, where, len(part)))
         return units
 
-    def _drawn_findings(self, recordings: Sequence[Recording]) -> tuple[Finding, ...]:
+    def _note_selection(self, recordings: Sequence[Recording]) -> tuple[Finding, ...]:
         """Return the note of an inspection if these recordings are only a part of the store."""
         whole = self.at_most_h is None
         return () if whole else findings_of_part(recordings, read_index(self.store_folder()).hours())
@@ -377,10 +377,10 @@ class Log:
         return replace(recording, meta={**recording.meta, MACHINE: self.machine}) if self.machine else recording
 
 
-def _in_bucket(address: str, signal_map: SignalMap | None, repair: Repair | None) -> list[Log]:
+def _list_bucket(address: str, signal_map: SignalMap | None, repair: Repair | None) -> list[Log]:
     """Return the logs below an address of a bucket, or the log at it, selected by file ending."""
     objects = BucketReader(address).objects(address)
-    suffixes = known_suffixes()
+    suffixes = list_suffixes()
     chosen = [file for file in objects if Path(file.name).suffix.lower() in suffixes]
     if not chosen:
         raise DataError(f"'{address}' holds {len(objects):,} object(s), none with the ending of a log that EDP reads")
@@ -425,7 +425,7 @@ def load_data_set(path: str | Path) -> DataSetSettings:
     return settings
 
 
-def _listed(path: Path, signal_map: SignalMap | None, repair: Repair | None) -> list[Log]:
+def _read_data_set(path: Path, signal_map: SignalMap | None, repair: Repair | None) -> list[Log]:
     """Return the logs of a data-set file with resolved paths; a map given here replaces the common map."""
     settings = load_data_set(path)
 
@@ -435,7 +435,7 @@ def _listed(path: Path, signal_map: SignalMap | None, repair: Repair | None) -> 
     shared = signal_map or resolved(settings.map)
     logs = []
     for entry in settings.recordings:
-        expanded = _expanded(entry.path, path)
+        expanded = _expand_variables(entry.path, path)
         address = bucket_address(expanded)
         remote = BucketReader(address).objects(address)[0] if address else None
         # An absolute path stands for itself, and so does an address.
@@ -457,7 +457,7 @@ def _check_listed(recordings: list[Recording], path: Path) -> None:
         raise DataError(f"'{path}': mixed rates: {shown}; set rate_hz in the signal map")
 
 
-def _expanded(entry: str, path: Path) -> str:
+def _expand_variables(entry: str, path: Path) -> str:
     """`entry` with environment variables put in, so that a data-set file can name logs on another disk."""
     full = os.path.expandvars(entry)
     if "$" in full:
@@ -490,7 +490,7 @@ def read_with_truth(source: DataSource) -> Recording:
     if len(recordings) != 1:
         raise DataError(f"'{source.path}' holds {len(recordings)} recordings; give one log")
     recording, log = recordings[0], source.path
-    truth = read_truth(log) if log.suffix.lower() in known_suffixes() and is_file_at(log) else None
+    truth = read_truth(log) if log.suffix.lower() in list_suffixes() and is_file_at(log) else None
     if truth is None:
         return recording
     new = [c for c in truth.channels if c.name not in recording.channel_names]

@@ -118,7 +118,7 @@ def judge(stamps: Stamps, where: str) -> Clock:
     off = stamps - (start + step * np.arange(len(stamps))) if step > 0 else np.full(len(stamps), np.inf)
     jitter = float(np.sqrt(np.mean(off**2)) / step) if step > 0 else float("inf")
     near = jitter <= UNIFORM_RMS and float(np.abs(off).max()) <= UNIFORM_MAX * step
-    rounded_line = None if near or step <= 0 else _rounded_line(stamps, median) or _repeated_line(stamps, steps)
+    rounded_line = None if near or step <= 0 else _fit_rounded_line(stamps, median) or _fit_repeated_line(stamps, steps)
     if rounded_line is not None:
         near, (start, step) = True, rounded_line
     if near:
@@ -162,7 +162,7 @@ def _line(stamps: Stamps) -> tuple[float, float]:
     return float(np.median(stamps - step * np.arange(len(stamps)))), step
 
 
-def _rounded_line(stamps: Stamps, median: float) -> tuple[float, float] | None:
+def _fit_rounded_line(stamps: Stamps, median: float) -> tuple[float, float] | None:
     """Start and step of the line of which the stamps are the rounded values; None where rounding is not all there is.
 
     Every stamp must lie within half a unit of its last printed digit of the line (and 5 % of a step). Stamps that
@@ -182,13 +182,13 @@ def _rounded_line(stamps: Stamps, median: float) -> tuple[float, float] | None:
     decades = np.floor(np.log10(np.maximum(np.abs(stamps), 1e-9))).astype(int)
     for decade in np.unique(decades):
         part = decades == decade
-        digit = _printed_digit(stamps[part], floor=0.02 * step)
+        digit = _find_last_digit(stamps[part], floor=0.02 * step)
         if float(off[part].max()) > 0.51 * digit + UNIFORM_RMS * step:
             return None
     return mean + step * float(rows[0]), step
 
 
-def _repeated_line(stamps: Stamps, steps: Stamps) -> tuple[float, float] | None:
+def _fit_repeated_line(stamps: Stamps, steps: Stamps) -> tuple[float, float] | None:
     """Start and step of the line that stamps of a coarse clock follow, which repeat for some rows; None for others.
 
     Exports that keep some digits of a number do that, whatever the last digit is worth. A row that was lost within a
@@ -211,7 +211,7 @@ def _repeated_line(stamps: Stamps, steps: Stamps) -> tuple[float, float] | None:
     return mean + step * float(rows[0]), step
 
 
-def _printed_digit(stamps: Stamps, floor: float) -> float:
+def _find_last_digit(stamps: Stamps, floor: float) -> float:
     """Return the largest power of ten that divides all stamps; powers below `floor` are not tried."""
     for power in range(10):
         if 10.0**-power < floor:

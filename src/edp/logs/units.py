@@ -115,7 +115,7 @@ def kind_of_unit(stated: str | None) -> Kind:
     return Kind.GENERIC if unit is None or Kind.GENERIC in unit.kinds else unit.kinds[0]
 
 
-def mapped_channel(entry: ChannelMap) -> Channel:
+def channel_from_entry(entry: ChannelMap) -> Channel:
     """Return the channel of an entry of a signal map.
 
     The kind is the stated one, else that of the vocabulary, else that of the stated unit (`kind_of_unit`: bar is a
@@ -127,21 +127,21 @@ def mapped_channel(entry: ChannelMap) -> Channel:
     return Channel(entry.name, entry.kind or kind_of_unit(entry.unit), entry.description)
 
 
-def with_kinds(signal_map: SignalMap) -> SignalMap:
+def add_kinds(signal_map: SignalMap) -> SignalMap:
     """Return a map whose entries state the kinds given by their units."""
-    return replace(signal_map, channels=tuple(map(_with_kind, signal_map.channels)))
+    return replace(signal_map, channels=tuple(map(_add_kind, signal_map.channels)))
 
 
-def without_derived_kinds(signal_map: SignalMap) -> SignalMap:
+def drop_derived_kinds(signal_map: SignalMap) -> SignalMap:
     """Return a map with the meaning of earlier versions, which read a channel without a kind as plain numbers."""
     entries = (
-        replace(entry, kind=Kind.GENERIC) if _with_kind(entry) != entry else entry for entry in signal_map.channels
+        replace(entry, kind=Kind.GENERIC) if _add_kind(entry) != entry else entry for entry in signal_map.channels
     )
     return replace(signal_map, channels=tuple(entries))
 
 
-def _with_kind(entry: ChannelMap) -> ChannelMap:
-    kind = mapped_channel(entry).kind
+def _add_kind(entry: ChannelMap) -> ChannelMap:
+    kind = channel_from_entry(entry).kind
     is_derived = entry.kind is None and entry.name not in VOCABULARY and kind is not Kind.GENERIC
     return replace(entry, kind=kind) if is_derived else entry
 

@@ -20,7 +20,7 @@ def write_recording(recording: Recording, path: str | Path, options: WriteOption
 
     Args:
         recording: what to write.
-        path: its ending is one of `edp.logs.known_suffixes`; an existing file is replaced only by a complete new one.
+        path: its ending is one of `edp.logs.list_suffixes`; an existing file is replaced only by a complete new one.
         options: the layout of a MAT file; where truth goes.
 
     Raises:

@@ -147,10 +147,10 @@ class MonitorChain:
                 state.since = number
                 verdicts.append(BlockVerdict(number, (0.0,) * len(self.watches), row, None, number, np.zeros(len(row))))
                 continue
-            verdicts.append(self._judged(number, row, seen, state))
+            verdicts.append(self._evaluate_block(number, row, seen, state))
         return verdicts, state
 
-    def _judged(self, number: int, row: Array, seen: Array, state: ChainState) -> BlockVerdict:
+    def _evaluate_block(self, number: int, row: Array, seen: Array, state: ChainState) -> BlockVerdict:
         largest = float(state.bank.step(seen[None])[0])
         each: Array = state.bank.each[:, 0].copy()  # type: ignore[attr-defined]
         there = np.isfinite(row)

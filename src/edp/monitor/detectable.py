@@ -58,23 +58,23 @@ class _Injection:
     apply: Callable[[Any, int, float, float], Any]
 
 
-def _shifted(values: Any, onset: int, size: float, rate_hz: float) -> Any:
+def _shift(values: Any, onset: int, size: float, rate_hz: float) -> Any:
     return np.concatenate([values[:onset], values[onset:] + np.float32(size)])
 
 
-def _scaled(values: Any, onset: int, size: float, rate_hz: float) -> Any:
+def _scale(values: Any, onset: int, size: float, rate_hz: float) -> Any:
     return np.concatenate([values[:onset], values[onset:] * np.float32(1.0 + size)])
 
 
-def _delayed(values: Any, onset: int, size: float, rate_hz: float) -> Any:
+def _delay(values: Any, onset: int, size: float, rate_hz: float) -> Any:
     samples = min(max(1, round(size * rate_hz)), onset)
     return np.concatenate([values[:onset], values[onset - samples : len(values) - samples]])
 
 
 INJECTIONS = {
-    Change.SHIFT: _Injection((0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0), (1.0, -1.0), MAX_SEGMENTS, _shifted),
-    Change.SCALE: _Injection((0.01, 0.02, 0.05, 0.1, 0.2, 0.5), (1.0, -1.0), 2, _scaled),
-    Change.DELAY: _Injection((0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0), (1.0,), 2, _delayed),
+    Change.SHIFT: _Injection((0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0), (1.0, -1.0), MAX_SEGMENTS, _shift),
+    Change.SCALE: _Injection((0.01, 0.02, 0.05, 0.1, 0.2, 0.5), (1.0, -1.0), 2, _scale),
+    Change.DELAY: _Injection((0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0), (1.0,), 2, _delay),
 }
 """Shifts come first: they are measured with more trials, and the effort may end before the others."""
 
@@ -184,14 +184,14 @@ def measure_found_sizes(
     rows: list[FoundSize] = []
     for number, (change, channel) in enumerate(planned, start=1):
         progress.note(f"changes that are found: {change} of {channel.name}, {number} of {len(planned)}")
-        row = _of_channel(monitor, quiet, channel, change, effort)
+        row = _measure_channel(monitor, quiet, channel, change, effort)
         if row is None:
             break
         rows.append(replace(row, minutes=minutes))
     return FoundSizes(tuple(rows), len(planned), effort.seconds, effort.allowed_s)
 
 
-def _of_channel(
+def _measure_channel(
     monitor: Monitor, quiet: Sequence[Recording], channel: Channel, change: Change, effort: _Effort
 ) -> FoundSize | None:
     """Return the size that is found, by bisection; None where the effort ends before."""
@@ -288,7 +288,7 @@ def promise_lines(sizes: Sequence[FoundSize]) -> list[str]:
         return ["what it finds was not measured: no healthy segment outside of the limits is free of alarms"]
     minutes = f"with {figure(sizes[0].minutes, 3)} healthy minutes"
     lines = []
-    for rows in _by_change(sizes):
+    for rows in _measure_changes(sizes):
         more = [f"and {len(rows) - _SHOWN} more channels (--json)"] if len(rows) > _SHOWN else []
         lines.append(f"{minutes} {'; '.join([*(size.sentence() for size in rows[:_SHOWN]), *more])}")
     return lines
@@ -316,7 +316,7 @@ def effort_line(provenance: Table) -> str:
     )
 
 
-def _by_change(sizes: Sequence[FoundSize]) -> list[list[FoundSize]]:
+def _measure_changes(sizes: Sequence[FoundSize]) -> list[list[FoundSize]]:
     """Sizes of each change that was injected, in the order of `INJECTIONS`."""
     groups = [[size for size in sizes if size.change == change] for change in INJECTIONS]
     return [group for group in groups if group]
@@ -327,7 +327,7 @@ def unseen_line(sizes: Sequence[FoundSize]) -> str:
     if not sizes:
         return ""
     parts = []
-    for rows in _by_change(sizes):
+    for rows in _measure_changes(sizes):
         named = ", ".join(
             f"of {size.channel} {'up to' if size.size is None else 'below'} {size.amount()}" for size in rows[:_SHOWN]
         )

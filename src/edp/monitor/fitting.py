@@ -25,7 +25,7 @@ from edp.monitor.session_blocks import (
     summarised,
 )
 from edp.monitor.summaries import BlockSummaries
-from edp.monitor.watches import BankSpec, Watch, WatchSpec, check_rows, fit_watch, scaled_alike
+from edp.monitor.watches import BankSpec, Watch, WatchSpec, check_rows, fit_watch, scale_watches
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.settings.bounds import above, below, check_bounds, check_count, integer, span
@@ -166,17 +166,17 @@ def check_healthy_sessions(spec: ChainSpec, channels: Sequence[Channel], session
     _check_sessions(spec, len(sessions))
     block = block_ticks(spec.block_s, sessions)
     points = operating_numbers(channels, sessions, block)
-    lengths = watched_blocks(spec, sessions)
+    lengths = count_watched_blocks(spec, sessions)
     folds = min(spec.folds, len(sessions))
     for fold in (NO_FOLD, *range(folds)):
-        left_out = set(_left_out(fold, len(sessions), folds))
+        left_out = set(_list_left_out(fold, len(sessions), folds))
         others = [length for index, length in enumerate(lengths) if index not in left_out]
         check_blocks(sum(others), points)
         for watch in spec.watches:
             check_rows(watch, others, sessions[0].rate_hz / block)
 
 
-def watched_blocks(spec: ChainSpec, sessions: Sequence[Recording]) -> list[int]:
+def count_watched_blocks(spec: ChainSpec, sessions: Sequence[Recording]) -> list[int]:
     """Return the number of blocks of each session that are watched, those at the start left out."""
     block = block_ticks(spec.block_s, sessions)
     settle = _settle_blocks(spec, sessions, block)
@@ -200,7 +200,7 @@ def _settle_blocks(spec: ChainSpec, sessions: Sequence[Recording], block: int) -
     return -(-settle_ticks // block)
 
 
-def _left_out(fold: int, sessions: int, folds: int) -> range:
+def _list_left_out(fold: int, sessions: int, folds: int) -> range:
     """Return the indices of the sessions left out by the fold."""
     return range(0) if fold == NO_FOLD else range(fold, sessions, folds)
 
@@ -215,7 +215,7 @@ def fit_from_blocks(
     side_by_side: SideBySide = ONE_BY_ONE,
 ) -> FittedChain:
     """Fit a chain like `fit_chain`, given the blocks of the sessions."""
-    remaining, doubtful = _without_doubtful(spec, blocks, settle)
+    remaining, doubtful = _drop_doubtful(spec, blocks, settle)
     blocks_per_s = rate_hz / summaries.block
     drift = SlowDrift(spec.drift_per_hour / 3600.0 / blocks_per_s, spec.most_drift)
     folds = min(spec.folds, len(remaining))
@@ -225,9 +225,9 @@ def fit_from_blocks(
         if job.fold == NO_FOLD:
             conditioning, watches = fitted.conditioning, fitted.watches
         for index, part in zip(job.left_out, fitted.rows, strict=True):
-            white[index] = _as_wide(part, [watch.directions for watch in watches])
+            white[index] = _extend_rows(part, [watch.directions for watch in watches])
     # On sessions that a view was not fitted to: on its own ones one of many directions looks far too calm.
-    bank = BankSpec(scaled_alike(spec.watches, watches, white))
+    bank = BankSpec(scale_watches(spec.watches, watches, white))
     limit = calibrated(bank, white, blocks_per_s, promised_hours)
     quiet = _quiet(bank, white)
     chain = MonitorChain(summaries, conditioning, drift, bank.watches, limit.limit, quiet, settle)
@@ -242,7 +242,7 @@ def _watches(spec: ChainSpec, sessions: Sequence[tuple[Array, Array]], blocks_pe
     ]
 
 
-def _as_wide(parts: Sequence[Array], directions: Sequence[int]) -> Array:
+def _extend_rows(parts: Sequence[Array], directions: Sequence[int]) -> Array:
     """Extend the rows of a fold's views to the width of the full views; missing directions count as healthy."""
     wide = []
     for part, width in zip(parts, directions, strict=True):
@@ -271,7 +271,7 @@ class _Part:
     @property
     def left_out(self) -> range:
         """Indices of the left-out sessions."""
-        return _left_out(self.fold, len(self.sessions), self.folds)
+        return _list_left_out(self.fold, len(self.sessions), self.folds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,12 +288,12 @@ def fit_part(job: _Part) -> FittedPart:
     out = set(job.left_out)
     others = [session for index, session in enumerate(job.sessions) if index not in out]
     conditioning = _conditioning(job.spec, others, job.settle)
-    fitted = [_conditioned(conditioning, job.drift, session, job.settle) for session in others]
+    fitted = [_condition(conditioning, job.drift, session, job.settle) for session in others]
     watches = _watches(job.spec, fitted, job.blocks_per_s, job.settle)
     rows = []
     for index in job.left_out:
         # The start of a session is operating time: its rows are missing, and count as healthy.
-        clipped, gross = _conditioned(conditioning, job.drift, job.sessions[index], job.settle)
+        clipped, gross = _condition(conditioning, job.drift, job.sessions[index], job.settle)
         rows.append(tuple(watch(gross if watch.own else clipped) for watch in watches))
     return FittedPart(conditioning, tuple(watches), tuple(rows))
 
@@ -311,7 +311,7 @@ def _conditioning(spec: ChainSpec, sessions: Sequence[SessionBlocks], settle: in
     return fit_conditioning([p.summaries[settle:] for p in sessions], [p.points[settle:] for p in sessions], spec.clip)
 
 
-def _conditioned(
+def _condition(
     conditioning: Conditioning, drift: SlowDrift, session: SessionBlocks, settle: int
 ) -> tuple[Array, Array]:
     """Return the conditioned rows with and without clipping, drift removed."""
@@ -321,7 +321,7 @@ def _conditioned(
     return drift.run(z, np.zeros(z.shape[1]))[0], gross
 
 
-def _without_doubtful(
+def _drop_doubtful(
     spec: ChainSpec, sessions: Sequence[SessionBlocks], settle: int
 ) -> tuple[list[SessionBlocks], tuple[str, ...]]:
     """Sessions without those whose means lie far from all others, and the names of those."""

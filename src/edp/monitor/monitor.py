@@ -223,11 +223,11 @@ class Monitor:
         shape = (len(rows), len(self.chain.watches))
         return Watched(tuple(alarms), np.array(statistics).reshape(shape), table)
 
-    def conditioned_rows(self, recording: Recording) -> Array:
+    def condition_rows(self, recording: Recording) -> Array:
         """Conditioned summaries of each block, NaN where missing, shape (blocks, summaries); see `summary_names`."""
-        return self._conditioned(recording)[0]
+        return self._condition(recording)[0]
 
-    def _conditioned(self, recording: Recording) -> tuple[Array, Array]:
+    def _condition(self, recording: Recording) -> tuple[Array, Array]:
         """Return the conditioned rows with and without clipping."""
         self.check(recording)
         state, rows, out = self.initial_state(), rows_of(recording, self.inputs), []
@@ -243,7 +243,7 @@ class Monitor:
 
     def white_rows(self, recording: Recording) -> Array:
         """White rows as the detectors see them, shape (blocks, directions of all watches)."""
-        return self.chain.bank.white(*self._conditioned(recording))
+        return self.chain.bank.white(*self._condition(recording))
 
     def alarm(self, verdict: BlockVerdict, recording: str = "") -> MonitorAlarm:
         """Create the alarm of a block's verdict.

@@ -31,12 +31,12 @@ from edp.storage.seals import HASH
 from edp.training.bundle import HEADER as BUNDLE_HEADER
 from edp.training.bundle import (
     Bundle,
-    as_damage,
+    add_plugins,
     check_hash,
+    convert_damage,
     load_bundle,
     read_arrays,
     save_bundle,
-    with_plugins,
     write_arrays,
 )
 from edp.training.twin_bundle import HEADER as TWIN_HEADER
@@ -91,7 +91,7 @@ def save_monitor(monitor: Monitor, folder: str | Path) -> Path:
         remove_dictionary(path)
     else:
         save_dictionary(monitor.diagnosis, path)
-    write_json(path / HEADER, with_plugins(header))
+    write_json(path / HEADER, add_plugins(header))
     _remove_old(path, entry["file"], written)
     return path
 
@@ -141,7 +141,7 @@ def load_monitor(folder: str | Path) -> Monitor:
     path = Path(folder)
     if not is_entry_at(path / HEADER):
         raise BundleError(f"'{path}' is not a monitor: it has no {HEADER}; give the folder that edp monitor fit wrote")
-    with as_damage(path):
+    with convert_damage(path):
         header = read_header(path / HEADER, ("schema",))
         schema = header["schema"]
         if isinstance(schema, bool) or schema != SCHEMA:

@@ -112,7 +112,7 @@ class BlockSummaries:
             shape = (blocks, (stop - at) // blocks, -1)
             state = self._take(residuals[at:stop].reshape(shape), rows[at:stop].reshape(shape), state)
             if state.ticks == self.block:
-                summary, point = self._closed(state)
+                summary, point = self._close_blocks(state)
                 summaries.append(summary.reshape(-1, self.width))
                 points.append(point.reshape(-1, self.points))
                 fresh = self.initial_state()
@@ -126,7 +126,7 @@ class BlockSummaries:
         blocks, ticks = residuals.shape[:2]
         there = np.isfinite(residuals)
         r = np.where(there, residuals, 0.0).astype(np.float64) * self.scale
-        flat = _filled(rows.reshape(blocks * ticks, -1).astype(np.float64), state.last)
+        flat = _fill_missing(rows.reshape(blocks * ticks, -1).astype(np.float64), state.last)
         y_flat = (flat - self.centre) * self.spread
         # The first tick of a stream is its own predecessor.
         first = (state.last - self.centre) * self.spread if state.started else y_flat[0]
@@ -154,7 +154,7 @@ class BlockSummaries:
             sums = {name: values[0] for name, values in sums.items()}
         return SummaryState(state.ticks + ticks, flat[-1].copy(), True, sums)
 
-    def _closed(self, state: SummaryState) -> tuple[Array, Array]:
+    def _close_blocks(self, state: SummaryState) -> tuple[Array, Array]:
         """Return summaries and operating points of completed blocks."""
         sums = state.sums
         n = np.maximum(sums["n"], 1.0)
@@ -239,7 +239,7 @@ class SummaryState:
     sums: Mapping[str, Array] = field(default_factory=dict)
 
 
-def _filled(rows: Array, last: Array) -> Array:
+def _fill_missing(rows: Array, last: Array) -> Array:
     """Return rows with missing values replaced by the last value."""
     there = np.isfinite(rows)
     if there.all():

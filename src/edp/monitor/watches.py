@@ -120,7 +120,7 @@ def check_rows(spec: WatchSpec, lengths: Sequence[int], blocks_per_s: float) -> 
 
 
 def _averages(length: int, blocks: int) -> int:
-    """Return the number of averages that `_averaged` computes from a number of rows."""
+    """Return the number of averages that `_average_blocks` computes from a number of rows."""
     if blocks == 1 or length <= 0:
         return max(length, 0)
     return max(0, length - blocks) // max(1, blocks // 2) + 1
@@ -135,7 +135,7 @@ def fit_watch(spec: WatchSpec, sessions: Sequence[Array], blocks_per_s: float, s
     if spec.view == "own":
         return _own(spec, sessions, settle)
     blocks = check_rows(spec, [len(session) - settle for session in sessions], blocks_per_s)
-    rows = np.concatenate([_averaged(np.nan_to_num(session[settle:]), blocks) for session in sessions])
+    rows = np.concatenate([_average_blocks(np.nan_to_num(session[settle:]), blocks) for session in sessions])
     mean = rows.mean(axis=0)
     centred = rows - mean
     covariance = centred.T @ centred / len(rows)
@@ -169,7 +169,7 @@ def _own(spec: WatchSpec, sessions: Sequence[Array], settle: int) -> Watch:
     return Watch(spec.detector, np.zeros(len(factors)), factors)
 
 
-def _averaged(rows: Array, blocks: int) -> Array:
+def _average_blocks(rows: Array, blocks: int) -> Array:
     """Return means of `blocks` rows with half overlap; for a shorter session the overall mean."""
     if blocks == 1 or not len(rows):
         return rows
@@ -220,7 +220,7 @@ class BankSpec(DetectorSpec):
         return np.concatenate([watch(gross if watch.own else rows) for watch in self.watches], axis=1)
 
 
-def scaled_alike(specs: Sequence[WatchSpec], watches: Sequence[Watch], sessions: Sequence[Array]) -> tuple[Watch, ...]:
+def scale_watches(specs: Sequence[WatchSpec], watches: Sequence[Watch], sessions: Sequence[Array]) -> tuple[Watch, ...]:
     """Return the watches scaled to equal sensitivity: by the third largest statistic of all healthy sessions.
 
     Args:

@@ -44,15 +44,15 @@ class AdaptedStream(Stream):
 
     def step(self, inputs: Inputs) -> StreamTick:
         """Feed one tick ``(input,)`` in SI units; the prediction is the corrected one."""
-        return self._adapted(super().step(inputs))
+        return self._correct(super().step(inputs))
 
     def missed(self, ticks: int = 1) -> StreamTick:
         """Tell that ticks went by without a step; the prediction is the corrected one."""
         result = super().missed(ticks)
         self.adapter.interrupt()
-        return self._adapted(result)
+        return self._correct(result)
 
-    def _adapted(self, base: StreamTick) -> StreamTick:
+    def _correct(self, base: StreamTick) -> StreamTick:
         if not base.valid:
             # No prediction to correct: the last corrected one stays, as the output of the exported C does.
             self.adapter.interrupt()

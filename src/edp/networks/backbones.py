@@ -342,7 +342,7 @@ class RecurrentBackbone(Streaming):
         # Dropout acts behind the recurrence, not inside it: masks within the loop would erase what the state carries.
         self.dropout = nn.Dropout(dropout)
         self.pooling = AttentionPooling(units, window)
-        extras = in_slot(blocks, BlockSlot.FEATURES)
+        extras = select_slot(blocks, BlockSlot.FEATURES)
         self.extras = nn.ModuleList(spec.build(units, window) for spec in extras)  # type: ignore[attr-defined]
         self.width = 2 * units + sum(spec.extra(units) for spec in extras)  # type: ignore[attr-defined]
 
@@ -376,7 +376,7 @@ class RecurrentBackbone(Streaming):
         return encoder + self.recurrent.costs() + [cost for part in self._tail() for cost in part.costs()]
 
 
-def in_slot(blocks: Blocks, slot: BlockSlot) -> list[object]:
+def select_slot(blocks: Blocks, slot: BlockSlot) -> list[object]:
     """Return the block specs of `slot`, in order."""
     return [block for block in blocks if getattr(block, "slot", None) is slot]
 
@@ -388,11 +388,11 @@ def _convolutions(
         return ConvolutionStack(features, channels, kernel, first_dilation, dropout)
 
     net, width = make_branch(1), channels[-1]
-    branches = in_slot(blocks, BlockSlot.BRANCHES)
+    branches = select_slot(blocks, BlockSlot.BRANCHES)
     if branches:
         build: BranchMaker = make_branch
         net = branches[0].build(build)  # type: ignore[attr-defined]
         width *= len(net.branches)
     # Blocks of the channels come behind the joined branches, so that they see the channels of all scales.
-    behind = [spec.build(width, window) for spec in in_slot(blocks, BlockSlot.CHANNELS)]  # type: ignore[attr-defined]
+    behind = [spec.build(width, window) for spec in select_slot(blocks, BlockSlot.CHANNELS)]  # type: ignore[attr-defined]
     return (Chain([net, *behind]) if behind else net), width

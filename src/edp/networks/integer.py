@@ -52,7 +52,7 @@ class IntegerPredictor(Predictor):
         self.integers: Graph = integers
         self.eval()
 
-    def in_float(self) -> Predictor:
+    def to_float_network(self) -> Predictor:
         """Return the network in single precision from which it was quantised, for counting or further training."""
         offset, width = (part.double().numpy() for part in (self.front.offset, self.front.width))
         zero, unit = (part.double().numpy() for part in (self.code.offset, self.code.width))
@@ -67,7 +67,7 @@ class IntegerPredictor(Predictor):
     def predict(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         """Predictions in SI units, ``(batch, time, horizon, target)``, and the next state."""
         results, new = self._run(x, state)
-        return self._shaped(results["prediction"], x), new
+        return self._reshape_outputs(results["prediction"], x), new
 
     def intervals(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         """Bounds in SI units ``(batch, time, coverage, 2, horizon, target)``, lower then upper, and the next state."""
@@ -81,11 +81,11 @@ class IntegerPredictor(Predictor):
         """
         results, new = self._run(x, state)
         bounds = self._sides(results, x) if self.output.coverages else None
-        return self._shaped(results["prediction"], x), bounds, new
+        return self._reshape_outputs(results["prediction"], x), bounds, new
 
     def _sides(self, results: dict[str, np.ndarray], x: Tensor) -> Tensor:
         """Bounds in SI units ``(batch, time, coverage, 2, horizon, target)``."""
-        sides = [self._shaped(results[side], x, len(self.output.coverages)) for side in ("lower", "upper")]
+        sides = [self._reshape_outputs(results[side], x, len(self.output.coverages)) for side in ("lower", "upper")]
         return torch.stack(sides, dim=3)
 
     def forward_features(self, x: Tensor, state: State) -> NoReturn:
@@ -101,7 +101,7 @@ class IntegerPredictor(Predictor):
         new = deepcopy(state)
         return new.run(x.detach().cpu().float().numpy().transpose(1, 0, 2)), new
 
-    def _shaped(self, values: np.ndarray, like: Tensor, *more: int) -> Tensor:
+    def _reshape_outputs(self, values: np.ndarray, like: Tensor, *more: int) -> Tensor:
         sizes = (*more, len(self.task.horizons), len(self.task.targets))
         rows = torch.from_numpy(np.ascontiguousarray(values.transpose(1, 0, 2)))
         return rows.reshape(*rows.shape[:2], *sizes).to(like)

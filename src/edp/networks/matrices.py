@@ -51,7 +51,7 @@ def matrices_of(network: nn.Module, recurrent: bool = True) -> list[Matrix]:
     matrices = []
     for name, part in network.named_modules():
         if part not in recurring or recurrent:
-            for key, axes in _declared(part):
+            for key, axes in _find_matrices(part):
                 parameter = getattr(part, key)
                 listed = isinstance(parameter, nn.ParameterList)
                 for last in map(str, range(len(parameter))) if listed else [key]:
@@ -60,6 +60,6 @@ def matrices_of(network: nn.Module, recurrent: bool = True) -> list[Matrix]:
     return matrices
 
 
-def _declared(part: nn.Module) -> Declared:
+def _find_matrices(part: nn.Module) -> Declared:
     declared = next((matrices for kind, matrices in LAYERS.items() if isinstance(part, kind)), ())
     return declared or (part.matrices if isinstance(part, Streaming) else ())

@@ -14,7 +14,7 @@ from edp.ir import Builder, Graph
 from edp.ir.base import INPUT
 from edp.ir.layers import BinaryOperation, ScaleShift
 from edp.networks.activations import ACTIVATIONS, ActivationSpec, Identity
-from edp.networks.backbones import BACKBONES, BackboneSpec, HybridSpec, in_slot
+from edp.networks.backbones import BACKBONES, BackboneSpec, HybridSpec, select_slot
 from edp.networks.blocks.base import BLOCKS, OUTPUT_SLOTS, SHARED_SLOTS, BlockSlot, HasConflicts, OutputSpace
 from edp.networks.frontend import FrontEnd, TargetTransform
 from edp.networks.heads import HEADS, HeadSpec, MlpHead
@@ -60,7 +60,7 @@ class ModelSpec:
                     f"(it has {', '.join(sorted(offered))}); remove the block or choose another backbone"
                 )
         for block_slot in BlockSlot:
-            names = [BLOCKS.name_of(block) for block in in_slot(self.blocks, block_slot)]
+            names = [BLOCKS.name_of(block) for block in select_slot(self.blocks, block_slot)]
             if len(names) > 1 and (block_slot not in SHARED_SLOTS or len(set(names)) < len(names)):
                 raise ConfigError(f"blocks {', '.join(names)} share the slot '{block_slot}'; keep one of them")
 
@@ -113,7 +113,7 @@ class Predictor(Streaming):
 
     def _block(self, slot: BlockSlot, *sizes: object) -> Streaming | None:
         """Build the block in a slot with a single block; None if the slot is empty."""
-        slot_blocks = in_slot(self.spec.blocks, slot)
+        slot_blocks = select_slot(self.spec.blocks, slot)
         return slot_blocks[0].build(*sizes) if slot_blocks else None  # type: ignore[attr-defined]
 
     def _present(self) -> tuple[Tensor, Tensor]:

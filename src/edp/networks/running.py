@@ -218,7 +218,7 @@ def _pieces(
         yield start, y
 
 
-def answered_pieces(
+def answer_pieces(
     predictor: Predictor, series: Sequence[Series], batch: int = 16
 ) -> Iterator[tuple[int, int, Prediction, Tensor]]:
     """Yield the network output of each series segment by segment, so that long outputs need not fit into memory.

@@ -154,7 +154,7 @@ class Stream:
         if len(rows) < 2 or not self.accepts(np.array(rows)):
             return [self.step(row) for row in rows]
         before = self._state
-        numbers = self._computed(np.array(rows))
+        numbers = self._compute_rows(np.array(rows))
         if not np.isfinite(numbers).all():
             self._state = before
             return [self.step(row) for row in rows]
@@ -215,7 +215,7 @@ class Stream:
         """One tick of the network from the last accepted inputs."""
         self.ticks += 1
         # Non-finite results would stay in the recurrent state for ever; clearing it is the only way back.
-        numbers = self._computed(self._last[None])[0]
+        numbers = self._compute_rows(self._last[None])[0]
         if not np.isfinite(numbers).all():
             self.restarts += 1
             self._forget()
@@ -226,7 +226,7 @@ class Stream:
             return StreamStatus.HELD
         return StreamStatus.OK if self.warm else StreamStatus.WARMING
 
-    def _computed(self, rows: NDArray[np.floating]) -> Rows:
+    def _compute_rows(self, rows: NDArray[np.floating]) -> Rows:
         """Predictions, then lower and upper bounds, ``(ticks, 1 + 2 * coverage, horizon, target)``, SI units."""
         x = torch.from_numpy(rows).to(dtype=self._like.dtype, device=self._like.device).unsqueeze(0)
         with torch.inference_mode(), _threads(self._threads):

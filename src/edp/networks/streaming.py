@@ -128,17 +128,17 @@ class Streaming(nn.Module, ABC):
         return result
 
 
-def fixed_parameters(model: nn.Module) -> set[str]:
+def list_fixed_parameters(model: nn.Module) -> set[str]:
     """Full names of the parameters that parts of a model declare as `Streaming.fixed`."""
-    return _declared(model, "fixed")
+    return _list_declared(model, "fixed")
 
 
 def indifferent_parameters(model: nn.Module) -> set[str]:
     """Full names of the parameters that parts of a model declare as `Streaming.indifferent`."""
-    return _declared(model, "indifferent")
+    return _list_declared(model, "indifferent")
 
 
-def _declared(model: nn.Module, attribute: str) -> set[str]:
+def _list_declared(model: nn.Module, attribute: str) -> set[str]:
     parts = model.named_modules()
     names = ((prefix, name) for prefix, part in parts for name in getattr(part, attribute, ()))
     return {f"{prefix}.{name}" if prefix else name for prefix, name in names}

@@ -61,7 +61,7 @@ class Allowance:
         self.bound = START_BYTES + COPIES * size
         # Before the limits are set, which `free_bytes` would count as the machine's.
         self.free = max(int(limits.SHARE * limits.free_bytes()), 0)
-        self.start = _used()
+        self.start = _measure_memory()
         self._limit_files()
         self._limit_memory()
         limits.listen(self.announce)
@@ -155,7 +155,7 @@ def is_exhausted(error: BaseException | None) -> bool:
     return False
 
 
-def _used() -> tuple[int, int]:
+def _measure_memory() -> tuple[int, int]:
     """Address space and data of this process, in bytes."""
     try:
         pages = [int(part) for part in Path("/proc/self/statm").read_text(encoding="ascii").split()]

@@ -39,7 +39,7 @@ BUILD_NAMES = frozenset(
 """What compilers, ROS 2 and Octave need in addition."""
 
 
-def reduced_environment(further: Iterable[str] = ()) -> Mapping[str, str]:
+def reduce_environment(further: Iterable[str] = ()) -> Mapping[str, str]:
     """Return the variables of this process that a process for hostile input may have.
 
     Args:

@@ -91,7 +91,7 @@ def announce_by(announce: Callable[[str], None] | None) -> None:
     _state.announce = announce
 
 
-def seen_layers() -> Mapping[str, str] | None:
+def get_seen_layers() -> Mapping[str, str] | None:
     """Return the reason for each missing layer (empty for a layer in force); None before the first log."""
     return _state.seen
 

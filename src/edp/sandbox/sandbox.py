@@ -23,7 +23,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from edp.errors import DataError
-from edp.sandbox.environment import reduced_environment
+from edp.sandbox.environment import reduce_environment
 from edp.sandbox.protocol import Header, packed, reader, receive
 
 PIPE_BYTES = 1 << 20
@@ -95,11 +95,11 @@ def open_channel(worker: str, modules: Sequence[str], path: Path, libraries: Seq
                 code, last_words = running_worker.last_words()
                 _drop(worker)
                 if attempt == _TRIES - 1:
-                    raise DataError(_failed(path, last_words or str(error) or f"exit code {code}")) from error
+                    raise DataError(_describe_failure(path, last_words or str(error) or f"exit code {code}")) from error
     raise RuntimeError("unreachable")
 
 
-def _failed(path: Path, why: str) -> str:
+def _describe_failure(path: Path, why: str) -> str:
     last = why.strip().splitlines()[-1] if why.strip() else "it ended"
     return f"'{path}' cannot be read: the process that reads logs failed ({last})"
 
@@ -126,7 +126,7 @@ def _forget() -> None:
 
 def _environment() -> dict[str, str]:
     places = os.pathsep.join(entry for entry in sys.path if entry)
-    return {**reduced_environment(), **dict.fromkeys(_THREADS, "1"), **_SMALL_POOL, "PYTHONPATH": places}
+    return {**reduce_environment(), **dict.fromkeys(_THREADS, "1"), **_SMALL_POOL, "PYTHONPATH": places}
 
 
 def _start(worker: str, arguments: Sequence[str], **pipes: Any) -> subprocess.Popen[bytes]:
@@ -328,15 +328,15 @@ class WorkerConnection:
     def lost(self) -> DataError:
         """Return the error for a process that ended."""
         code, last_words = self._ended()
-        error = DataError(_died(self.path, code, last_words))
+        error = DataError(_describe_death(self.path, code, last_words))
         self.close("reading it failed before; open it again")
         return error
 
 
-def _died(path: Path, code: int | None, last_words: str) -> str:
+def _describe_death(path: Path, code: int | None, last_words: str) -> str:
     advice = "it may be damaged: copy or export it again"
     if code is None or code >= 0:
-        return _failed(path, last_words or f"exit code {code}")
+        return _describe_failure(path, last_words or f"exit code {code}")
     number = -code
     if number in [int(getattr(signal, name, -1)) for name in ("SIGPROF", "SIGALRM", "SIGXCPU")]:
         return (

@@ -109,7 +109,7 @@ class Provenance:
         """Return the content of the file."""
         return plain_fields(replace(self, more={})) | self.more
 
-    def with_entries(self, **entries: Any) -> Self:
+    def add_entries(self, **entries: Any) -> Self:
         """Return the provenance with additional entries of a command."""
         return replace(self, more={**self.more, **entries})
 

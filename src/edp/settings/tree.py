@@ -249,7 +249,7 @@ class SettingsTree:
             return None  # JSON has a word for it; TOML leaves the key out
         if value is None and self.null_is_nan and hint is float:
             return math.nan
-        hint = _stated(hint)
+        hint = _strip_optional(hint)
         form = _form(hint)
         if name in self.parts:
             if form.sequence:
@@ -356,7 +356,7 @@ def _allows_none(hint: Any) -> bool:
 
 
 @cache
-def _stated(hint: Any) -> Any:
+def _strip_optional(hint: Any) -> Any:
     """Return the list or mapping type of a hint that also allows None; other hints unchanged."""
     inner = [one for one in typing.get_args(hint) if one is not type(None)]
     is_list = len(inner) == 1 and typing.get_origin(inner[0]) in (tuple, Mapping)

@@ -15,7 +15,7 @@ from edp import __version__
 from edp.errors import BusyError, ConfigError, EdpError, StorageError, closest
 from edp.jobs import Workers
 from edp.jobs.workers import UNITS, WorkUnit, forget_units
-from edp.logs import LAYOUTS, WriteOptions, known_suffixes, read_recording, write_recording
+from edp.logs import LAYOUTS, WriteOptions, list_suffixes, read_recording, write_recording
 from edp.progress import SILENT, Progress
 from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, MOTOR_CHANNELS, TABLE_A1
 from edp.sim.excitation import EXCITATIONS
@@ -106,8 +106,8 @@ class SimulationOrder(DataSetSpec):
         Raises:
             EdpError: an ending without a format, an unknown layout, or one of another format.
         """
-        if self.suffix not in known_suffixes():
-            hint = closest(self.suffix, known_suffixes())
+        if self.suffix not in list_suffixes():
+            hint = closest(self.suffix, list_suffixes())
             raise ConfigError(f"there is no log format for the ending '{self.suffix}'{hint}")
         if self.layout:
             LAYOUTS[self.layout]

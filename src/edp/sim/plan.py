@@ -144,19 +144,19 @@ class DataSetSpec:
             )
             for i in range(self.recordings)
         )
-        return over_family(plan, self.family, self.seed, self.masses, self.scatter) if self.family else plan
+        return distribute_over_family(plan, self.family, self.seed, self.masses, self.scatter) if self.family else plan
 
     def _soils(self, excitations: Sequence[str]) -> list[str]:
         """Return the material of each recording; empty for free air. Each family gets all materials in turn."""
         soils = [""] * len(excitations)
-        places = [i for i in _by_family(excitations) if EXCITATIONS[excitations[i]].works_ground]
+        places = [i for i in _sort_by_family(excitations) if EXCITATIONS[excitations[i]].works_ground]
         if self.materials:
             for recording_index, chosen in zip(places, hand_out(self.materials, len(places)), strict=True):
                 soils[recording_index] = "" if chosen == AIR else chosen
         return soils
 
 
-def _by_family(excitations: Sequence[str]) -> list[int]:
+def _sort_by_family(excitations: Sequence[str]) -> list[int]:
     """Return the recording indices sorted by family."""
     return sorted(range(len(excitations)), key=lambda i: excitations[i])
 
@@ -189,7 +189,7 @@ def plan_data_set(
     return spec.scenarios()
 
 
-def over_family(
+def distribute_over_family(
     scenarios: Sequence[Scenario],
     count: int,
     seed: int,
@@ -205,13 +205,15 @@ def over_family(
         raise ConfigError(f"family = {count} machines; at least one is needed")
     turns = {
         recording_index: turn % count
-        for turn, recording_index in enumerate(_by_family([s.excitation for s in scenarios]))
+        for turn, recording_index in enumerate(_sort_by_family([s.excitation for s in scenarios]))
     }
     names = [member_name(seed, turns[i], masses, scatter) for i in range(len(scenarios))]
-    return tuple(replace(s, machine=n, name=_named(s.name, n)) for s, n in zip(scenarios, names, strict=True))
+    return tuple(
+        replace(s, machine=n, name=_rename_recording(s.name, n)) for s, n in zip(scenarios, names, strict=True)
+    )
 
 
-def _named(name: str, machine: str) -> str:
+def _rename_recording(name: str, machine: str) -> str:
     return "_".join([machine, *name.split("_", 1)[1:]])
 
 

@@ -157,14 +157,14 @@ def _futures(
             else:
                 simulation.branch(branch_seed)
                 rows = simulation.run(length)
-        futures[b] = _measured(simulation, np.concatenate((past, rows)), noise)[at_times]
+        futures[b] = _measure_outputs(simulation, np.concatenate((past, rows)), noise)[at_times]
     return futures
 
 
-def _measured(simulation: Simulation, log: Array, seed: np.random.SeedSequence) -> Array:
+def _measure_outputs(simulation: Simulation, log: Array, seed: np.random.SeedSequence) -> Array:
     scenario = simulation.scenario
     rng = np.random.default_rng(seed) if scenario.sensor_noise else None
-    signals = sensors.measured_signals(log, simulation.machine, scenario.rate_hz, rng, log[:, at.LOG_OIL] + 273.15)
+    signals = sensors.measure_signals(log, simulation.machine, scenario.rate_hz, rng, log[:, at.LOG_OIL] + 273.15)
     return signals[:, : len(TARGETS)]
 
 

@@ -57,7 +57,7 @@ def read_scenario_file(path: str | Path) -> tuple[dict[str, object], dict[str, s
     """
     table = _table(path)
     settings = SCENARIO_FILE.build(ScenarioFile, table, str(path))
-    return _stated(settings, table)
+    return _split_settings(settings, table)
 
 
 def scenario_changes(overrides: Sequence[str]) -> tuple[dict[str, object], dict[str, str]]:
@@ -66,8 +66,8 @@ def scenario_changes(overrides: Sequence[str]) -> tuple[dict[str, object], dict[
     Raises:
         ConfigError: a key that a scenario file does not have, or a value of another kind.
     """
-    table = _merged(overrides)
-    return _stated(SettingsTree().build(_CHANGES, table, "--set"), table)
+    table = _merge_overrides(overrides)
+    return _split_settings(SettingsTree().build(_CHANGES, table, "--set"), table)
 
 
 def limit_settings(path: str | Path | None, overrides: Sequence[str]) -> LimitSpec:
@@ -76,26 +76,26 @@ def limit_settings(path: str | Path | None, overrides: Sequence[str]) -> LimitSp
     Raises:
         ConfigError: a key or value that cannot be.
     """
-    table = merged({} if path is None else _table(path), _merged(overrides))
+    table = merged({} if path is None else _table(path), _merge_overrides(overrides))
     return SettingsTree().build(LimitSpec, table.get("limit", {}), "[limit]", "limit")
 
 
 def _table(path: str | Path) -> Table:
     source = Path(path)
-    return _resolved(read_toml(source, f"scenario file {source}", ConfigError), source.parent)
+    return _resolve_paths(read_toml(source, f"scenario file {source}", ConfigError), source.parent)
 
 
-def _merged(overrides: Sequence[str]) -> Table:
+def _merge_overrides(overrides: Sequence[str]) -> Table:
     return combined([override(text) for text in overrides])
 
 
-def _stated(settings: Any, table: Table) -> tuple[dict[str, object], dict[str, str]]:
+def _split_settings(settings: Any, table: Table) -> tuple[dict[str, object], dict[str, str]]:
     """Return the stated values of the data set and of the write options."""
     values = {key: getattr(settings, key) for key in table if key not in ("files", "limit")}
     return values, SCENARIO_FILE.plain(settings.files) if settings.files is not None else {}
 
 
-def _resolved(table: Table, folder: Path) -> Table:
+def _resolve_paths(table: Table, folder: Path) -> Table:
     """Return the table with absolute paths of machine and material files."""
     resolved = dict(table)
     machine, materials = table.get("machine"), table.get("materials")

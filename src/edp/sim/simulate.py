@@ -14,7 +14,7 @@ from edp.sim.excitation import EXCITATIONS
 from edp.sim.faults.course import MachineCourse, SensorCourse, numbers_of, shares_at, spare_s
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
-from edp.sim.machine.machine_files import known_mass
+from edp.sim.machine.machine_files import look_up_mass
 from edp.sim.physics.plant import Plant
 from edp.sim.physics.snapshot import Snapshot, capture, restored
 from edp.sim.scenario import Scenario, SimulationError, plain
@@ -82,7 +82,7 @@ class Simulation:
         Raises:
             SimulationError: the state became non-finite.
         """
-        rows = self._moved(targets)
+        rows = self._advance(targets)
         self.samples += len(rows)
         # Asked once a block: what once is not finite stays so.
         if not self.plant.finite:
@@ -95,7 +95,7 @@ class Simulation:
         self._targets.append(targets)
         return rows
 
-    def _moved(self, targets: Array) -> Array:
+    def _advance(self, targets: Array) -> Array:
         """Advance the plant with parameters that follow the faults sample by sample."""
         run = self.plant.follow if self.operator.by_hand else self.plant.run
         if not self._course.faults:
@@ -186,14 +186,14 @@ def _recording(scenario: Scenario, machine: Machine, log: Array, clamps: int) ->
     faults = SensorCourse(scenario.faults)
     drawn = faults.drawn(draws.draw(machine, len(log), rate_hz, rng), rate_hz, np.random.default_rng(chance))
     kelvin = log[:, at.LOG_OIL] + 273.15
-    measured = sensors.shown_signals(log, machine, rate_hz, rng is not None, drawn, kelvin, faults.table)
+    measured = sensors.observe_signals(log, machine, rate_hz, rng is not None, drawn, kelvin, faults.table)
     truth = sensors.truth_signals(log)
     # Strokes, pump pressures and oil temperature as they are shown: only a fault makes them differ from the truth.
     truth |= {name: measured[:, column] for name, column in sensors.shown_names().items()}
     further = {**EXTRA_CHANNELS, **GROUND_CHANNELS, **MOTOR_CHANNELS}
     extra = {name: channel for name, channel in further.items() if name in truth}
     facts = {key: value for key, value in plain(scenario).items() if key != "name"}
-    mass = known_mass(scenario.machine)
+    mass = look_up_mass(scenario.machine)
     if mass is not None:
         facts["mass_t"] = round(mass, 3)
     shares = shares_at(scenario.faults, np.arange(len(log)), rate_hz)

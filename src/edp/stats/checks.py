@@ -31,7 +31,7 @@ def finite(values: ArrayLike, what: str, axes: int) -> Array:
     return array
 
 
-def tested_mask(tested: ArrayLike | None, shape: tuple[int, ...]) -> Mask:
+def check_tested_mask(tested: ArrayLike | None, shape: tuple[int, ...]) -> Mask:
     """Return the mask of the sessions on which each run was evaluated, ``(run, session)``.
 
     None stands for all sessions.
@@ -49,7 +49,7 @@ def tested_mask(tested: ArrayLike | None, shape: tuple[int, ...]) -> Mask:
     return mask
 
 
-def tested_cells(differences: ArrayLike, tested: ArrayLike | None) -> tuple[Array, Mask]:
+def check_tested_cells(differences: ArrayLike, tested: ArrayLike | None) -> tuple[Array, Mask]:
     """Differences ``(..., run, session)``, zero outside the tested cells, and the mask of these.
 
     Runs and sessions without a cell, as a design that is not finished has, are left out of both.
@@ -60,7 +60,7 @@ def tested_cells(differences: ArrayLike, tested: ArrayLike | None) -> tuple[Arra
     array = np.asarray(differences, dtype=np.float64)
     if array.ndim < 2:
         raise DataError(f"the differences have shape {array.shape}; give (..., run, session)")
-    mask = tested_mask(tested, array.shape)
+    mask = check_tested_mask(tested, array.shape)
     runs, sessions = mask.any(axis=1), mask.any(axis=0)
     if not (runs.all() and sessions.all()):
         array, mask = array[..., runs, :][..., sessions], mask[runs][:, sessions]

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.special import ndtri, stdtrit
 
 from edp.errors import DataError
-from edp.stats.checks import Array, lower_p, tested_cells, two_sided_p
+from edp.stats.checks import Array, check_tested_cells, lower_p, two_sided_p
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ def clustered_t(differences: ArrayLike, tested: ArrayLike | None = None) -> Mean
     Raises:
         DataError: fewer than two runs or sessions, or cells that are not finite.
     """
-    array, mask = tested_cells(differences, tested)
+    array, mask = check_tested_cells(differences, tested)
     runs, sessions = mask.shape
     if min(runs, sessions) < 2:
         raise DataError(f"{runs} runs on {sessions} sessions came; a clustered test needs at least two of each")

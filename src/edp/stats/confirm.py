@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from edp.errors import ConfigError, DataError
-from edp.stats.checks import Array, Mask, tested_mask
+from edp.stats.checks import Array, Mask, check_tested_mask
 from edp.stats.clustered import clustered_t
 from edp.stats.effects import EffectSize, effect_size, rank_stability
 from edp.stats.mixed import mixed_model
@@ -111,7 +111,7 @@ def confirm(
         raise DataError(
             f"scores of shape {array.shape} came for {len(modules)} modules; give (1 + module, run, session)"
         )
-    mask = tested_mask(tested, array.shape)
+    mask = check_tested_mask(tested, array.shape)
     # All arms at once, so that a failure costs every module the same.
     filled = fill_worst(array, mask, worst)
     differences = filled[1:] - filled[0]

@@ -61,7 +61,7 @@ def two_level_design(
     """
     names = tuple(factors)
     groups = tuple(tuple(group) for group in exclusive)
-    run_count = _checked_runs(names, runs)
+    run_count = _check_runs(names, runs)
     for group in groups:
         for name in group:
             if name not in names:
@@ -71,7 +71,7 @@ def two_level_design(
     levels = _regular(len(names), run_count)
     if groups:
         indices = [tuple(names.index(name) for name in group) for group in groups]
-        levels = _exchanged(_repaired(levels, indices), indices)
+        levels = _exchange_levels(_repair_runs(levels, indices), indices)
         _, alias, error = _quality(levels, indices)
     else:
         _, alias, error = _quality(levels, [])
@@ -84,7 +84,7 @@ def least_runs(factors: int) -> int:
     return max(4, 1 << (2 * factors - 1).bit_length())
 
 
-def _checked_runs(names: tuple[str, ...], runs: int | None) -> int:
+def _check_runs(names: tuple[str, ...], runs: int | None) -> int:
     if len(names) < 2 or len(set(names)) != len(names):
         raise ConfigError(f"factors {list(names)} came; give at least two, each once")
     least = least_runs(len(names))
@@ -112,7 +112,7 @@ def _regular(factors: int, runs: int) -> Mask:
     return np.array([[(run & word).bit_count() % 2 == 1 for word in chosen] for run in range(runs)], dtype=bool)
 
 
-def _repaired(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
+def _repair_runs(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
     """Repair runs with several active factors of a group: keep the factor that was kept least often so far."""
     fixed = levels.copy()
     for group in groups:
@@ -126,7 +126,7 @@ def _repaired(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
     return fixed
 
 
-def _exchanged(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
+def _exchange_levels(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
     """Flip a level of a run, or move it within a group, as long as this lowers the cost."""
     best, cost = levels.copy(), float(_quality(levels, groups)[0])
     moves: list[tuple[int, ...]] = [(factor,) for factor in range(levels.shape[1])]

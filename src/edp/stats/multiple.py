@@ -22,7 +22,7 @@ def benjamini_hochberg(p: ArrayLike) -> Array:
     """
     from scipy.stats import false_discovery_control  # late: see edp.stats.effects
 
-    array, _, _ = _sorted(p)
+    array, _, _ = _sort_p_values(p)
     return np.asarray(false_discovery_control(array, axis=-1, method="bh"), dtype=np.float64)
 
 
@@ -32,10 +32,10 @@ def holm(p: ArrayLike) -> Array:
     Raises:
         DataError: empty, or values outside 0 to 1.
     """
-    array, order, n = _sorted(p)
+    array, order, n = _sort_p_values(p)
     scaled = np.take_along_axis(array, order, axis=-1) * np.arange(n, 0, -1)
     # Steps down: no p-value may be adjusted below that of a smaller one.
-    return _unsorted(np.minimum(np.maximum.accumulate(scaled, axis=-1), 1.0), order)
+    return _restore_order(np.minimum(np.maximum.accumulate(scaled, axis=-1), 1.0), order)
 
 
 def adjust_registered(p: Mapping[str, float], registered: Iterable[str]) -> dict[str, float]:
@@ -60,14 +60,14 @@ def adjust_registered(p: Mapping[str, float], registered: Iterable[str]) -> dict
     return {name: float(value) for name, value in zip(names, adjusted)}
 
 
-def _sorted(p: ArrayLike) -> tuple[Array, np.ndarray, int]:
+def _sort_p_values(p: ArrayLike) -> tuple[Array, np.ndarray, int]:
     array = finite(p, "list of p-values", 1)
     if (array < 0.0).any() or (array > 1.0).any():
         raise DataError("p-values must lie between 0 and 1")
     return array, np.argsort(array, axis=-1, kind="stable"), array.shape[-1]
 
 
-def _unsorted(values: Array, order: np.ndarray) -> Array:
+def _restore_order(values: Array, order: np.ndarray) -> Array:
     result = np.empty_like(values)
     np.put_along_axis(result, order, values, axis=-1)
     return result

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from edp.errors import DataError
-from edp.stats.checks import Array, tested_mask
+from edp.stats.checks import Array, check_tested_mask
 
 
 def fill_worst(scores: ArrayLike, tested: ArrayLike | None = None, worst: ArrayLike | None = None) -> Array:
@@ -30,7 +30,7 @@ def fill_worst(scores: ArrayLike, tested: ArrayLike | None = None, worst: ArrayL
     array = np.asarray(scores, dtype=np.float64)
     if array.ndim != 3:
         raise DataError(f"the scores have shape {array.shape}; give (arm, run, session)")
-    mask = tested_mask(tested, array.shape)
+    mask = check_tested_mask(tested, array.shape)
     finite = np.isfinite(array) & mask
     # The worst of all arms on that session: sessions differ in difficulty.
     seen = np.where(finite, array, -np.inf).max(axis=(0, 1))

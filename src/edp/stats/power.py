@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.special import nctdtr, stdtrit
 
 from edp.errors import ConfigError
-from edp.stats.checks import Array, tested_mask
+from edp.stats.checks import Array, check_tested_mask
 from edp.stats.clustered import clustered_t
 from edp.stats.variance import PairedVariance
 from edp.wording import figure
@@ -155,6 +155,6 @@ def simulated_power(
         repetitions: simulated studies.
         seed: of the draws.
     """
-    mask = tested_mask(tested, np.asarray(tested).shape)
+    mask = check_tested_mask(tested, np.asarray(tested).shape)
     draws = simulate_differences(variance, mask, -delta, repetitions, np.random.default_rng(seed))
     return float((clustered_t(draws, mask).p < alpha).mean())

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edp.errors import ConfigError
-from edp.stats.checks import Array, tested_mask
+from edp.stats.checks import Array, check_tested_mask
 from edp.stats.clustered import clustered_t
 from edp.stats.power import simulate_differences
 from edp.stats.variance import PairedVariance
@@ -69,7 +69,7 @@ def race(
     """
     _check(interim_analyses)
     array = np.asarray(differences, dtype=np.float64)
-    mask = tested_mask(tested, array.shape)
+    mask = check_tested_mask(tested, array.shape)
     dropped = np.zeros(array.shape[:-2], dtype=np.int64)
     for analysis in interim_analyses:
         # One at the last run would be the test itself.
@@ -119,7 +119,7 @@ def race_rates(
         repetitions: simulated studies.
         seed: of the draws.
     """
-    mask = tested_mask(tested, np.asarray(tested).shape)
+    mask = check_tested_mask(tested, np.asarray(tested).shape)
     draws = simulate_differences(variance, mask, -delta, repetitions, np.random.default_rng(seed))
     raced = race(draws, mask, interim_analyses)
     return RaceRates(

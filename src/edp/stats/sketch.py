@@ -38,9 +38,9 @@ class QuantileSketch:
         self.count += new.size
         self._kept.append(new)
         if self.count > MOST_EXACT or self._bins is not None:
-            self._binned()
+            self._fill_bins()
 
-    def _binned(self) -> NDArray[np.int64]:
+    def _fill_bins(self) -> NDArray[np.int64]:
         """Move the single values into the bins and return the bins."""
         bins = np.zeros(_BINS, dtype=np.int64) if self._bins is None else self._bins
         for part in self._kept:
@@ -60,7 +60,7 @@ class QuantileSketch:
         if "values" in state:
             self.update(state["values"])
             return
-        self._binned()[state["bins"]] += state["counts"]
+        self._fill_bins()[state["bins"]] += state["counts"]
         self.count += int(state["counts"].sum())
 
     def quantiles(self, shares: Sequence[float]) -> list[float]:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from edp.errors import DataError
-from edp.stats.checks import finite, tested_cells
+from edp.stats.checks import check_tested_cells, finite
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def thesis_variance(scores: ArrayLike) -> SplitVariance:
     Raises:
         DataError: fewer than two splits or values that are not finite.
     """
-    array = _by_split(scores)
+    array = _check_scores(scores)
     seed = float(array.std(axis=1, ddof=1).mean()) if array.shape[1] > 1 else None
     return SplitVariance(float(array.mean()), float(array.mean(axis=1).std(ddof=1)), seed)
 
@@ -61,7 +61,7 @@ def split_variance(scores: ArrayLike, level: float = 0.95) -> SplitVariance:
     Raises:
         DataError: fewer than two splits or values that are not finite.
     """
-    array = _by_split(scores)
+    array = _check_scores(scores)
     splits, seeds = array.shape
     mean, tail = float(array.mean()), 0.5 - 0.5 * level
     between = seeds * float(array.mean(axis=1).var(ddof=1))
@@ -118,7 +118,7 @@ def seed_correlation(module: ArrayLike, baseline: ArrayLike) -> float:
     Raises:
         DataError: one seed, unequal shapes, values that are not finite, or an arm without spread.
     """
-    first, second = _by_split(module), _by_split(baseline)
+    first, second = _check_scores(module), _check_scores(baseline)
     if first.shape != second.shape or first.shape[1] < 2:
         raise DataError(f"tables of shape {first.shape} and {second.shape} came; give equal ones of at least two seeds")
     first, second = (table - table.mean(axis=1, keepdims=True) for table in (first, second))
@@ -158,7 +158,7 @@ def paired_variance(differences: ArrayLike, tested: ArrayLike | None = None) -> 
     Raises:
         DataError: the cells cannot tell the variances apart, or hold values that are not finite.
     """
-    array, mask = tested_cells(differences, tested)
+    array, mask = check_tested_cells(differences, tested)
     if array.ndim != 2:
         raise DataError(f"the differences have shape {array.shape}; give (run, session)")
     per_run, per_session, cells = mask.sum(axis=1), mask.sum(axis=0), int(mask.sum())
@@ -190,7 +190,7 @@ def paired_variance(differences: ArrayLike, tested: ArrayLike | None = None) -> 
     return PairedVariance(session, run, cell)
 
 
-def _by_split(scores: ArrayLike) -> np.ndarray:
+def _check_scores(scores: ArrayLike) -> np.ndarray:
     array = finite(scores, "table of scores", 2)
     if array.ndim != 2 or array.shape[0] < 2:
         raise DataError(f"the scores have shape {array.shape}; give (split, seed) with at least two splits")

@@ -1,6 +1,6 @@
 """Files of EDP's own kinds: read within bounds, written whole, and locked."""
 
-from edp.storage.locks import check_held, held_by, hold, release
+from edp.storage.locks import check_held, find_holder, hold, release
 from edp.storage.reading import (
     JSON_BYTES,
     SETTINGS_BYTES,
@@ -29,7 +29,7 @@ __all__ = [
     "SETTINGS_BYTES",
     "check_held",
     "check_writable",
-    "held_by",
+    "find_holder",
     "hold",
     "make_folder",
     "object_with",

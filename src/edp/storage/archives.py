@@ -101,14 +101,14 @@ class ZipReader:
 
     def __init__(self, source: Path | bytes, what: str, limits: ArchiveLimits, advice: str) -> None:
         self.what, self.limits, self.advice = what, limits, advice
-        self._stream: IO[bytes] = io.BytesIO(source) if isinstance(source, bytes) else _opened(source)
+        self._stream: IO[bytes] = io.BytesIO(source) if isinstance(source, bytes) else _open_unblocked(source)
         try:
             if not isinstance(source, bytes) and not stat.S_ISREG(os.fstat(self._stream.fileno()).st_mode):
-                raise self._refused("is not a regular file")
+                raise self._refusal_error("is not a regular file")
             self._size = self._stream.seek(0, os.SEEK_END)
             if self._size > limits.file_bytes:
-                raise self._refused(f"has {self._size:,} bytes, at most {limits.file_bytes:,} are read")
-            self.entries = self._listed()
+                raise self._refusal_error(f"has {self._size:,} bytes, at most {limits.file_bytes:,} are read")
+            self.entries = self._list_entries()
         except BaseException:
             self._stream.close()
             raise
@@ -136,12 +136,12 @@ class ZipReader:
             packed = self._bytes(start, entry.packed)
             data = packed if entry.method == _STORED else unpack_raw(packed, entry.size)
         except (_Damaged, DamagedError) as error:
-            raise self._refused(f"is damaged at entry '{printable(name)}' ({error})") from error
+            raise self._refusal_error(f"is damaged at entry '{printable(name)}' ({error})") from error
         if len(data) != entry.size:
             more = "more" if len(data) > entry.size else "fewer"
-            raise self._refused(f"announces {entry.size:,} bytes for entry '{printable(name)}' and holds {more}")
+            raise self._refusal_error(f"announces {entry.size:,} bytes for entry '{printable(name)}' and holds {more}")
         if binascii.crc32(data) != entry.crc:
-            raise self._refused(f"is damaged: the checksum of entry '{printable(name)}' does not fit")
+            raise self._refusal_error(f"is damaged: the checksum of entry '{printable(name)}' does not fit")
         return data
 
     def unpack(self, target: Path, names: Iterable[str]) -> None:
@@ -153,24 +153,24 @@ class ZipReader:
         """
         for name in names:
             if name not in self.entries:
-                raise self._refused(f"has no entry '{printable(name)}'")
+                raise self._refusal_error(f"has no entry '{printable(name)}'")
             file = target / name
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_bytes(self.read(name))
 
-    def _listed(self) -> dict[str, ArchiveEntry]:
+    def _list_entries(self) -> dict[str, ArchiveEntry]:
         try:
             count, size, at = self._directory_place()
             # Before the directory is read: its length is what the rest costs.
             if count > self.limits.entries:
-                raise self._refused(f"has {count:,} entries, at most {self.limits.entries:,} are read")
+                raise self._refusal_error(f"has {count:,} entries, at most {self.limits.entries:,} are read")
             if not count * _CENTRAL_BYTES <= size <= count * (_CENTRAL_BYTES + _LONGEST_NAME):
                 raise _Damaged(f"a directory of {size:,} bytes for {count:,} entries")
             entries = list(self._entries(self._bytes(at, size), count))
             self._check_names(entries)
             self._check_places(entries, at)
         except (_Damaged, struct.error, UnicodeDecodeError) as error:
-            raise self._refused(f"is not a ZIP archive, or a damaged one ({error})") from error
+            raise self._refusal_error(f"is not a ZIP archive, or a damaged one ({error})") from error
         return {entry.name: entry for entry in entries}
 
     def _directory_place(self) -> tuple[int, int, int]:
@@ -220,10 +220,12 @@ class ZipReader:
             if method == _STORED and size != packed:
                 raise _Damaged(f"entry '{printable(name)}' is stored and has two sizes")
             if size > DEFLATE_RATIO * (packed + 64):
-                raise self._refused(f"claims {size:,} bytes for entry '{printable(name)}', packed into {packed:,}")
+                raise self._refusal_error(
+                    f"claims {size:,} bytes for entry '{printable(name)}', packed into {packed:,}"
+                )
             total += size
             if total > self.limits.unpacked_bytes:
-                raise self._refused(f"would unpack to more than {self.limits.unpacked_bytes:,} bytes")
+                raise self._refusal_error(f"would unpack to more than {self.limits.unpacked_bytes:,} bytes")
             yield ArchiveEntry(name, size, packed, method, crc, local_at)
         if at != len(directory):
             raise _Damaged("a directory with bytes behind its entries")
@@ -231,13 +233,15 @@ class ZipReader:
     def _check_entry(self, name: str, flags: int, method: int, attributes: int) -> None:
         shown = f"entry '{printable(name)}'"
         if not _is_inside(name):
-            raise self._refused(f"has an {shown} that does not name a file inside the archive")
+            raise self._refusal_error(f"has an {shown} that does not name a file inside the archive")
         if stat.S_ISLNK(attributes >> _UNIX_TYPE):
-            raise self._refused(f"has an {shown} that is a link")
+            raise self._refusal_error(f"has an {shown} that is a link")
         if flags & (_ENCRYPTED | _STRONG | _MASKED):
-            raise self._refused(f"has an {shown} that is encrypted")
+            raise self._refusal_error(f"has an {shown} that is encrypted")
         if flags & _PATCHED or method not in (_STORED, _DEFLATED):
-            raise self._refused(f"has an {shown} packed by the method {method}, only stored and deflated ones are read")
+            raise self._refusal_error(
+                f"has an {shown} packed by the method {method}, only stored and deflated ones are read"
+            )
 
     def _check_names(self, entries: Sequence[ArchiveEntry]) -> None:
         # Two names that some file systems take for one would overwrite each other.
@@ -246,14 +250,14 @@ class ZipReader:
         for entry in entries:
             name = entry.name.removesuffix("/").casefold()
             if name in names:
-                raise self._refused(f"has an entry '{printable(entry.name)}' that stands twice")
+                raise self._refusal_error(f"has an entry '{printable(entry.name)}' that stands twice")
             names.add(name)
             if not entry.name.endswith("/"):
                 files.add(name)
         for name in names:
             folder = name.rpartition("/")[0]
             if folder in files:
-                raise self._refused(f"has an entry '{printable(folder)}' that is a file and a folder")
+                raise self._refusal_error(f"has an entry '{printable(folder)}' that is a file and a folder")
 
     def _check_places(self, entries: Iterable[ArchiveEntry], directory_at: int) -> None:
         """Refuse entries that overlap another entry or the directory: one byte would unpack many times."""
@@ -261,7 +265,7 @@ class ZipReader:
         for entry in sorted(entries, key=lambda each: each.at):
             _, end = self._data_at(entry)
             if entry.at < free_from or end > directory_at:
-                raise self._refused(f"has an entry '{printable(entry.name)}' that shares bytes with another one")
+                raise self._refusal_error(f"has an entry '{printable(entry.name)}' that shares bytes with another one")
             free_from = end
 
     def _data_at(self, entry: ArchiveEntry) -> tuple[int, int]:
@@ -290,11 +294,11 @@ class ZipReader:
             raise _Damaged("the file became shorter while it was read")
         return data
 
-    def _refused(self, why: str) -> DataError:
+    def _refusal_error(self, why: str) -> DataError:
         return DataError(f"{self.what} {why}; {self.advice}")
 
 
-def _opened(path: Path) -> IO[bytes]:
+def _open_unblocked(path: Path) -> IO[bytes]:
     # Without waiting for the other end of a pipe.
     return open(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)), "rb")
 

@@ -39,7 +39,7 @@ def hold(path: str | Path) -> IO[str]:
     """
     lock = Path(path)
     while True:
-        stream = _opened(lock)
+        stream = _open_lock(lock)
         try:
             lock_file(stream)
         except OSError as error:
@@ -124,7 +124,7 @@ def check_held(path: str | Path, stream: IO[str]) -> None:
         )
 
 
-def held_by(path: str | Path) -> str | None:
+def find_holder(path: str | Path) -> str | None:
     """Return the holder of a file locked by `hold`; None if it is free. Nothing is changed."""
     try:
         with os.fdopen(os.open(path, os.O_RDONLY | _OPEN), encoding="utf-8", errors="replace") as stream:
@@ -139,7 +139,7 @@ def held_by(path: str | Path) -> str | None:
     return None
 
 
-def _opened(lock: Path) -> IO[str]:
+def _open_lock(lock: Path) -> IO[str]:
     """Open the lock file, created if necessary, for appending; its content is not changed."""
     try:
         handle = os.open(lock, os.O_RDWR | os.O_APPEND | os.O_CREAT | _OPEN, 0o666)

@@ -50,7 +50,7 @@ def status_of(path: str | Path) -> os.stat_result:
     """
     status = status_at(path)
     if status is None:
-        raise StorageError(f"'{_shown(path)}' is not there: removed or renamed; give a path that exists")
+        raise StorageError(f"'{_format_path(path)}' is not there: removed or renamed; give a path that exists")
     return status
 
 
@@ -183,9 +183,9 @@ def cannot_look(path: str | Path, error: OSError | ValueError, looked: str = "lo
         errno.ENAMETOOLONG: "give a shorter path",
         errno.ELOOP: "remove the loop of links, or give another path",
     }.get(getattr(error, "errno", 0) or 0, "see that its disk is there, or give another path")
-    return StorageError(f"'{_shown(path)}' cannot be {looked}: {reason}; {advice}")
+    return StorageError(f"'{_format_path(path)}' cannot be {looked}: {reason}; {advice}")
 
 
-def _shown(path: str | Path) -> str:
+def _format_path(path: str | Path) -> str:
     text = str(path)
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."

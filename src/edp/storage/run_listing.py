@@ -13,7 +13,7 @@ from typing import Any
 
 from edp.errors import StorageError
 from edp.storage.headers import is_whole
-from edp.storage.locks import held_by
+from edp.storage.locks import find_holder
 from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_link_at, status_of
 from edp.storage.provenance import PROVENANCE
 from edp.storage.reading import parse_json, read_text, read_toml
@@ -120,14 +120,14 @@ def _run(path: Path) -> ListedRun:
     kind = _kind(path, identity, status)
     data = provenance.get("data")
     source = str(data.get("source", "")) if isinstance(data, dict) else ""
-    when = str(status.get("time") or provenance.get("created") or _touched(path))
+    when = str(status.get("time") or provenance.get("created") or _last_change(path))
     score = ""
     try:
         score = _score(scores)
     except (KeyError, TypeError, ValueError, AttributeError):
         damaged.append("scores.json")
     state = _state(path, kind, status)
-    damaged += _damaged_parts(path, kind if state == FINISHED else None)
+    damaged += _list_damaged(path, kind if state == FINISHED else None)
     return ListedRun(
         path, kind.name, "damaged" if damaged else state, when[:_LONGEST], source[:_LONGEST], score[:_LONGEST]
     )
@@ -142,7 +142,7 @@ def _kind(path: Path, identity: Mapping[str, object], status: Mapping[str, objec
 
 def _state(path: Path, kind: RunKind, status: Mapping[str, object]) -> str:
     """Return the state of a run; a state that is not recorded follows from the result, which is written at the end."""
-    if held_by(path / kind.lock):
+    if find_holder(path / kind.lock):
         return "running"
     recorded = status.get("status") or _study_state(path, kind)
     if not recorded:
@@ -157,7 +157,7 @@ def _study_state(path: Path, kind: RunKind) -> str:
     return str(_part(path / kind.result, []).get("state", ""))
 
 
-def _damaged_parts(path: Path, finished: RunKind | None) -> list[str]:
+def _list_damaged(path: Path, finished: RunKind | None) -> list[str]:
     """Return the settings and models of a run that are damaged, and the model that a finished run lacks."""
     damaged = []
     try:
@@ -190,7 +190,7 @@ def _part(file: Path, damaged: list[str]) -> Mapping[str, object]:
     return content
 
 
-def _touched(path: Path) -> str:
+def _last_change(path: Path) -> str:
     """Return the time of the last change of a folder, in the form of the files."""
     try:
         return time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(status_of(path).st_mtime))

@@ -16,11 +16,11 @@ from typing import Any
 from edp import __version__
 from edp.errors import BusyError, ConfigError, EdpError, StorageError
 from edp.storage.folders import check_kind
-from edp.storage.locks import check_held, held_by, hold
+from edp.storage.locks import check_held, find_holder, hold
 from edp.storage.paths import entries_of, files_below, full_path, is_file_at, is_folder_at, is_link_at, is_there
 from edp.storage.reading import read_object
 from edp.storage.run_kinds import RUN_KINDS, RunKind
-from edp.storage.seals import sealed_line
+from edp.storage.seals import seal_line
 from edp.storage.writing import TEMPORARY, make_folder, remove_unfinished, write_bytes, write_json
 
 IDENTITY, STATUS = "run.json", "status.json"
@@ -178,7 +178,7 @@ class Run:
     def write_history(self, rows: list[dict[str, object]]) -> None:
         """Write one line of JSON with a hash for each epoch."""
         check_held(self.file(".lock"), self._lock)
-        write_bytes(self.file("history.jsonl"), "".join(map(sealed_line, rows)).encode())
+        write_bytes(self.file("history.jsonl"), "".join(map(seal_line, rows)).encode())
 
 
 def state_of(folder: str | Path) -> str:
@@ -195,7 +195,7 @@ def _status_of(folder: str | Path) -> dict[str, object]:
     return read_object(file, ("status", "time")) if is_there(file) else {}
 
 
-def unfinished_text(folder: str | Path) -> str:
+def describe_unfinished(folder: str | Path) -> str:
     """Return the message about an unfinished run; an empty text if the folder has no unfinished run.
 
     Every command that opens a run and misses the result says this.
@@ -207,7 +207,7 @@ def unfinished_text(folder: str | Path) -> str:
     started = is_file_at(path / IDENTITY) or all(is_file_at(path / name) for name in LEFT)
     if not started or state_of(path) in ENDED:
         return ""
-    holder = held_by(path / ".lock")
+    holder = find_holder(path / ".lock")
     state = "it was stopped" if holder is None else f"process {holder} is at work"
     todo = "give the command that began it again to continue" if holder is None else "wait until it ends"
     return f"'{path}' holds a run that is not finished ({state}); {todo}"
@@ -231,7 +231,7 @@ def missing_text(folder: str | Path, kind: str, what: str = "", file: str = "") 
         reason += f" and holds a run of {present.command}"
     what = what or f"a run of {asked.command}"
     other = f"'{folder}' is not {what}: {reason}; give a folder that {asked.command} wrote"
-    return unfinished_text(folder) or other
+    return describe_unfinished(folder) or other
 
 
 def run_kind(folder: str | Path) -> RunKind | None:
@@ -269,7 +269,7 @@ def check_claimable(path: str | Path | Run, kind: str) -> None:
         )
     if present is None:
         check_kind(path, "run", what=asked.command)
-    holder = held_by(Path(path) / ".lock")
+    holder = find_holder(Path(path) / ".lock")
     if holder is not None:
         raise _busy(Path(path), holder)
 

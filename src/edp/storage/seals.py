@@ -66,7 +66,7 @@ def unsealed(content: Any, where: str, error: type[Exception]) -> Any:
     return {key: value for key, value in content.items() if key != HASH}
 
 
-def sealed_line(row: Mapping[str, object]) -> str:
+def seal_line(row: Mapping[str, object]) -> str:
     """Return an object as a line of JSON that ends with the hash of the text before it; the object may hold NaN."""
     digest = digest_of_bytes(json.dumps(dict(row)).encode())
     return json.dumps({**row, HASH: digest}) + "\n"
@@ -78,7 +78,7 @@ def is_sealed_line(line: str) -> bool:
 
 
 def check_sealed_line(line: str, where: str, error: type[Exception]) -> None:
-    """Check the hash of a line that `sealed_line` wrote.
+    """Check the hash of a line that `seal_line` wrote.
 
     Args:
         line: without its end.

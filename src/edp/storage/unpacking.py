@@ -21,7 +21,7 @@ DEFLATE_RATIO = 1100
 """Deflate packs no better than 1,032 to 1."""
 
 
-def unpacked_size(packing: str, data: bytes | memoryview, limit: int) -> int:
+def measure_unpacked(packing: str, data: bytes | memoryview, limit: int) -> int:
     """Count the bytes that packed data hold, without keeping them; beyond `limit`, counting ends.
 
     Args:
@@ -42,7 +42,7 @@ def unpacked_size(packing: str, data: bytes | memoryview, limit: int) -> int:
 
 
 def unpack_to(packing: str, data: bytes | memoryview, limit: int) -> bytes:
-    """Return packed data unpacked to at most ``limit + 1`` bytes; see `unpacked_size`."""
+    """Return packed data unpacked to at most ``limit + 1`` bytes; see `measure_unpacked`."""
     unpacked = bytearray()
     for part in _parts(packing, data):
         unpacked += part

@@ -32,7 +32,7 @@ def sample_recording(rate_hz: float = 100.0, ticks: int = 400) -> Recording:
     return Recording("R1", channels, values.astype(np.float32), rate_hz, "sim:test", {"seed": 3, "text": "ü"})
 
 
-def written_log(form: LogFormat, recording: Recording, folder: Path) -> Path:
+def write_log_file(form: LogFormat, recording: Recording, folder: Path) -> Path:
     """Write a recording with a format, under its first ending, and return the path."""
     path = folder / f"{recording.name}{form.suffixes[0]}"
     form.write(recording, path, WriteOptions())
@@ -59,7 +59,7 @@ def check_round_trip(form: LogFormat, recording: Recording) -> None:
         ContractError: something of it is lost or changed.
     """
     with tempfile.TemporaryDirectory(prefix="edp-format-") as folder:
-        path = written_log(form, recording, Path(folder))
+        path = write_log_file(form, recording, Path(folder))
         again = read_log(form, path)
         if path.is_file():
             with path.open("rb") as stream:
@@ -80,17 +80,17 @@ def check_damage(form: LogFormat) -> None:
         ContractError: another exception, or noise that is read as a log.
     """
     with tempfile.TemporaryDirectory(prefix="edp-format-") as folder:
-        path = written_log(form, sample_recording(), Path(folder))
+        path = write_log_file(form, sample_recording(), Path(folder))
         if not path.is_file():
             return
         content = path.read_bytes()
         # Nothing, less than a head, half, and all but an end that many formats need.
         for size in (0, 10, len(content) // 2, len(content) - 10):
             path.write_bytes(content[:size])
-            _refused(form, path, f"a file that is cut off after {size} of {len(content)} bytes")
+            _is_refused(form, path, f"a file that is cut off after {size} of {len(content)} bytes")
         # Random bytes of the same length: nothing in them must be taken for a log.
         path.write_bytes(np.random.default_rng(0).bytes(len(content)))
-        expect(_refused(form, path, "random bytes"), f"format '{form.name}' reads random bytes as a log")
+        expect(_is_refused(form, path, "random bytes"), f"format '{form.name}' reads random bytes as a log")
 
 
 def check_log_format(form: LogFormat) -> None:
@@ -113,7 +113,7 @@ def check_log_format(form: LogFormat) -> None:
     check_damage(form)
 
 
-def _refused(form: LogFormat, path: Path, what: str) -> bool:
+def _is_refused(form: LogFormat, path: Path, what: str) -> bool:
     try:
         read_log(form, path)
     except EdpError:

@@ -17,8 +17,8 @@ from edp.networks.stream import Stream
 from edp.networks.streaming import (
     State,
     detach_state,
-    fixed_parameters,
     indifferent_parameters,
+    list_fixed_parameters,
     map_state,
     parameters_of,
     reset_where,
@@ -34,7 +34,7 @@ MACHINE_CONSTANTS = 800
 """Numbers of a machine's geometry that a physics base may add to the list of layers."""
 
 
-def drawn_inputs(predictor: Predictor, batch: int = 2, ticks: int = TICKS, seed: int = 0) -> Tensor:
+def draw_inputs(predictor: Predictor, batch: int = 2, ticks: int = TICKS, seed: int = 0) -> Tensor:
     """Return random inputs, ``(batch, time, input)``, of the predictor's type."""
     like = next(predictor.parameters())
     draw = torch.Generator().manual_seed(seed)
@@ -56,7 +56,7 @@ def check_shapes(predictor: Predictor) -> None:
     Raises:
         ContractError: one of them is broken.
     """
-    x, task = drawn_inputs(predictor), predictor.task
+    x, task = draw_inputs(predictor), predictor.task
     code, state = run_network(predictor, x)
     with torch.no_grad():
         physical, _ = predictor.predict(x, predictor.initial_state(2, x))
@@ -79,10 +79,10 @@ def check_causality(predictor: Predictor) -> None:
     Args:
         predictor: in double precision, in evaluation mode.
     """
-    x, cut = drawn_inputs(predictor), 13
+    x, cut = draw_inputs(predictor), 13
     changed = x.clone()
     # Large changes: a small one could hide in a saturated unit.
-    changed[:, cut:] = 50.0 * drawn_inputs(predictor, seed=1)[:, cut:]
+    changed[:, cut:] = 50.0 * draw_inputs(predictor, seed=1)[:, cut:]
     before, after = run_network(predictor, x)[0], run_network(predictor, changed)[0]
     # Double precision: what remains is the order of sums, never a leak.
     expect_near(after[:, :cut], before[:, :cut], "a later tick changes an earlier prediction", rtol=0, atol=1e-12)
@@ -119,7 +119,7 @@ def check_reset(predictor: Predictor) -> None:
     Args:
         predictor: in double precision, in evaluation mode.
     """
-    x, later = drawn_inputs(predictor), drawn_inputs(predictor, seed=2)
+    x, later = draw_inputs(predictor), draw_inputs(predictor, seed=2)
     _, state = run_network(predictor, x)
     mixed = reset_where(torch.tensor([True, False]), predictor.initial_state(2, x), detach_state(state))
     both = run_network(predictor, later, mixed)[0]
@@ -133,9 +133,9 @@ def check_reset(predictor: Predictor) -> None:
 
 def check_state_is_left(predictor: Predictor) -> None:
     """Check that a run does not change the state that it was given."""
-    _, state = run_network(predictor, drawn_inputs(predictor))
+    _, state = run_network(predictor, draw_inputs(predictor))
     copies = map_state(torch.clone, state)
-    run_network(predictor, drawn_inputs(predictor, seed=3), state)
+    run_network(predictor, draw_inputs(predictor, seed=3), state)
 
     def compare(old: Tensor, new: Tensor) -> Tensor:
         expect(torch.equal(old, new), "a run writes into the state that it was given")
@@ -150,7 +150,7 @@ def check_determinism(predictor: Predictor) -> None:
     Args:
         predictor: in single precision, in evaluation mode.
     """
-    x = drawn_inputs(predictor)
+    x = draw_inputs(predictor)
     first = run_network(predictor, x)[0]
     torch.manual_seed(99)
     # Another state of the generator shows a hidden draw.
@@ -167,7 +167,7 @@ def check_batch(predictor: Predictor) -> None:
     Args:
         predictor: in double precision, in evaluation mode.
     """
-    x = drawn_inputs(predictor, batch=4)
+    x = draw_inputs(predictor, batch=4)
     together = run_network(predictor, x)[0]
     for i in range(4):
         alone = run_network(predictor, x[i : i + 1])[0]
@@ -181,14 +181,16 @@ def check_gradients(predictor: Predictor) -> None:
         predictor: in double precision.
     """
     torch.manual_seed(5)
-    x = drawn_inputs(predictor, batch=4)
+    x = draw_inputs(predictor, batch=4)
     code, _ = predictor(x, predictor.initial_state(4, x))
     # An error of the size of a standard deviation, however far a physics base goes on inputs drawn at random.
     # The target is drawn around the answer itself, so that every output has an error.
     loss = (code - code.detach() - torch.randn(code.shape, dtype=code.dtype)).square().sum()
     learned = {name: parameter for name, parameter in predictor.named_parameters() if parameter.requires_grad}
     fixed = {name for name, _ in predictor.named_parameters()} - set(learned)
-    expect(fixed == fixed_parameters(predictor), f"parameters that do not learn: {', '.join(sorted(fixed)) or 'none'}")
+    expect(
+        fixed == list_fixed_parameters(predictor), f"parameters that do not learn: {', '.join(sorted(fixed)) or 'none'}"
+    )
     indifferent = indifferent_parameters(predictor)
     gradients = torch.autograd.grad(loss, list(learned.values()), allow_unused=True)
     for name, gradient in zip(learned, gradients, strict=True):
@@ -235,7 +237,7 @@ def check_graph(predictor: Predictor) -> None:
         ExportError: a part has no form as layers.
     """
     graph = predictor.graph()
-    x, expected = _streamed(predictor)
+    x, expected = _stream_outputs(predictor)
     reference = Reference(graph)
     results = [reference.results(row) for row in x]
     expect(set(results[0]) == set(expected), f"the list gives {sorted(results[0])}; {sorted(expected)} must hold")
@@ -300,7 +302,7 @@ def _layout(state: State) -> list[tuple[torch.Size, torch.dtype]]:
     return layout
 
 
-def _streamed(predictor: Predictor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _stream_outputs(predictor: Predictor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return inputs ``(time, input)``, predictions and, if there are any, bounds, as streamed by PyTorch."""
     draw = torch.Generator().manual_seed(0)
     x = torch.randn(1, TICKS, predictor.front.inputs, generator=draw).double()

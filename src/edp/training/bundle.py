@@ -152,7 +152,7 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
         referenced.add(entry["file"])
         header |= {"schema": ADAPTED_SCHEMA, "adaptation": bundle.adaptation.to_plain() | {"arrays": entry}}
     # The header comes last: it is what makes the new files count.
-    write_json(path / HEADER, with_plugins(header))
+    write_json(path / HEADER, add_plugins(header))
     # Old files go only after the rename; a kill in between leaves spare files, not a broken bundle.
     for old in (
         file for what in ("weights", "integers", "adaptation") for file in entries_of(path, f"{what}-*.safetensors")
@@ -183,16 +183,16 @@ def load_bundle(folder: str | Path) -> Bundle:
             version does not know.
     """
     path = _bundle_folder(folder)
-    with as_damage(path):
+    with convert_damage(path):
         header = _read_header(path)
         _check_schema(header, path)
         check_hash(header, path / HEADER)
         if unknown := unknown_parts(header["model"]):
             raise BundleError(f"bundle '{path}': {'; '.join(unknown)}")
-        return _assembled(header, path)
+        return _assemble(header, path)
 
 
-def with_plugins(header: Mapping[str, object]) -> dict[str, object]:
+def add_plugins(header: Mapping[str, object]) -> dict[str, object]:
     """Return a header with the plug-ins whose parts it names."""
     plugins = origins_in(header)
     return {**header, PLUGINS: plugins} if plugins else dict(header)
@@ -221,30 +221,30 @@ def upgrade_bundle(folder: str | Path) -> Path:
         BundleError: not a bundle of an earlier version, or a damaged one; it is left as it is.
     """
     path = _bundle_folder(folder)
-    with as_damage(path):
+    with convert_damage(path):
         header = _read_header(path)
         schema = header["schema"]
         if schema not in UNHASHED | REWORDED:
             raise BundleError(f"bundle '{path}' has schema {schema}; there is nothing to upgrade")
         if schema in REWORDED:
             check_hash(header, path / HEADER)
-        upgraded = _reworded(header) | {"schema": (UNHASHED | REWORDED)[schema]}
+        upgraded = _convert_keys(header) | {"schema": (UNHASHED | REWORDED)[schema]}
         # The content is assembled once, so that damage is not sealed under a new hash.
-        _assembled(upgraded, path)
-    write_json(path / HEADER, with_plugins(upgraded))
+        _assemble(upgraded, path)
+    write_json(path / HEADER, add_plugins(upgraded))
     return path
 
 
-def _reworded(header: Table) -> dict[str, object]:
+def _convert_keys(header: Table) -> dict[str, object]:
     """Convert the keys of an earlier header to this version."""
-    reworded = {**header, "provenance": _renamed(header["provenance"], "lesson", "strategy")}
+    reworded = {**header, "provenance": _rename_key(header["provenance"], "lesson", "strategy")}
     if "adaptation" in header:
         entry = header["adaptation"]
-        reworded["adaptation"] = {**entry, "spec": _renamed(entry["spec"], "rest", "dead_zone")}
+        reworded["adaptation"] = {**entry, "spec": _rename_key(entry["spec"], "rest", "dead_zone")}
     return reworded
 
 
-def _renamed(table: Mapping[str, object], old: str, new: str) -> dict[str, object]:
+def _rename_key(table: Mapping[str, object], old: str, new: str) -> dict[str, object]:
     return {new if key == old else key: value for key, value in table.items()}
 
 
@@ -262,7 +262,7 @@ def _bundle_folder(folder: str | Path) -> Path:
 
 
 @contextlib.contextmanager
-def as_damage(path: Path) -> Iterator[None]:
+def convert_damage(path: Path) -> Iterator[None]:
     """Convert errors in a file of a bundle to one message that names the bundle."""
     # A damaged file can raise any of these deep in a parser; a bug elsewhere keeps its own type.
     kinds = (EdpError, LookupError, AttributeError, TypeError, ValueError, ArithmeticError, RuntimeError)
@@ -284,7 +284,7 @@ def _read_header(path: Path) -> dict[str, object]:
     return header
 
 
-def _assembled(header: Table, path: Path) -> Bundle:
+def _assemble(header: Table, path: Path) -> Bundle:
     """Build the bundle from a header and its files."""
     spec, task = model_from_plain(header["model"]), task_from_plain(header["task"])
     inputs = tuple(Channel(_text(c["name"]), Kind(c["kind"]), _text(c["description"])) for c in header["inputs"])

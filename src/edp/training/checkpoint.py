@@ -84,7 +84,7 @@ def save_checkpoint(
     state = optimizer.state_dict()
     structure = _strip(state, "optimizer", tensors)
     header = {"key": key, "progress": asdict(progress), "optimizer": structure}
-    write_bytes(path, _signed(save(tensors, metadata={"edp": json.dumps(header), "blake2b": BLANK})))
+    write_bytes(path, _insert_digest(save(tensors, metadata={"edp": json.dumps(header), "blake2b": BLANK})))
 
 
 def load_checkpoint(path: Path, key: str) -> tuple[TrainingPosition, Weights, dict[str, object]] | None:
@@ -101,7 +101,7 @@ def load_checkpoint(path: Path, key: str) -> tuple[TrainingPosition, Weights, di
         header, tensors = _header(data), load(data)
         if header["key"] != key:
             raise StorageError(f"checkpoint '{path}' belongs to another run; choose another folder with --out")
-        return _taken_apart(header, tensors)
+        return _parse_checkpoint(header, tensors)
     except (SafetensorError, LookupError, AttributeError, TypeError, ValueError, RuntimeError) as error:
         # safetensors, JSON and missing keys each raise their own type; all of them mean damage.
         raise damaged(path, error) from error
@@ -112,7 +112,7 @@ def damaged(path: Path, error: Exception) -> StorageError:
     return StorageError(f"checkpoint '{path}' is damaged ({error}); remove it to train from the start")
 
 
-def _taken_apart(header: Table, tensors: dict[str, Tensor]) -> tuple[TrainingPosition, Weights, dict[str, object]]:
+def _parse_checkpoint(header: Table, tensors: dict[str, Tensor]) -> tuple[TrainingPosition, Weights, dict[str, object]]:
     plain = header["progress"]
     progress = TrainingPosition(**{**plain, "schedule": ScheduleState(**plain["schedule"])})
     groups: dict[str, dict[str, Tensor]] = {"current": {}, "average": {}, "best": {}}
@@ -167,7 +167,7 @@ def _digest(data: bytes, position: int) -> bytes:
     return state.hexdigest().encode()
 
 
-def _signed(data: bytes) -> bytes:
+def _insert_digest(data: bytes) -> bytes:
     position = _place_of_digest(data)
     return data[:position] + _digest(data, position) + data[position + len(BLANK) :]
 

@@ -195,7 +195,7 @@ def _factors(matrix: NDArray[np.float64], rank: int) -> tuple[Scaled, Scaled]:
     return Scaled.of(root * u[:, :rank].T), Scaled.of(root * v[:rank])
 
 
-def with_delta(base: Predictor, delta: Delta) -> Predictor:
+def apply_delta(base: Predictor, delta: Delta) -> Predictor:
     """Return the network of a machine: a copy of the base with the change added.
 
     Raises:
@@ -246,7 +246,7 @@ def delta_from_bytes(data: bytes, where: str) -> Delta:
     object_with(head, ("base", "facts", "shapes", "hash"), where, BundleError)
     if head["hash"] != _hash(arrays) or not isinstance(head["facts"], dict) or not isinstance(head["shapes"], dict):
         raise BundleError(f"{where} is damaged: its numbers do not have the hash in its header; copy it again")
-    parts = {kind: _scaled(arrays, head["shapes"], kind, where) for kind in ("w", "l", "r")}
+    parts = {kind: _read_scaled(arrays, head["shapes"], kind, where) for kind in ("w", "l", "r")}
     vectors = {name[2:]: values for name, values in arrays.items() if name.startswith("v:")}
     lefts, rights = parts["l"], parts["r"]
     fitting = lefts.keys() == rights.keys() and all(
@@ -258,7 +258,7 @@ def delta_from_bytes(data: bytes, where: str) -> Delta:
     return Delta(str(head["base"]), head["facts"], vectors, parts["w"], narrow)
 
 
-def _scaled(
+def _read_scaled(
     arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, object], kind: str, where: str
 ) -> dict[str, Scaled]:
     """Matrices of a kind by name, their shapes and types checked."""

@@ -144,7 +144,7 @@ def fit_elements(
         rng = np.random.default_rng([seed, start])
         begin = APART * rng.normal(size=problem.size) if start else np.zeros(problem.size)
         descent = descend(problem.normal_equations, begin, limits, damping=1e-2)
-        fitted = judge.twin = twin.with_numbers(problem.priors.values(descent.theta[:parameters]))
+        fitted = judge.twin = twin.with_parameters(problem.priors.values(descent.theta[:parameters]))
         error = judge.error()
         better = bool(error < least)
         if better:

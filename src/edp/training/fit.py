@@ -34,7 +34,7 @@ from edp.training.memory import check_training_memory
 from edp.training.objective import Objective
 from edp.training.outcome import Diverged, Fitted, TrainingError, TrainingProgress
 from edp.training.ridge_start import start_bypass
-from edp.training.spec import TrainingSpec, by_gradient, check_training, thread_count
+from edp.training.spec import TrainingSpec, check_training, thread_count, to_gradient_training
 from edp.training.strategy import BatchContext, DirectFit, EpisodicStrategy, StreamStrategy, TrainingStrategy
 from edp.training.validation import calibrate, validation_scores
 from edp.wording import typed
@@ -57,7 +57,7 @@ def fit(
         run: where the training writes; where given, a checkpoint after each epoch makes it resumable.
         on_event: called with progress.
         strategy: weights to begin with, a teacher, or what fits the network by itself; it is part of what the key of
-            `run` must tell apart. A strategy knows no folds: with it a committee trains by gradient (`by_gradient`).
+            `run` must tell apart. A strategy knows no folds: with it a committee trains by gradient (`to_gradient_training`).
 
     Raises:
         ConfigError: settings that contradict one another.
@@ -73,7 +73,7 @@ def fit(
         if run is not None:
             run.folder.write_history(direct.history)
         return direct
-    spec = by_gradient(spec)
+    spec = to_gradient_training(spec)
     fitted = Loop(data, model, spec, run, strategy).fit(tell)
     best = max((row["epoch"] for row in fitted.history if row["best"]), default=0)
     if spec.refit == "none" or not best:
@@ -164,7 +164,7 @@ class Loop:
         """Train to the last epoch, or until the early stop."""
         self.resumed_at, self.rate = self.progress.epoch, 0.0
         seen, busy = 0, 0.0
-        while self.progress.epoch < self.epochs and not self._stalled():
+        while self.progress.epoch < self.epochs and not self._is_stalled():
             began = time.perf_counter()
             seen += self.advance(self.updates, on_event)
             busy += time.perf_counter() - began
@@ -174,9 +174,9 @@ class Loop:
 
     def finish(self) -> Fitted:
         """Return the fitted model after the last epoch; the training cannot continue."""
-        return self._fitted()
+        return self._make_result()
 
-    def _fitted(self) -> Fitted:
+    def _make_result(self) -> Fitted:
         """Return the network with the best weights so far."""
         with torch.no_grad():
             for name, parameter in self.net.named_parameters():
@@ -187,7 +187,7 @@ class Loop:
             self.strategy.end(self.net)
         return Fitted(self.net.eval(), self.progress.history, self.progress.seconds, self.rate, self.resumed_at)
 
-    def _diverged(self, what: str, value: float) -> Diverged:
+    def _divergence_error(self, what: str, value: float) -> Diverged:
         progress = self.progress
         best_rows = [row for row in progress.history if row["epoch"] == progress.best_epoch]
         if self.refitted is not None:
@@ -207,7 +207,7 @@ class Loop:
         return Diverged(
             f"{what} is {value} at update {progress.updates} (epoch {facts['epoch']}): the training diverged; {saved}. "
             "Lower the learning rate or clip_norm, or look for outliers with edp inspect",
-            self._fitted() if math.isfinite(progress.best_score) else None,
+            self._make_result() if math.isfinite(progress.best_score) else None,
             facts,
         )
 
@@ -227,7 +227,7 @@ class Loop:
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise damaged(self.file or Path(FILE), error) from error
 
-    def _stalled(self) -> bool:
+    def _is_stalled(self) -> bool:
         waited = self.progress.epoch - self.progress.best_epoch
         return self.refitted is None and 0 < self.spec.patience <= waited and self.spec.average.may_stop()
 
@@ -265,7 +265,7 @@ class Loop:
         """End training before the current epoch is complete and return the model with the best weights so far."""
         self.resumed_at, self.rate = self.progress.epoch, 0.0
         self.progress.history.append(self._judge_epoch(self.within.loss))
-        return self._fitted()
+        return self._make_result()
 
     def _update(self, batch: Batch, state: State | None) -> tuple[float, State]:
         x, reset = (torch.from_numpy(part).to(self.device) for part in (batch.inputs, batch.reset))
@@ -292,7 +292,7 @@ class Loop:
         self.progress.updates += 1
         value = float(loss.detach())
         if not math.isfinite(value):
-            raise self._diverged("the training loss", value)
+            raise self._divergence_error("the training loss", value)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.learned, self.spec.clip_norm)
@@ -343,7 +343,7 @@ class Loop:
         score, report, validation_loss = self._validate()
         for what, value in (("score", score), ("loss", validation_loss)):
             if not math.isfinite(value):
-                raise self._diverged(f"the validation {what}", value)
+                raise self._divergence_error(f"the validation {what}", value)
         better = score < progress.best_score
         if better:
             progress.best_score, progress.best_epoch = score, progress.epoch + 1

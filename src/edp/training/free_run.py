@@ -124,7 +124,7 @@ class FreeRunSpec:
             )
 
 
-def measured_ports(spec: FreeRunSpec, shape: tuple[int, int, int], prefix: int, rng: np.random.Generator) -> Array:
+def draw_measured_ports(spec: FreeRunSpec, shape: tuple[int, int, int], prefix: int, rng: np.random.Generator) -> Array:
     """Return the measured ports ``(tick, lane, answer)``: 1 in the prefix, later by the fractions in the settings."""
     _, lanes, answers = shape
     kind = rng.random(lanes)
@@ -164,10 +164,10 @@ def fit_free_runs(
     """
     torch.set_num_threads(1)  # the products of a tick are too small to share
     with one_blas_thread():
-        return _fitted(twin, train, validation, spec, on_event, run, trained)
+        return _fit_stages(twin, train, validation, spec, on_event, run, trained)
 
 
-def _fitted(
+def _fit_stages(
     twin: RecurrentTwin | ResidualTwin,
     train: Sequence[Series],
     validation: Sequence[Series],
@@ -198,11 +198,11 @@ def _fitted(
     optimizer = spec.optimizer.build(network.named_parameters())
     rates = [group["lr"] for group in optimizer.param_groups]
     weight = torch.from_numpy(answer_weights(twin, spec))
-    progress, chosen = _resumed(run, network, optimizer)
+    progress, chosen = _load_checkpoint(run, network, optimizer)
     if trained and not progress.updates:
         progress.best_score = judge.error()
     before, began = progress.seconds, time.process_time()
-    while progress.updates < len(ticks) and not _waited_out(progress, spec, len(ticks)):
+    while progress.updates < len(ticks) and not _is_stalled(progress, spec, len(ticks)):
         share = _rate(progress.updates / len(ticks), spec.warmup)
         for group, base in zip(optimizer.param_groups, rates, strict=True):
             group["lr"] = base * share
@@ -230,7 +230,7 @@ def _fitted(
     return FittedTwin(twin, progress.history, progress.seconds)
 
 
-def _resumed(
+def _load_checkpoint(
     run: KeyedRun | None, network: CellWeights, optimizer: torch.optim.Optimizer
 ) -> tuple[TrainingPosition, dict[str, Tensor]]:
     """Return the position and best weights of a run; network and optimiser are restored."""
@@ -246,7 +246,7 @@ def _resumed(
     return progress, weights.best
 
 
-def _waited_out(progress: TrainingPosition, spec: FreeRunSpec, total: int) -> bool:
+def _is_stalled(progress: TrainingPosition, spec: FreeRunSpec, total: int) -> bool:
     """Whether the last stage has gone on for too long without an improvement."""
     since = sum(row["update"] > progress.best_epoch for row in progress.history)
     judged = progress.history[-1]["update"] if progress.history else 0
@@ -274,7 +274,7 @@ def _update(
     windows = random_windows(train, twin.prefix_ticks + ticks, spec.lanes, rng)
     drawn = MeasuredWindows.read(windows, twin.prefix_ticks + ticks)
     driven, truth = (np.ascontiguousarray(values.swapaxes(0, 1)) for values in (drawn.commands, drawn.outputs))
-    ports = measured_ports(spec, truth[1:].shape, twin.prefix_ticks, rng)
+    ports = draw_measured_ports(spec, truth[1:].shape, twin.prefix_ticks, rng)
     commands, measured, port = (torch.from_numpy(a) for a in (driven, truth[:-1], ports))
     answers = twin.free_run(commands, measured, port)
     loss = huber((answers - torch.from_numpy(truth[1:])) * weight, spec.delta).mean()

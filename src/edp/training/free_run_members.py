@@ -43,7 +43,7 @@ class MemberTraining:
     trained: bool = False
 
 
-def trained_member(job: MemberTraining, on_event: Callable[[FreeRunProgress], None] | None = None) -> FittedTwin:
+def train_member(job: MemberTraining, on_event: Callable[[FreeRunProgress], None] | None = None) -> FittedTwin:
     """Train the network of a job; the result is the same in any process.
 
     Raises:
@@ -74,13 +74,13 @@ def train_unit(identity: TrainingIdentity, where: Mapping[str, MemberTraining]) 
     if job.folder is None:
         raise ConfigError(f"{job.label} has no folder to be trained in")
     folder = job.folder[0]
-    trained_member(job, lambda event: event.write(folder))
+    train_member(job, lambda event: event.write(folder))
     return {"trained": job.label}
 
 
-def noted_progress(jobs: Sequence[MemberTraining]) -> FreeRunProgress | None:
+def read_progress_notes(jobs: Sequence[MemberTraining]) -> FreeRunProgress | None:
     """Combine the latest progress of parallel trainings; None if there is none yet."""
-    noted = [_noted(job) for job in jobs]
+    noted = [_read_progress(job) for job in jobs]
     events = [event for event in noted if event is not None]
     if not events:
         return None
@@ -98,7 +98,7 @@ def noted_progress(jobs: Sequence[MemberTraining]) -> FreeRunProgress | None:
     )
 
 
-def _noted(job: MemberTraining) -> FreeRunProgress | None:
+def _read_progress(job: MemberTraining) -> FreeRunProgress | None:
     try:
         return None if job.folder is None else FreeRunProgress.read(job.folder[0])
     except EdpError:
@@ -113,7 +113,7 @@ def one_by_one(
     Raises:
         EdpError: see `fit_free_runs`.
     """
-    return (trained_member(job, on_event) for job in jobs)
+    return (train_member(job, on_event) for job in jobs)
 
 
 TrainAll = Callable[[Sequence[MemberTraining], Callable[[FreeRunProgress], None] | None], Iterable[FittedTwin]]
@@ -148,10 +148,10 @@ def fit_members(
         folder = None if run is None else (run.folder.path / PARTS / f"member_{which}", run.key)
         seeded = replace(training, seed=seed)
         jobs.append(MemberTraining(f"member {which + 1}", form.member(*parts, seed), *series, seeded, folder))
-    return joined_members(list(train_all(jobs, on_event)))
+    return join_members(list(train_all(jobs, on_event)))
 
 
-def joined_members(fits: Sequence[FittedTwin]) -> FittedTwin:
+def join_members(fits: Sequence[FittedTwin]) -> FittedTwin:
     """Members that were trained apart, on one map and with one scale, as one twin.
 
     Returns:

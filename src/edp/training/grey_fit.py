@@ -124,7 +124,7 @@ class GreyProblem:
 
     def twin_at(self, theta: Doubles) -> GreyTwin:
         """Return the grey box at coordinates."""
-        return self.twin.with_numbers(self.parametrisation.values(theta))
+        return self.twin.with_parameters(self.parametrisation.values(theta))
 
     def normal_equations(self, theta: Doubles, windows: GreyRound, full: bool) -> NormalEquations:
         """Return the loss of each run, with gradient and Gauss-Newton matrix by the coordinates if `full`."""

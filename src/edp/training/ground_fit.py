@@ -47,8 +47,8 @@ def fit_ground(
     """
     started = time.process_time()
     check_grounded(twin)
-    parts = {"train": [logged_forces(twin, one) for one in train]}
-    parts["validation"] = [logged_forces(twin, one) for one in validation]
+    parts = {"train": [read_forces(twin, one) for one in train]}
+    parts["validation"] = [read_forces(twin, one) for one in validation]
     law = GROUNDS[kind].from_logs(twin, parts["train"], machine)
     shares = {part: law.r_squared(twin, logs) if logs else float("nan") for part, logs in parts.items()}
     explained = {part: share if np.isfinite(share) else None for part, share in shares.items()}
@@ -58,7 +58,7 @@ def fit_ground(
     return GroundFit(twin=twin, history=[], seconds=seconds, datasheet=rows, facts={"ground": facts}, law=law)
 
 
-def logged_forces(twin: GreyTwin, series: Series) -> Log:
+def read_forces(twin: GreyTwin, series: Series) -> Log:
     """Strokes (m), velocities (m/s) and forces (N) against each actuator ``(tick, actuator)`` along a log.
 
     Forces are `DisturbanceObserver`'s, told all channels tick by tick; ticks of the prefix have no row.

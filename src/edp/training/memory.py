@@ -75,7 +75,7 @@ def _validation(net: Predictor, data: Prepared) -> float:
 def _backward(net: Predictor, spec: TrainingSpec) -> float:
     """Return the memory that the backward pass needs, estimated from two short passes of one stream."""
     chunks = spec.chunks
-    first, second = (_saved(net, ticks) for ticks in PROBED)
+    first, second = (_measure_saved(net, ticks) for ticks in PROBED)
     # The difference of two passes removes what does not grow with the ticks.
     tick = max(0.0, (second - first) / (PROBED[1] - PROBED[0]))
     start = max(0.0, first - tick * PROBED[0])
@@ -84,7 +84,7 @@ def _backward(net: Predictor, spec: TrainingSpec) -> float:
     return TEMPORARY * chunks.batch * (start + (tick + loss) * chunks.length)
 
 
-def _saved(net: Predictor, ticks: int) -> int:
+def _measure_saved(net: Predictor, ticks: int) -> int:
     """Bytes of tensors that a forward pass of one stream keeps for the way back."""
     like = next(net.parameters())
     counted_storages = {parameter.untyped_storage().data_ptr() for parameter in net.parameters()}

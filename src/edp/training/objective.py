@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from edp.networks.frontend import TargetTransform
-from edp.networks.losses import Course, Prediction, horizon_weights, masked_loss, output_weights
+from edp.networks.losses import Course, Prediction, compute_masked_loss, horizon_weights, output_weights
 from edp.training.spec import TrainingSpec
 
 
@@ -43,7 +43,7 @@ class Objective:
             weights = weights * self.spec.adaptive.weights(self.running)
             # Detached: the weights follow the error and must not be a way to lower the loss.
             self.running = self.spec.adaptive.follow(self.running, (answer.center - target).detach(), valid)
-        loss = masked_loss(self.spec.loss, answer, target, valid, weights)
+        loss = compute_masked_loss(self.spec.loss, answer, target, valid, weights)
         if self.spec.terms:
             course = self._course(answer.center, target, self.code.level(features), valid)
             for term in self.spec.terms:

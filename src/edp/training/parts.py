@@ -142,7 +142,7 @@ def _state(loop: Loop) -> dict[str, object]:
 def _restore(loop: Loop, state: Table) -> None:
     loop.progress.updates = state["updates"]
     loop.within.updates, loop.within.total = state["epoch_updates"], state["total"]
-    loop.within.stream = _moved(state["stream"], loop.device)
+    loop.within.stream = _move_tree(state["stream"], loop.device)
     with torch.no_grad():
         for name, parameter in loop.net.named_parameters():
             parameter.copy_(state["current"][name])
@@ -154,11 +154,11 @@ def _restore(loop: Loop, state: Table) -> None:
         torch.cuda.set_rng_state(state["chance on the device"], loop.device)
 
 
-def _moved(tree: Any, device: torch.device) -> Any:
+def _move_tree(tree: Any, device: torch.device) -> Any:
     if isinstance(tree, Tensor):
         return tree.to(device)
     if isinstance(tree, dict):
-        return {name: _moved(part, device) for name, part in tree.items()}
+        return {name: _move_tree(part, device) for name, part in tree.items()}
     if isinstance(tree, list | tuple):
-        return type(tree)(_moved(part, device) for part in tree)
+        return type(tree)(_move_tree(part, device) for part in tree)
     return tree

@@ -70,10 +70,10 @@ def fit_residual(
     """
     spec = residual_spec(form, training)
     ticks = round(spec.validation_s * twin.channels.rate_hz)
-    grey_error = FreeRunValidation(twin.without_network(), validation, ticks, spec.lanes).error()
+    grey_error = FreeRunValidation(twin.drop_network(), validation, ticks, spec.lanes).error()
     fitted = fit_free_runs(twin, train, validation, spec, on_event, run)
     error = min(row["validation"] for row in fitted.history)
-    chosen = twin if error < grey_error else twin.without_network()
+    chosen = twin if error < grey_error else twin.drop_network()
     facts = {"helps": error < grey_error, "validation": error, "validation_grey_box": grey_error}
     return ResidualFit(
         twin=chosen, history=fitted.history, seconds=fitted.seconds, facts={"residual": facts}, grey_error=grey_error,

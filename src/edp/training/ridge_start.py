@@ -9,7 +9,7 @@ import torch
 
 from edp.data.gathered import LastMade
 from edp.data.lags import LagTask, origins
-from edp.data.ridge import crossed_solution, ridge_solution
+from edp.data.ridge import cross_validate_ridge, ridge_solution
 from edp.data.scaling import feature_columns
 from edp.data.series import Series
 from edp.data.task import Task
@@ -56,7 +56,7 @@ def start_bypass(predictor: Predictor, train: Sequence[Series], validation: Sequ
         )
     crossed = bypass.spec.start == "crossed"
     solution = (
-        crossed_solution(series_of_parts[0] + series_of_parts[1], lags)
+        cross_validate_ridge(series_of_parts[0] + series_of_parts[1], lags)
         if crossed
         else ridge_solution(series_of_parts[0], lags, series_of_parts[1])
     )

@@ -108,8 +108,8 @@ class OneCycle:
 
     def factor(self, progress: float, state: ScheduleState) -> float:
         if progress < self.rise:
-            return _between(self.start, 1.0, progress / self.rise)
-        return _between(1.0, self.floor, min(1.0, (progress - self.rise) / max(1e-9, 1.0 - self.rise)))
+            return _interpolate_cosine(self.start, 1.0, progress / self.rise)
+        return _interpolate_cosine(1.0, self.floor, min(1.0, (progress - self.rise) / max(1e-9, 1.0 - self.rise)))
 
     def observe(self, validation: float, state: ScheduleState) -> None:
         """Nothing to remember."""
@@ -151,5 +151,5 @@ class Plateau:
             state.factor, state.waited = max(self.floor, state.factor * self.shrink), 0
 
 
-def _between(start: float, end: float, share: float) -> float:
+def _interpolate_cosine(start: float, end: float, share: float) -> float:
     return end + (start - end) * 0.5 * (1.0 + math.cos(math.pi * share))

@@ -133,7 +133,7 @@ class TrainingSpec:
                 )
 
 
-def by_gradient(spec: TrainingSpec) -> TrainingSpec:
+def to_gradient_training(spec: TrainingSpec) -> TrainingSpec:
     """Return the settings of a gradient training in chunks that replaces a training on folds.
 
     Chunks and updates an epoch are those of a committee where the spec leaves its defaults; all else stays.
@@ -180,7 +180,7 @@ def check_training(task: Task, model: ModelSpec, spec: TrainingSpec) -> None:
             f"('{task.targets[0]}'); set it to 0"
         )
     if spec.bagging is not None:
-        reasons += _against_bagging(model, spec, spec.bagging)
+        reasons += _list_bagging_conflicts(model, spec, spec.bagging)
     if reasons:
         raise ConfigError("training: " + "; ".join(reasons))
 
@@ -204,7 +204,7 @@ def check_fitted_parts(model: ModelSpec, spec: TrainingSpec) -> None:
         )
 
 
-def _against_bagging(model: ModelSpec, spec: TrainingSpec, bagging: BaggingSpec) -> list[str]:
+def _list_bagging_conflicts(model: ModelSpec, spec: TrainingSpec, bagging: BaggingSpec) -> list[str]:
     """Return the reasons against training on folds."""
     reasons = []
     if not isinstance(model.backbone, CommitteeSpec) or not isinstance(model.head, LinearHead):

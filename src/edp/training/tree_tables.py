@@ -45,7 +45,7 @@ def complete_tables(model: HistGradientBoostingRegressor, depth: int) -> Tables:
     return feature, threshold, leaf.astype(np.float32)
 
 
-def stacked_tables(tables: Sequence[Tables], trees: int) -> Tables:
+def stack_tables(tables: Sequence[Tables], trees: int) -> Tables:
     """Tables of several outputs, ``(output, tree, ...)``; missing trees give zero.
 
     Args:
@@ -59,10 +59,10 @@ def stacked_tables(tables: Sequence[Tables], trees: int) -> Tables:
     if most > trees:
         raise ValueError(f"an output has {most} trees; at most {trees} must hold")
     feature, threshold, leaf = zip(*tables, strict=True)
-    return _stacked(feature, trees, 0), _stacked(threshold, trees, NEVER), _stacked(leaf, trees, 0.0)
+    return _stack_rows(feature, trees, 0), _stack_rows(threshold, trees, NEVER), _stack_rows(leaf, trees, 0.0)
 
 
-def _stacked(rows: Sequence[NDArray[_Number]], trees: int, fill: float) -> NDArray[_Number]:
+def _stack_rows(rows: Sequence[NDArray[_Number]], trees: int, fill: float) -> NDArray[_Number]:
     """Rows of each output ``(output, tree, ...)``, with rows of `fill` where it has fewer."""
     full = np.full((len(rows), trees, rows[0].shape[1]), fill, dtype=rows[0].dtype)
     for target, own in zip(full, rows, strict=True):

@@ -25,7 +25,7 @@ from edp.storage.memory import check_setting
 from edp.storage.paths import entries_of, is_entry_at
 from edp.storage.runs import missing_text
 from edp.storage.seals import HASH
-from edp.training.bundle import Bundle, as_damage, check_hash, read_arrays, with_plugins, write_arrays
+from edp.training.bundle import Bundle, add_plugins, check_hash, convert_damage, read_arrays, write_arrays
 
 SCHEMA = 2
 GROUNDED = 3
@@ -124,7 +124,7 @@ def save_twin(bundle: TwinBundle, folder: str | Path) -> Path:
     }
     if bundle.ground is not None:
         header["ground"] = {"kind": GROUNDS.name_of(bundle.ground), **bundle.ground.plain()}
-    write_json(path / HEADER, with_plugins(header))
+    write_json(path / HEADER, add_plugins(header))
     # Old files go only after the rename; a kill in between leaves spare files, not a broken twin.
     for old in entries_of(path, "weights-*.safetensors"):
         if old.name != entry["file"]:
@@ -148,7 +148,7 @@ def twin_hash(folder: str | Path) -> str:
         BundleError: the header was damaged or changed.
     """
     path = _twin_folder(folder)
-    with as_damage(path):
+    with convert_damage(path):
         header = read_header(path / HEADER, (HASH,))
         check_hash(header, path / HEADER)
         return str(header[HASH])
@@ -171,7 +171,7 @@ def load_twin(folder: str | Path) -> TwinBundle:
     path = _twin_folder(folder)
     if not is_entry_at(path / HEADER):
         raise BundleError(missing_text(path, "twin", "a twin"))
-    with as_damage(path):
+    with convert_damage(path):
         header = read_header(path / HEADER, ("schema",))
         schema = header["schema"]
         if isinstance(schema, bool) or schema not in READABLE:
@@ -180,10 +180,10 @@ def load_twin(folder: str | Path) -> TwinBundle:
                 "install a newer one, or train again"
             )
         check_hash(header, path / HEADER)
-        return _assembled(header, path)
+        return _assemble(header, path)
 
 
-def _assembled(header: Table, path: Path) -> TwinBundle:
+def _assemble(header: Table, path: Path) -> TwinBundle:
     parts = {part: tuple(_channel(entry) for entry in header["channels"][part]) for part in PARTS}
     if not RATE.holds(header["rate_hz"]):
         raise ValueError(f"its rate_hz is {str(header['rate_hz'])[:40]}; {RATE.rule('rate_hz')} must hold")

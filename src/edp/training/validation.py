@@ -14,7 +14,7 @@ from edp.data.series import Series
 from edp.data.spread_rows import spread_series
 from edp.networks.losses import Prediction
 from edp.networks.predictor import Predictor
-from edp.networks.running import answered_pieces, stream_answers
+from edp.networks.running import answer_pieces, stream_answers
 from edp.signals import KINDS
 from edp.training.spec import TrainingSpec
 
@@ -34,7 +34,7 @@ def validation_scores(
     # Double precision: sums over hours of ticks in float32 lose the digits in which epochs differ.
     scale = net.code.width.detach().cpu().double()
     factors = torch.tensor([KINDS[kind].report_factor for kind in data.target_kinds], dtype=torch.float64)
-    series = judged_stretches(net, series, spec)
+    series = select_evaluated(net, series, spec)
     absolute, count, loss = torch.zeros(len(series), *scale.shape, dtype=torch.float64), 0, [0.0] * len(series)
     for i, answer, target in _answers(net, series, spec, windowed):
         absolute[i] += (answer.center - target).abs().sum(dim=(0, 1))
@@ -44,7 +44,7 @@ def validation_scores(
     return float(mean.mean()), float((mean * scale * factors).mean()), sum(loss) / max(1, count)
 
 
-def judged_stretches(net: Predictor, series: Sequence[Series], spec: TrainingSpec) -> list[Series]:
+def select_evaluated(net: Predictor, series: Sequence[Series], spec: TrainingSpec) -> list[Series]:
     """Return the data that evaluate epochs: the series, or evenly spaced segments beyond `MOST_VALIDATED` samples.
 
     Else an epoch of a fixed number of updates would take hours to judge where the store is large.
@@ -56,7 +56,7 @@ def judged_stretches(net: Predictor, series: Sequence[Series], spec: TrainingSpe
 def calibrate(net: Predictor, series: Sequence[Series], spec: TrainingSpec) -> None:
     """Scale the intervals of a network so that they contain their fraction of `series`."""
     answers, targets = [], []
-    for _, answer, target in _answers(net, judged_stretches(net, series, spec), spec, windowed=False):
+    for _, answer, target in _answers(net, select_evaluated(net, series, spec), spec, windowed=False):
         answers.append(answer)
         targets.append(target)
     answer = replace(
@@ -83,7 +83,7 @@ def _answers(
             ticks = slice(skip, skip + target.shape[1])
             yield i, replace(answer, center=answer.center[:, ticks], spread=answer.spread[:, ticks]), target
         return
-    for i, start, answer, features in answered_pieces(net, series):
+    for i, start, answer, features in answer_pieces(net, series):
         part = series[i]
         first, stop = max(start, skip), min(start + features.shape[1], part.samples - net.task.max_horizon)
         if first < stop:

@@ -42,7 +42,7 @@ def footprint_of(path: str | Path, budget: Budget | None = None) -> tuple[Footpr
     if budget is not None:
         alone = replace(predictor.spec, blocks=(), physics=None)
         # One unit without blocks is the smallest network of these inputs: if it is too large, all are.
-        check_possible(budget, footprint(_untrained(student(alone, units=1), predictor.task)))
+        check_possible(budget, footprint(_build_untrained(student(alone, units=1), predictor.task)))
     return footprint(predictor, adaptation), name
 
 
@@ -63,11 +63,11 @@ def _predictor_of(path: str | Path) -> tuple[Predictor, str, Adaptation | None]:
         experiment = load_experiment(source)
         # A settings file names no rate; counts do not depend on it, so the thesis's 100 Hz stands in.
         task = experiment.task.resolve(100.0, physics=experiment.model.physics)
-        return _untrained(experiment.model, task), source.stem, None
+        return _build_untrained(experiment.model, task), source.stem, None
     bundle = load_bundle(source)
     predictor = bundle.predictor
     # Integer networks have the counts of the network that they were quantised from.
-    counted = predictor.in_float() if isinstance(predictor, IntegerPredictor) else predictor
+    counted = predictor.to_float_network() if isinstance(predictor, IntegerPredictor) else predictor
     return counted, describe(predictor.spec), bundle.adaptation
 
 
@@ -98,10 +98,10 @@ def export_bundle(
         EdpError: not a bundle, an unknown form or option, or a network or name that this form cannot hold.
     """
     target, bundle = make_target(to, options), load_exported(path)
-    return target.write(bundle if calibration is None else in_integers(bundle, calibration), name, Path(folder))
+    return target.write(bundle if calibration is None else quantise_twin(bundle, calibration), name, Path(folder))
 
 
-def in_integers(bundle: Bundle, calibration: DataSource) -> Bundle:
+def quantise_twin(bundle: Bundle, calibration: DataSource) -> Bundle:
     """Return a twin whose cell computes in W8A16; complete recordings determine formats and weights.
 
     Raises:
@@ -132,5 +132,5 @@ def unheld_adaptation(path: str | Path, to: str) -> bool:
     return load_exported(path).adaptation is not None and not getattr(TARGETS[to], "adapts", False)
 
 
-def _untrained(model: ModelSpec, task: Any) -> Predictor:
+def _build_untrained(model: ModelSpec, task: Any) -> Predictor:
     return build_model(task, model, blank_scaler(task), seed=0)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from edp.data.prepared import Prepared
 from edp.data.spread_rows import spread_series
-from edp.logs.drawn import Drawn, checked_hours, drawn_recordings
+from edp.logs.drawn import Drawn, check_hours, draw_recordings
 from edp.recording import STRETCH_S, Recording
 from edp.training.bundle import Bundle
 
@@ -29,10 +29,10 @@ def judged_data(
     hour, length = 3600.0 * bundle.task.rate_hz, round(STRETCH_S * bundle.task.rate_hz)
     lengths = [part.samples for part in (data.test if others is None else others)]
     whole = sum(lengths)
-    most = whole if at_most_h is None else max(1, round(hour * checked_hours(at_most_h)))
+    most = whole if at_most_h is None else max(1, round(hour * check_hours(at_most_h)))
     if others is not None:
         # Before they are made inputs and targets: of a store only what is judged is read.
-        chosen = others if at_most_h is None else drawn_recordings(others, at_most_h)
+        chosen = others if at_most_h is None else draw_recordings(others, at_most_h)
         data = replace(data, test=[bundle.task.series(recording) for recording in chosen])
     elif whole > most:
         data = replace(data, test=spread_series(data.test, length, most, on_disk=True))

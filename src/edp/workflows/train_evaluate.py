@@ -14,7 +14,7 @@ import torch
 from safetensors.numpy import save
 
 from edp.config.experiment import Experiment, build, experiment_toml, load_experiment, plain_tree
-from edp.data.frozen import frozen_of, refuse_frozen
+from edp.data.frozen import list_frozen, refuse_frozen
 from edp.data.prepared import Prepared, prepare
 from edp.errors import DataError
 from edp.evaluation.channel_importance import ChannelImportances, ChannelImportanceSpec, measure_channel_importance
@@ -26,12 +26,12 @@ from edp.evaluation.judge import (
     JudgedPart,
     JudgeSpec,
     ModelBench,
-    by_effort,
     check_scored,
     first_scored,
     judge,
     network_parts,
     score_network,
+    sort_by_effort,
 )
 from edp.evaluation.scores_file import PREDICTIONS, DrawnSample, ModelScores, ScoresFile, earlier_scores
 from edp.jobs import IN_PROCESS, Workers
@@ -89,7 +89,7 @@ def prepare_data(source: RecordingSource, experiment: Experiment, frozen: Mappin
     """
     recordings = source.read()
     # Sessions that this split freezes itself are allowed to stay in its test part.
-    others = {key: name for key, name in (frozen or {}).items() if key not in frozen_of(experiment.split)}
+    others = {key: name for key, name in (frozen or {}).items() if key not in list_frozen(experiment.split)}
     refuse_frozen(recordings, others, "would be divided into training and test part")
     first = recordings[0]
     task = experiment.task.resolve(first.rate_hz, first.channel_names, experiment.model.physics)
@@ -160,10 +160,10 @@ def train(
             if end.fitted is not None:
                 # Without weights from before the divergence there is nothing to keep.
                 provenance = _provenance(source, experiment, data, end.fitted.seconds, frozen)
-                _keep(run, end.fitted, provenance.with_entries(**taught, diverged=str(end)), data)
+                _keep(run, end.fitted, provenance.add_entries(**taught, diverged=str(end)), data)
             run.write_status("diverged", message=str(end), **end.facts)
             raise
-        provenance = _provenance(source, experiment, data, fitted.seconds, frozen).with_entries(**taught)
+        provenance = _provenance(source, experiment, data, fitted.seconds, frozen).add_entries(**taught)
         return _keep(run, fitted, provenance, data)
 
 
@@ -182,7 +182,7 @@ def keep_fitted(
     """
     run.write_settings(experiment_toml(experiment))
     run.write_history(fitted.history)
-    provenance = _provenance(source, experiment, data, fitted.seconds, {}).with_entries(**facts)
+    provenance = _provenance(source, experiment, data, fitted.seconds, {}).add_entries(**facts)
     return _keep(run, fitted, provenance, data)
 
 
@@ -213,9 +213,9 @@ def _provenance(
     source: DataSource, experiment: Experiment, data: Prepared, seconds: float, frozen: Mapping[str, str]
 ) -> Provenance:
     training = experiment.training
-    sealed = {**frozen, **frozen_of(experiment.split)}
+    sealed = {**frozen, **list_frozen(experiment.split)}
     provenance = training_provenance(source, data, training.seed, thread_count(training), seconds, sealed)
-    return provenance.with_entries(regime=training.chunks.regime, device=training.device)
+    return provenance.add_entries(regime=training.chunks.regime, device=training.device)
 
 
 @one_blas_thread()
@@ -247,7 +247,7 @@ def evaluate(
     """
     folder = Path(run)
     _check_run_writable(folder)
-    bundle, experiment, provenance, data = trained_run(folder)
+    bundle, experiment, provenance, data = read_trained_run(folder)
     target, judged, others = folder, [data.digest], other_recordings(source, provenance)
     if source is not None:
         # Content by name and digest: the same file changed is another judgement.
@@ -296,7 +296,7 @@ def _evaluate_models(
 ) -> Evaluation:
     """Evaluate the network in parts, and every baseline, as units of work."""
     parts = network_parts(bench.data)
-    names = by_effort(bench.spec.baselines)
+    names = sort_by_effort(bench.spec.baselines)
     where = {"run": at} | ({"bench": bench} if workers.are_alone else {})
     folder = Path(at.run)
     units = [
@@ -343,7 +343,7 @@ def evaluate_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithS
 @lru_cache(maxsize=1)
 def _open_bench(evaluated_run: EvaluatedRun, digest: str, spec: JudgeSpec) -> ModelBench:
     """Return a run with its data, read once for all units of a process; `digest` is that of the data."""
-    bundle, _, provenance, data = trained_run(Path(evaluated_run.run))
+    bundle, _, provenance, data = read_trained_run(Path(evaluated_run.run))
     other = json.loads(evaluated_run.source)
     others = other_recordings(None if other is None else DataSource.from_plain(other), provenance)
     data, _ = judged_data(bundle, data, others, evaluated_run.at_most_h)
@@ -361,7 +361,7 @@ def _check_run_writable(folder: Path) -> None:
         check_writable(folder)
 
 
-def trained_run(folder: Path) -> tuple[Bundle, Experiment, Provenance, Prepared]:
+def read_trained_run(folder: Path) -> tuple[Bundle, Experiment, Provenance, Prepared]:
     """Return bundle, settings, provenance and data of a run, after a check that the data are those of its training.
 
     Raises:
@@ -401,7 +401,7 @@ def channel_importance(
     """
     folder = Path(run)
     _check_run_writable(folder)
-    bundle, _, provenance, data = trained_run(folder)
+    bundle, _, provenance, data = read_trained_run(folder)
     target = folder
     data, _ = judged_data(bundle, data, other_recordings(source, provenance), at_most_h)
     if source is not None:
@@ -445,7 +445,7 @@ __all__ = [
     "evaluate",
     "judge_bundle",
     "prepare_data",
+    "read_trained_run",
     "simulate_data_set",
     "train",
-    "trained_run",
 ]

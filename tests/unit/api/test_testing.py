@@ -23,7 +23,7 @@ from edp.networks.losses.base import Penalty
 from edp.networks.streaming import Cost, Streaming
 from edp.registry import Registry
 from edp.signals import Kind
-from edp.workflows.search.modules import MODULES, fitting, with_modules
+from edp.workflows.search.modules import MODULES, add_modules, fitting
 
 
 def entered(monkeypatch, registry: Registry, name: str, part: object) -> object:
@@ -99,7 +99,7 @@ def test_a_sound_block_of_a_third_party_passes(monkeypatch):
     assert MODULES["gain"].options == {"strength": [1.0, 2.0]}
     settings = plain_tree(load_experiment(None, "quick", ["model.blocks=[]"]))
     assert fitting(settings)[-1] == "gain"
-    assert with_modules(settings, ["gain"])["model"]["blocks"] == [{"kind": "gain"}]
+    assert add_modules(settings, ["gain"])["model"]["blocks"] == [{"kind": "gain"}]
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from edp.logs.source import DataSource
 from edp.signals import TABLE_A1
 from edp.storage import read_json
 from edp.training import load_bundle
-from edp.workflows.parity import recorded_case
+from edp.workflows.parity import record_case
 
 LIMIT = [w for s in ("moments=4", "branches=4", "horizons=[1,10]") for w in ("--set", f"limit.{s}")]
 COMMANDS = [command.name for command in app.registered_commands]
@@ -189,8 +189,8 @@ def test_several_logs_are_judged_together_in_a_folder_of_their_own(edp, logs, tr
 
 def test_the_reference_recording_of_parity_is_a_part_of_each_log(logs, trained):
     bundle, paths = load_bundle(trained), [logs / "drive_1.parquet", logs / "drive_2.parquet"]
-    case = recorded_case(bundle, DataSource.of(paths), 61)
-    parts = [recorded_case(bundle, DataSource.of(path), ticks) for path, ticks in zip(paths, (31, 30), strict=True)]
+    case = record_case(bundle, DataSource.of(paths), 61)
+    parts = [record_case(bundle, DataSource.of(path), ticks) for path, ticks in zip(paths, (31, 30), strict=True)]
     assert np.array_equal(case.inputs, np.concatenate([part.inputs for part in parts]))
 
 

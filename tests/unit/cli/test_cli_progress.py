@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from edp.cli import console
-from edp.cli.console import BoundedProgress, Steps, TimeLeft, count_text, left_text, progress
+from edp.cli.console import BoundedProgress, Steps, TimeLeft, count_text, format_time_left, progress
 from edp.cli.progress import Display, StageDisplay
 from edp.cli.screen import ScreeningDisplay
 from edp.training import TrainingProgress
@@ -187,9 +187,9 @@ def test_notes_of_a_command_replace_each_other(capsys):
 
 
 def test_time_left_and_counts_of_a_plan():
-    assert [left_text(s) for s in (0.0, -3.0, float("nan"), float("inf"))] == [""] * 4
-    assert left_text(0.2) == ", 1 s left"
-    assert left_text(75.0) == ", 1 min 15 s left"
+    assert [format_time_left(s) for s in (0.0, -3.0, float("nan"), float("inf"))] == [""] * 4
+    assert format_time_left(0.2) == ", 1 s left"
+    assert format_time_left(75.0) == ", 1 min 15 s left"
     assert (count_text(2, 3), count_text(3, 3, "/"), count_text(4, 3)) == (
         "2 of 3",
         "3/3",

@@ -15,7 +15,7 @@ from edp.errors import ConfigError
 from edp.sim.excitation.levers import speed_table
 from edp.sim.machine.machine_files import load_machine
 from edp.workflows.control import ControlBench, ControlSources, TuningSpec, tune_gains
-from edp.workflows.control.transfer_of_tuning import TransferSpec, TuningTransfer, costs_of, drawn_settings
+from edp.workflows.control.transfer_of_tuning import TransferSpec, TuningTransfer, costs_of, draw_settings
 from edp.workflows.control.tune_gains import TUNING_SEED
 
 
@@ -39,7 +39,7 @@ def test_correlation_and_regret_are_those_of_the_ranks():
 
 def test_settings_are_drawn_from_the_space_by_their_seed():
     spec = CONTROLLERS["pi"]()
-    first, again, other = (drawn_settings(spec, TransferSpec(20, seed)) for seed in (1, 1, 2))
+    first, again, other = (draw_settings(spec, TransferSpec(20, seed)) for seed in (1, 1, 2))
     assert first == again != other
     for name, (low, high) in spec.space.items():
         values = [getattr(setting, name) for setting in first]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edp.data.twin_channels import twin_channels
-from edp.evaluation.beyond import beyond_sentence, command_ranges, commands_beyond
+from edp.evaluation.beyond import command_ranges, commands_beyond, describe_excess
 from edp.testing.twins import sample_actuators
 
 
@@ -30,8 +30,8 @@ def test_only_commands_that_leave_their_range_by_more_than_noise_are_named(machi
     assert set(found) == {"lever_2"}
     assert found["lever_2"].share == pytest.approx(10 / len(inputs))
     assert found["lever_2"].largest == pytest.approx(high + 0.5)
-    assert "lever_2" in beyond_sentence(found)
-    assert beyond_sentence({}) == ""
+    assert "lever_2" in describe_excess(found)
+    assert describe_excess({}) == ""
 
 
 def test_a_twin_that_went_on_knows_the_commands_of_both(machine):

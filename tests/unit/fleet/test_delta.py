@@ -13,7 +13,7 @@ from edp.networks.predictor import ModelSpec
 from edp.storage import write_bytes
 from edp.testing.networks import small_network, small_task
 from edp.training.bundle import weights_digest
-from edp.training.delta import Scaled, delta_from_bytes, delta_of, read_delta, with_delta
+from edp.training.delta import Scaled, apply_delta, delta_from_bytes, delta_of, read_delta
 
 MODEL, OTHER = (ModelSpec(backbone=LstmSpec(units=units)) for units in (24, 8))
 
@@ -47,15 +47,15 @@ def test_a_delta_brings_the_fine_tuned_network_back_within_its_bytes(networks, t
         assert (tmp_path / "c14.delta").stat().st_size <= most
         again = read_delta(tmp_path / "c14.delta")
         assert again.facts == {"machine": "C14 no. 3"}
-        network = with_delta(base, again)
+        network = apply_delta(base, again)
         assert apart(network, tuned) < {12_000: 1.0, 40_000: 0.02}[most] * apart(base, tuned)
-        assert weights_digest(network) == weights_digest(with_delta(base, delta))
+        assert weights_digest(network) == weights_digest(apply_delta(base, delta))
     assert weights_digest(base) == before
 
 
 def test_more_bytes_bring_it_nearer(networks):
     base, tuned = networks
-    far = [apart(with_delta(base, delta_of(base, tuned, {}, most)), tuned) for most in (8_500, 12_000, 200_000)]
+    far = [apart(apply_delta(base, delta_of(base, tuned, {}, most)), tuned) for most in (8_500, 12_000, 200_000)]
     assert far[0] > far[1] > far[2]
 
 
@@ -65,13 +65,13 @@ def test_what_did_not_change_takes_no_room(networks):
     assert not delta.vectors
     assert not delta.whole
     assert not delta.narrow
-    assert weights_digest(with_delta(base, delta)) == weights_digest(base)
+    assert weights_digest(apply_delta(base, delta)) == weights_digest(base)
 
 
 def test_a_delta_of_another_network_is_refused(networks):
     base, tuned = networks
     with pytest.raises(BundleError, match=r"is a change of the network .* give the network that the fleet"):
-        with_delta(tuned, delta_of(base, tuned))
+        apply_delta(tuned, delta_of(base, tuned))
     with pytest.raises(BundleError, match="of the same parts"):
         delta_of(base, small_network(OTHER, small_task(OTHER)))
     with pytest.raises(BundleError, match="do not hold the changed vectors"):
@@ -101,4 +101,4 @@ def test_factors_of_a_product_beyond_the_network_are_refused_before_they_are_mul
     long = Scaled.of(np.ones((1, 1_000_000)))
     hostile = replace(delta, narrow={name: (long, long)})
     with pytest.raises(BundleError, match="in another shape"):
-        with_delta(base, delta_from_bytes(hostile.to_bytes(), "hostile"))
+        apply_delta(base, delta_from_bytes(hostile.to_bytes(), "hostile"))

@@ -26,7 +26,7 @@ from edp.training.identification.bodies import (
     solve_base,
 )
 from edp.training.identification.elements import check_strokes, excavator_elements, full_commands
-from edp.training.identification.machine_numbers import MACHINE_NUMBERS, guesses, with_values
+from edp.training.identification.machine_numbers import MACHINE_NUMBERS, guesses, set_values
 from edp.training.identification.machine_text import machine_text
 from edp.training.identification.mapping import GreyParts, grey_numbers
 from edp.training.identification.parametrisation import (
@@ -62,7 +62,7 @@ def other_machine(seed=0):
     )
     # A pump that is asked for more than all gives no more.
     shift = [-abs(s) if "pump_demand" in n.key else s for n, s in zip(MACHINE_NUMBERS, shift, strict=True)]
-    return with_values(M22, guesses(M22) * np.exp(0.3 * np.array(shift)))
+    return set_values(M22, guesses(M22) * np.exp(0.3 * np.array(shift)))
 
 
 @pytest.mark.long

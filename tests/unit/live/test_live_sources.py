@@ -14,7 +14,7 @@ from small_monitors import fitted_monitor
 
 from edp.control.plants import TwinEnvironment
 from edp.errors import ConfigError, DataError
-from edp.logs.units import mapped_channel
+from edp.logs.units import channel_from_entry
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
 from edp.networks.stream import Stream
@@ -355,7 +355,7 @@ def test_a_stream_that_stops_goes_back_or_changes_its_rate_is_told(datagrams):
 
 def test_a_map_gives_names_and_units_to_columns():
     signal_map = SignalMap(channels=(ChannelMap("CylVels_1", "v", unit="mm/s"), ChannelMap("idle", "", constant=3.0)))
-    source = UdpSource(0, 100.0, tuple(mapped_channel(entry) for entry in signal_map.channels), signal_map)
+    source = UdpSource(0, 100.0, tuple(channel_from_entry(entry) for entry in signal_map.channels), signal_map)
     assert source._row({"v": 250.0}).tolist() == [0.25, 3.0]
     with pytest.raises(ConfigError, match=r"--udp \d+: cannot listen"):
         UdpSource(source.port, 100.0, source.channels)

@@ -17,7 +17,7 @@ from edp.signals import VOCABULARY
 from edp.sim import Scenario, simulate
 from edp.workflows.monitor import build_dictionary, fit_to_recordings
 from edp.workflows.monitor.dictionary import machine_of
-from edp.workflows.monitor.fault_sessions import cases_of, fault_classes, mirrors, noise_of, simulated, with_noise
+from edp.workflows.monitor.fault_sessions import add_noise, cases_of, fault_classes, mirrors, noise_of, simulated
 from edp.workflows.monitor.report_monitor import read_alarms, read_run
 
 KINDS = ("velocity_bias", "velocities_swapped")
@@ -49,7 +49,7 @@ def test_a_fault_session_is_its_sound_twin_before_the_onset_and_with_sensor_faul
 def test_noise_of_a_log_is_measured_and_added():
     recording = simulate(Scenario(duration_s=12.0, seed=3))
     assert noise_of(recording, ["CylStroke_1"])["CylStroke_1"] < 2e-5
-    noisy = with_noise(recording, {"CylStroke_1": 1e-4, "CylStroke_2": 0.0}, [1])
+    noisy = add_noise(recording, {"CylStroke_1": 1e-4, "CylStroke_2": 0.0}, [1])
     assert noise_of(noisy, ["CylStroke_1"])["CylStroke_1"] == pytest.approx(1e-4, rel=0.2)
     assert np.array_equal(noisy.column("CylStroke_2"), recording.column("CylStroke_2"))
 

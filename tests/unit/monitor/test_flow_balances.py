@@ -10,7 +10,7 @@ from edp.monitor.residuals import RESIDUALS, FitMaterial
 from edp.monitor.residuals.base import SourceParts, residuals_of
 from edp.monitor.residuals.flow_balances import FlowBalances, FlowBalancesSpec
 from edp.monitor.residuals.flow_curves import KNOTS, hats, opened, played
-from edp.monitor.residuals.groups import sensed_channels
+from edp.monitor.residuals.groups import select_sensed
 from edp.recording import Recording
 from edp.sim import Scenario, simulate
 from edp.wording import figure
@@ -25,7 +25,7 @@ def session(seed, faults=(), seconds=40.0):
 
 
 def material(sessions):
-    return FitMaterial(sessions[:-1], sessions[-1:], sensed_channels(sessions[0].channels), sessions[0].rate_hz)
+    return FitMaterial(sessions[:-1], sessions[-1:], select_sensed(sessions[0].channels), sessions[0].rate_hz)
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +138,7 @@ def test_a_damaged_file_is_refused(source):
 
 def test_a_machine_without_pressures_has_none():
     sessions = [session(seed, seconds=5.0) for seed in range(2)]
-    few = [one for one in sensed_channels(sessions[0].channels) if not one.name.startswith("CylPressures")]
+    few = [one for one in select_sensed(sessions[0].channels) if not one.name.startswith("CylPressures")]
     assert SPEC.fit(FitMaterial(sessions[:1], sessions[1:], tuple(few), sessions[0].rate_hz)) is None
 
 

@@ -11,7 +11,7 @@ from edp.monitor.residuals import FitMaterial
 from edp.monitor.residuals.balances import BalancesSpec
 from edp.monitor.residuals.base import residuals_of
 from edp.monitor.residuals.look_ahead import LookAheadSpec
-from edp.monitor.watches import LEAST_GROSS, BankSpec, WatchSpec, fit_watch, scaled_alike
+from edp.monitor.watches import LEAST_GROSS, BankSpec, WatchSpec, fit_watch, scale_watches
 from edp.recording import Recording
 from edp.signals import VOCABULARY
 from edp.testing.monitor import rig_sessions
@@ -81,7 +81,7 @@ def test_a_reserve_keeps_a_view_away_from_the_limit():
     sessions = list(rng.normal(size=(6, 100, 2)))
     specs = [WatchSpec(detector=CusumSpec(), reserve=reserve) for reserve in (1.0, 1.5)]
     watch = fit_watch(specs[0], sessions, 1.0, 0)
-    near, far = scaled_alike(specs, [watch, watch], [np.tile(watch(rows), 2) for rows in sessions])
+    near, far = scale_watches(specs, [watch, watch], [np.tile(watch(rows), 2) for rows in sessions])
     assert far.scale == pytest.approx(1.5 * near.scale)
 
 

@@ -15,7 +15,7 @@ from edp.networks.predictor import build_model
 from edp.networks.running import mean_error
 from edp.training import load_bundle
 from edp.training.delta import delta_of
-from edp.training.pretraining.methods.codes import WithCodes, coded_block
+from edp.training.pretraining.methods.codes import WithCodes, find_coded_block
 from edp.workflows.pretraining import Pretrain, pretrain
 from edp.workflows.transfer import FinetuneRequest, FinetuneSpec, finetune
 
@@ -52,7 +52,7 @@ def test_a_bundle_holds_the_network_without_the_codes_of_the_machines_that_train
     network = load_bundle(fleet).predictor
     assert any(isinstance(block, MachineCode) for block in network.spec.blocks)
     assert not any("table" in name for name in network.state_dict())
-    assert not coded_block(network).machine_code.any()
+    assert not find_coded_block(network).machine_code.any()
 
 
 def test_a_source_without_a_code_is_refused(machines, experiment, tmp_path):
@@ -96,7 +96,7 @@ def test_a_stream_has_the_code_of_its_machine_or_none_from_its_start_to_its_end(
     series = strategy.series(data.task, data.train)
     assert [part.machine for part in series] == [part.machine for part in data.train]
     strategy.begin(network, experiment.training)
-    block, seen = coded_block(network), set()
+    block, seen = find_coded_block(network), set()
     table = block.table.detach().view(strategy.machines, -1)
     sampler = ChunkSampler(series, data.task.horizons, dataclasses.replace(experiment.training.chunks, carried=3), 0)
     unknown = None

@@ -16,7 +16,7 @@ from edp.report.fleet.page import build_fleet_page
 from edp.storage import write_json
 from edp.training import load_bundle
 from edp.training.bundle import weights_digest
-from edp.training.delta import read_delta, with_delta
+from edp.training.delta import apply_delta, read_delta
 from edp.workflows.fleet import personal
 from edp.workflows.fleet.judge_fleet import PAGE, FleetQuestion, drift_of, report_fleet
 from edp.workflows.fleet.personal import PersonalOrder, finetune_fleet, network_of, read_fleet
@@ -85,7 +85,7 @@ def test_a_machine_that_is_done_is_not_done_again(own, run, store, monkeypatch, 
 def test_the_network_of_one_machine_is_a_bundle(own, run, tmp_path):
     folder = network_of(own, "Press-3", tmp_path / "press3")
     row = read_fleet(own).machines[3]
-    wanted = with_delta(load_bundle(run).predictor, read_delta(own / row.delta))
+    wanted = apply_delta(load_bundle(run).predictor, read_delta(own / row.delta))
     assert weights_digest(load_bundle(folder).predictor) == weights_digest(wanted)
     with pytest.raises(ConfigError, match=r"no machine 'Press-9'.*Press-"):
         network_of(own, "Press-9", tmp_path / "no")

@@ -46,7 +46,7 @@ def arm(tmp_path):
 def test_cells_of_structs_become_a_recording_each_and_those_named_val_test(arm, tmp_path):
     proposal = propose(arm)
     assert proposal.targets == ("y_1", "y_2")
-    assert {guess.column for guess in proposal.proposal.of_role("command")} == {"u_1", "u_2"}
+    assert {guess.column for guess in proposal.proposal.select_role("command")} == {"u_1", "u_2"}
     assert any("7 experiments" in note and "2 test" in note for note in proposal.notes)
     write_proposal(proposal, tmp_path / "out")
     data = DataSource.of(tmp_path / "out" / "data.toml")

@@ -111,7 +111,7 @@ def test_a_proposal_for_logs_that_move_one_lever_each(tmp_path):
     proposal = propose(logs)
     assert not proposal.broken
     assert (proposal.proposal.clock.column, proposal.proposal.clock.unit) == ("t", "ms")
-    assert {guess.column for guess in proposal.proposal.of_role("command")} == {"x1", "y1"}
+    assert {guess.column for guess in proposal.proposal.select_role("command")} == {"x1", "y1"}
     # v_arm moves in one log, v_boom in the other; each is named as the change of a stroke.
     assert set(proposal.targets) == {"v_boom", "v_arm"}
     assert (

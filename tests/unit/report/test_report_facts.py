@@ -15,7 +15,7 @@ from edp.report.run.facts import (
     spread_text,
     verdict_lines,
 )
-from edp.report.run.outputs import judged_line
+from edp.report.run.outputs import describe_evaluation
 from edp.report.run.tables import comparison_tables, key_figures
 from edp.settings.provenance import DataOrigin, DataPart, Provenance
 from edp.storage import write_json
@@ -124,14 +124,14 @@ def test_test_logs_are_named_with_what_they_cannot_prove(run_folder):
         return replace(facts.scores, models={NETWORK: network})
 
     trained = Provenance(data=DataOrigin(train=DataPart(names=("dig_1", "travel_1"))))
-    assert judged_line(scores(), trained) == ""
-    assert "So few that one odd log decides" in judged_line(scores("dig_2", "dig_3"), trained)
-    same = judged_line(scores("dig_2", "dig_3", "dig_4"), trained)
+    assert describe_evaluation(scores(), trained) == ""
+    assert "So few that one odd log decides" in describe_evaluation(scores("dig_2", "dig_3"), trained)
+    same = describe_evaluation(scores("dig_2", "dig_3", "dig_4"), trained)
     assert same == (
         "Judged on 3 test logs: dig_2, dig_3 and dig_4. All are of one kind; the figure says nothing of travel."
     )
-    assert "kind" not in judged_line(scores("dig_2", "dig_3", "travel_4"), trained)
-    assert "and others" in judged_line(scores(*(f"{i}" for i in range(9))), trained)
+    assert "kind" not in describe_evaluation(scores("dig_2", "dig_3", "travel_4"), trained)
+    assert "and others" in describe_evaluation(scores(*(f"{i}" for i in range(9))), trained)
 
 
 def test_verdict_names_what_exceeds_the_budget(run_folder):

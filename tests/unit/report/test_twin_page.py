@@ -21,7 +21,7 @@ from edp.report.twin.page import build_twin_page
 from edp.settings.provenance import Provenance
 from edp.signals import Channel, Kind
 from edp.storage import read_json, write_json
-from edp.workflows.twin.judge_twin import reported_channels, shown_runs, write_scores
+from edp.workflows.twin.judge_twin import describe_channels, select_shown_runs, write_scores
 
 HOSTILE = "</script><img src=x onerror=alert(1)>"
 SPEC = FreeRunJudgeSpec(at_s=(0.2, 1.0), covered_at_s=(0.2, 1.0))
@@ -47,8 +47,8 @@ def judged(strokes=True, name="boom", swing=False, kind=Kind.VELOCITY):
 
 def facts_of(**options):
     scores, runs, intervals = judged(**options)
-    content = FreeRunFile(channels=reported_channels(runs.channels), models=scores)
-    return FreeRunFacts("m22", content, shown_runs(runs, intervals))
+    content = FreeRunFile(channels=describe_channels(runs.channels), models=scores)
+    return FreeRunFacts("m22", content, select_shown_runs(runs, intervals))
 
 
 def grounded(ground, data=None):

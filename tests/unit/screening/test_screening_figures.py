@@ -11,7 +11,7 @@ from edp.data.screening.clusters import clusters_of
 from edp.data.screening.copies import find_copies, rest_related
 from edp.data.screening.forest import Permuted, Rows
 from edp.data.screening.information import Information
-from edp.data.screening.lagged import lagged_covariances
+from edp.data.screening.lagged import compute_lagged_covariances
 from edp.data.screening.linear import RIDGE, gram, peaks, unexplained
 from edp.data.screening.ranks import Kendall, correlation, rank_columns
 from edp.data.screening.spec import ScreeningSpec
@@ -80,7 +80,7 @@ def test_lagged_sums_equal_scipys_correlate_over_stretches_of_any_length() -> No
         for lengths in ((1501,), (700, 2300), (333, 40))
     ]
     table = table_of(parts)
-    lagged = lagged_covariances(table, 60, shifts=2)
+    lagged = compute_lagged_covariances(table, 60, shifts=2)
     squares = np.zeros(3)
     total = np.zeros((121, 3, 3))
     for stretches in parts:
@@ -103,7 +103,7 @@ def test_a_lag_is_negative_where_the_channel_leads() -> None:
     rng = np.random.default_rng(3)
     command = rng.normal(size=4000)
     answer = np.roll(command, 9)
-    lagged = lagged_covariances(table_of([[np.stack([answer, command], 1).astype(np.float32)]] * 2), 20)
+    lagged = compute_lagged_covariances(table_of([[np.stack([answer, command], 1).astype(np.float32)]] * 2), 20)
     assert lagged.lags[np.abs(lagged.pooled()[:, 1, 0]).argmax()] == -9
 
 
@@ -116,7 +116,7 @@ def test_linear_models_from_lagged_sums_equal_models_from_rows() -> None:
     rng = np.random.default_rng(4)
     x = rng.normal(size=(3000, 3)).cumsum(axis=0).astype(np.float32)
     x -= x.mean(axis=0)
-    lagged = lagged_covariances(table_of([[x], [x[::-1].copy()]]), 30)
+    lagged = compute_lagged_covariances(table_of([[x], [x[::-1].copy()]]), 30)
     sums = _correlations(lagged, np.array([0]))
     taps = [(i, d) for i in range(3) for d in (0, 1, 4)]
     rows = delayed(x / table_of([[x]]).within, taps, 30)
@@ -139,7 +139,7 @@ def test_what_is_left_of_a_channel_shrinks_with_what_explains_it() -> None:
     source = rng.normal(size=6000)
     mixed = np.convolve(source, [0.5, 0.5])[:6000] + 0.1 * rng.normal(size=6000)
     x = np.stack([source, mixed], axis=1).astype(np.float32)
-    sums = lagged_covariances(table_of([[x], [x]]), 20).pooled()
+    sums = compute_lagged_covariances(table_of([[x], [x]]), 20).pooled()
     before, after = unexplained(sums, 1, [(0, 0)], [(0, 1)])
     assert before == pytest.approx(1 - 0.25 / 0.51, abs=0.03)
     assert after == pytest.approx(0.01 / 0.51, abs=0.005)
@@ -152,7 +152,7 @@ def test_a_copy_is_told_from_a_channel_that_only_resembles() -> None:
     copy = np.roll(source, 11) + 0.3 * source.std() * rng.normal(size=20_000)
     answer = lfilter([0.1], [1.0, -0.9], source)
     x = np.stack([source, copy, answer], axis=1).astype(np.float32)
-    sums = lagged_covariances(table_of([[x], [x]]), 40).pooled()
+    sums = compute_lagged_covariances(table_of([[x], [x]]), 40).pooled()
     found = {(pair.copy, pair.source, pair.lag) for pair in find_copies(sums, 0.99)}
     assert (1, 0, 11) in found
     assert not {pair for pair in found if 2 in pair[:2]}
@@ -198,7 +198,7 @@ def test_a_reference_that_a_machine_follows_closely_is_no_copy_of_its_answer() -
     reference = lfilter([0.01], [1.0, -0.99], rng.normal(size=20_000))
     answer = lfilter([0.2], [1.0, -0.8], np.roll(reference, 5)) + 1e-4 * rng.normal(size=20_000)
     x = np.stack([answer, reference], axis=1).astype(np.float32)
-    sums = lagged_covariances(table_of([[x], [x]]), 40).pooled()
+    sums = compute_lagged_covariances(table_of([[x], [x]]), 40).pooled()
     lags, best = peaks(sums, -40, 40)
     assert best[1, 0] > 0.99
     assert lags[1, 0] < -5

@@ -37,7 +37,7 @@ from edp.workflows.search.runner import Resources, run_search
 from edp.workflows.search.smaller import Recipe, before, make_smaller
 from edp.workflows.search.study_log import look_at
 from edp.workflows.search.trainings import experiment_of
-from edp.workflows.train_evaluate import evaluate, prepare_data, train, trained_run
+from edp.workflows.train_evaluate import evaluate, prepare_data, read_trained_run, train
 from edp.workflows.transfer.finetune import FinetuneRequest, finetune
 
 CHANGES = (
@@ -186,7 +186,7 @@ def test_no_frozen_session_trains_or_chooses_from_the_study_to_the_compressed_ne
     assert len(seen) > 10
     assert not set(seen) & sealed(study, six_sessions)
     for folder in (run, *study.networks.values(), tmp_path / "student", tmp_path / "w8a16"):
-        data = trained_run(folder)[3]
+        data = read_trained_run(folder)[3]
         assert {s.name for s in data.test} == set(study.context.test)
         assert {s.name for s in data.train} == set(study.context.training)
         assert {s.name for s in data.validation} == set(study.context.validation)

@@ -23,8 +23,8 @@ from edp.storage.ledger import (
     WithState,
     leave_arrival,
     leave_state,
-    left_state,
     read_state,
+    state_path,
 )
 from edp.workflows.search.engine import Dispatcher
 from edp.workflows.search.export import export_study
@@ -238,7 +238,7 @@ def test_a_worker_leaves_a_state_only_of_what_is_done(tmp_path, identity_of):
     for function, status in ((gives_a_state, TrainingStatus.DONE), (gives_a_bad_result, TrainingStatus.DIVERGED)):
         identity = dataclasses.replace(identity_of(0), job=f"{__name__}:{function.__name__}")
         assert perform(identity, {}, str(tmp_path), lambda: None).status == status
-        assert left_state(tmp_path, identity.key).exists() == (status == TrainingStatus.DONE)
+        assert state_path(tmp_path, identity.key).exists() == (status == TrainingStatus.DONE)
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ def strokes(own, depths, x=HEEL_X):
         contact[tm.POINTS + 2], contact[tm.POINTS + 3] = x, top - depth
         contact[tm.HEEL_DEPTH], contact[tm.NORMAL] = depth, 0.0
         # As `engage` asks: within a rut there is nothing to touch.
-        if depth > ground_profile.pressed_at(x, own.heights, own.memory):
+        if depth > ground_profile.rut_depth(x, own.heights, own.memory):
             tm.engage_heel(own.numbers, own.heights, own.memory, contact)
         else:
             own.memory[at.HEEL_SET] = 0.0

@@ -56,7 +56,7 @@ def test_an_episode_is_the_recording_of_its_levers_to_the_bit(scenario):
     shifted[1:, demands], shifted[0, demands] = log[:-1, demands], 0.0
     noise = np.random.default_rng(seeds_of(scenario)[2]) if scenario.sensor_noise else None
     kelvin = log[:, at.LOG_OIL] + 273.15
-    measured = sensors.measured_signals(shifted, simulation.machine, scenario.rate_hz, noise, kelvin)
+    measured = sensors.measure_signals(shifted, simulation.machine, scenario.rate_hz, noise, kelvin)
     truth = sensors.truth_signals(shifted)
 
     env = env_of(scenario, hand=simulation.operator.by_hand)

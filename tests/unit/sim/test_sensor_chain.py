@@ -101,7 +101,7 @@ def test_recordings_are_those_of_whole_columns(logs, name, rate, noisy):
     log, machine = logs[name, rate], load_machine(name)
     for seed in range(3):
         first, second = (np.random.default_rng(seed) if noisy else None for _ in range(2))
-        shown = sensors.measured_signals(log, machine, rate, first, log[:, at.LOG_OIL] + 273.15)
+        shown = sensors.measure_signals(log, machine, rate, first, log[:, at.LOG_OIL] + 273.15)
         plain = plain_chain(log, machine, rate, second)
         # a pilot that is never used stays at 0
         size = np.maximum(np.abs(plain).max(axis=0), 1e-3)
@@ -122,7 +122,7 @@ def test_recordings_are_those_of_whole_columns(logs, name, rate, noisy):
 def test_a_tick_at_a_time_gives_the_bits_of_the_recording(logs, name, rate, noisy, seed, length):
     log, machine = logs[name, rate][:length], load_machine(name)
     kelvin = log[:, at.LOG_OIL] + 273.15
-    whole = sensors.measured_signals(log, machine, rate, np.random.default_rng(seed) if noisy else None, kelvin)
+    whole = sensors.measure_signals(log, machine, rate, np.random.default_rng(seed) if noisy else None, kelvin)
     drawn = draws.draw(machine, length, rate, np.random.default_rng(seed) if noisy else None)
     setup, state = draws.pack_sensors(machine, rate, noisy), chain.new_state(draws.depth(drawn))
     for k in range(length):

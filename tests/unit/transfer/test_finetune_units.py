@@ -13,7 +13,7 @@ from edp.jobs.workers import UNITS
 from edp.networks import running
 from edp.storage import read_json
 from edp.workflows import train_evaluate
-from edp.workflows.train_evaluate import evaluate, trained_run
+from edp.workflows.train_evaluate import evaluate, read_trained_run
 from edp.workflows.transfer import FinetuneRequest, finetune
 
 pytestmark = pytest.mark.processes
@@ -67,7 +67,7 @@ def test_a_network_run_in_parts_has_the_scores_of_one_process(run, target, tmp_p
 
 
 def test_all_models_are_scored_on_the_same_ticks(run):
-    bundle, _, _, data = trained_run(run)
+    bundle, _, _, data = read_trained_run(run)
     assert bundle.predictor.spec.window == 10
     bench = judge.ModelBench(bundle.predictor, data, judge.JudgeSpec(baselines=("ridge_arx",), history=30))
     assert bench.skip == 30

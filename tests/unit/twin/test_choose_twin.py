@@ -25,7 +25,7 @@ from edp.testing.twins import sample_actuators, sample_series, sample_twin
 from edp.training import free_run_members
 from edp.training.fitted_twin import FreeRunProgress
 from edp.training.free_run import FreeRunDiverged, FreeRunSpec
-from edp.training.free_run_members import MemberTraining, fit_members, member_unit, noted_progress
+from edp.training.free_run_members import MemberTraining, fit_members, member_unit, read_progress_notes
 from edp.training.optimizers import AdamW
 from edp.workflows.twin import choose_twin, fit_twin, training_cost
 from edp.workflows.twin.choose_twin import TwinChoice, shortened
@@ -83,7 +83,7 @@ def test_what_cannot_be_fitted_is_left_out_and_says_why(run, monkeypatch):
         choice(run, candidates=("arx",)).best()
 
 
-def judged_by(monkeypatch, errors, behind=1.0):
+def list_evaluated_channels(monkeypatch, errors, behind=1.0):
     """Let a training's errors be those by map and updates; of what was trained, in order, the keys."""
     trained = []
     plain_fit = free_run_members.fit_free_runs
@@ -103,7 +103,7 @@ def judged_by(monkeypatch, errors, behind=1.0):
 @pytest.mark.long
 def test_trainings_get_longer_as_long_as_that_helps_and_the_twin_is_the_average_over_the_folds(run, monkeypatch):
     errors = {(True, 1): 0.9, (False, 1): 0.8, (True, 3): 0.85, (False, 3): 0.6, (False, 9): 0.595}
-    trained = judged_by(monkeypatch, errors)
+    trained = list_evaluated_channels(monkeypatch, errors)
     result, tried = choice(run, candidates=("recurrent",)).best()
     # 0.595 is less than 1 % better than 0.6, so the full length is not tried; of one form the best length is kept.
     assert trained == [key for key in errors for _ in range(5)]
@@ -118,7 +118,7 @@ def test_trainings_get_longer_as_long_as_that_helps_and_the_twin_is_the_average_
 @pytest.mark.long
 def test_a_training_far_behind_the_best_one_is_given_up_after_two_folds(run, monkeypatch):
     errors = {(True, 1): 0.9, (True, 3): 0.95}
-    trained = judged_by(monkeypatch, errors, behind=1.6)
+    trained = list_evaluated_channels(monkeypatch, errors, behind=1.6)
     monkeypatch.setattr(choose_twin, "FAR_BEHIND", 1.5)
     result, tried = choice(run, candidates=("recurrent",)).best()
     # Against a rival nothing else is better here; lengths end with the second one, which helped nobody.
@@ -141,7 +141,7 @@ def test_a_training_far_behind_the_best_one_is_given_up_after_two_folds(run, mon
 @pytest.mark.long
 def test_trainings_that_a_budget_has_no_time_for_are_left_out(run, monkeypatch):
     errors = {(True, 1): 0.9, (False, 1): 0.8, (True, 3): 0.85, (False, 3): 0.6}
-    trained = judged_by(monkeypatch, errors)
+    trained = list_evaluated_channels(monkeypatch, errors)
     # A minute of counted time an update: 1, 1 and 3 fit into six minutes, one more of 3 does not.
     monkeypatch.setattr(choose_twin, "training_seconds", lambda *parts: 60.0 * sum(parts[2].updates))
     _, tried = choice(run, candidates=("recurrent",), minutes=6.0).best()
@@ -371,17 +371,17 @@ def test_trainings_side_by_side_note_how_far_they_are(run):
         member = Recurrent(units=3).member(channels, scales, None, which)
         folder = (run.path / f"member_{which}", "k" * 32)
         jobs.append(MemberTraining(f"member {which}", member, series, series, TINY, folder))
-    assert noted_progress(jobs) is None
+    assert read_progress_notes(jobs) is None
     for job in jobs[:2]:
         list(IN_PROCESS.map([member_unit(job)]))
     (run.path / "member_2").mkdir()
     note = run.path / "member_2" / "progress.json"
     note.write_text("{ half a")  # as it may be read while it is written
-    event = noted_progress(jobs)
+    event = read_progress_notes(jobs)
     assert (event.update, event.updates) == (40, 60)
     assert event.validation > 0.0
     jobs[2] = replace(jobs[2], folder=None)
-    assert noted_progress(jobs).update == 40
+    assert read_progress_notes(jobs).update == 40
 
 
 def test_a_choice_looks_at_its_workers_while_it_waits(run, monkeypatch):
@@ -396,7 +396,7 @@ def test_a_choice_looks_at_its_workers_while_it_waits(run, monkeypatch):
             return iter([])
 
     seen = iter([None, FreeRunProgress(3, 9, 0.1, 1.0, None, False)])
-    monkeypatch.setattr(fit_twin, "noted_progress", lambda jobs: next(seen))
+    monkeypatch.setattr(fit_twin, "read_progress_notes", lambda jobs: next(seen))
     fit = replace(choice(run).fit, workers=Waiting())
     assert list(fit.train_members([], looks.append)) == []
     assert [event.update for event in looks] == [3]

@@ -13,7 +13,7 @@ from edp.logs import write_recording
 from edp.logs.source import DataSource
 from edp.networks.twin import fit_scales
 from edp.networks.twin.recurrent import Recurrent, averaged
-from edp.networks.twin.recurrent_members import scales_for, separated, with_scales
+from edp.networks.twin.recurrent_members import replace_scales, scales_for, separated
 from edp.recording import Recording
 from edp.report.twin.candidates import read_candidates
 from edp.testing.twins import sample_actuators, sample_twin
@@ -109,7 +109,7 @@ def test_members_taken_apart_are_the_average_again(members, valve_map):
     state, same = (one.reset(commands[:, :20], measured[:, :20]) for one in (twin, again))
     answers, others = twin.rollout(commands[:, 20:], state)[0], again.rollout(commands[:, 20:], same)[0]
     assert others == pytest.approx(answers, rel=1e-4, abs=1e-4)
-    with_scales(twin, twin.scales).network.bias.data.add_(1.0)
+    replace_scales(twin, twin.scales).network.bias.data.add_(1.0)
     assert np.array_equal(twin.rollout(commands[:, 20:], state)[0], answers)
 
 
@@ -128,7 +128,7 @@ def test_a_stroke_ends_where_it_came_twice_else_at_the_farther_end(ends, low, hi
     twin, _, _ = sample_twin(Recurrent(units=4, prefix_ticks=20))
     limits = replace(twin.scales, low=twin.scales.low.copy(), high=twin.scales.high.copy())
     limits.low[2:4], limits.high[2:4] = 0.0, 1.0
-    twin = with_scales(twin, limits)
+    twin = replace_scales(twin, limits)
     recording = sample_actuators(ticks=200)
     channels = twin_channels(recording)
     series = []
@@ -150,7 +150,7 @@ def test_one_stay_at_an_outermost_place_is_an_end_stop_where_the_lever_pushes_on
     twin, _, _ = sample_twin(Recurrent(units=4, prefix_ticks=20))
     limits = replace(twin.scales, low=twin.scales.low.copy(), high=twin.scales.high.copy())
     limits.low[2:4], limits.high[2:4] = 0.0, 1.0
-    twin = with_scales(twin, limits)
+    twin = replace_scales(twin, limits)
     channels = twin_channels(sample_actuators(ticks=300))
     whole = channels.task().series(sample_actuators(ticks=300))
     inputs, targets = whole.inputs.copy(), whole.targets.copy()

@@ -42,13 +42,13 @@ def trains_nothing(monkeypatch):
 def with_part(monkeypatch, part, change):
     """Let `train_twin` see another part of the data."""
     module = sys.modules["edp.workflows.twin.train_twin"]
-    prepared = module.prepared_twin
+    prepared = module.cut_recordings
 
     def changed(recordings, experiment):
         channels, data = prepared(recordings, experiment)
         return channels, replace(data, **{part: [change(series, channels) for series in getattr(data, part)]})
 
-    monkeypatch.setattr(module, "prepared_twin", changed)
+    monkeypatch.setattr(module, "cut_recordings", changed)
 
 
 def moved(series, channels):
@@ -112,13 +112,13 @@ def front_logs(folder):
 def test_identify_refuses_a_test_part_without_a_start_at_once(
     identifies_nothing, monkeypatch, tmp_path, change, message
 ):
-    prepared = identifies_nothing.prepared_twin
+    prepared = identifies_nothing.cut_recordings
 
     def changed(recordings, experiment):
         channels, data = prepared(recordings, experiment)
         return channels, replace(data, test=[change(series, channels) for series in data.test])
 
-    monkeypatch.setattr(identifies_nothing, "prepared_twin", changed)
+    monkeypatch.setattr(identifies_nothing, "cut_recordings", changed)
     # Strokes of the machine are checked apart.
     monkeypatch.setattr(identifies_nothing, "_check_strokes", lambda *args: None)
     with pytest.raises(DataError, match=message):

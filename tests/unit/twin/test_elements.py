@@ -29,7 +29,7 @@ def tanks():
     targets = np.stack([rng.normal(0, 0.05, 150), rng.uniform(0, 10, 150)], axis=1).astype(np.float32)
     scales = fit_scales(CHANNELS, [Series("scales", pump, targets)])
     twin = TANKS.start(CHANNELS, scales, [], 0)
-    true = twin.with_numbers(np.array([0.02, 0.2, 0.04, 0.6, 0.5, 0.05, 0.5, 0.04, 0.55, 10.0, 0.1]))
+    true = twin.with_parameters(np.array([0.02, 0.2, 0.04, 0.6, 0.5, 0.05, 0.5, 0.04, 0.55, 10.0, 0.1]))
     answers, _ = true.rollout(pump[None, :-1], true.initial_state(pump[:1], np.array([[0.0, 5.0]], np.float32)))
     rows = np.concatenate([[[0.0, 5.0]], answers[0]]).astype(np.float32)
     series = Series("run", pump, rows)

@@ -8,7 +8,7 @@ from sample_scores import sample_errors, sample_free_run_scores
 
 from edp.data.twin_channels import TwinChannels
 from edp.errors import DataError
-from edp.evaluation.ahead import ahead_scores, look_ahead, predictor_scores
+from edp.evaluation.ahead import look_ahead, predictor_scores, score_ahead
 from edp.evaluation.free_run import FreeRunJudgeSpec, FreeRuns, free_run_scores, free_runs
 from edp.evaluation.guard import twin_beaten_by
 from edp.networks.twin.static_map import StaticMap
@@ -188,7 +188,7 @@ def test_a_look_ahead_is_measured_up_to_its_moment_and_told_the_commands_after_i
     place = counts[0] + 50
     np.testing.assert_allclose(ahead.answers[place], expected[0, -1], rtol=1e-4, atol=1e-6)
     assert np.array_equal(ahead.truth[place], part.targets[at + 7])
-    scores = plain_value(ahead_scores(ahead))
+    scores = plain_value(score_ahead(ahead))
     errors = np.abs(ahead.answers - ahead.truth).mean(axis=0)
     assert scores["velocity_mae"]["mean"] == pytest.approx(1e3 * errors[:2].mean(), rel=1e-4)
     assert scores["stroke_error"]["by_channel"]["stroke_2"] == pytest.approx(1e3 * errors[3], rel=1e-4)

@@ -12,7 +12,7 @@ from edp.networks.twin.recurrent import Recurrent
 from edp.networks.twin.windows import MeasuredWindows, random_windows
 from edp.storage.runs import KeyedRun, Run
 from edp.testing.twins import sample_series
-from edp.training.free_run import FreeRunDiverged, FreeRunSpec, fit_free_runs, measured_ports
+from edp.training.free_run import FreeRunDiverged, FreeRunSpec, draw_measured_ports, fit_free_runs
 from edp.training.optimizers import AdamW, Soap
 
 SMALL = {"lanes": 16, "lengths_s": (0.2, 1.0), "updates": (150, 100), "validate_every": 50, "validation_s": 5.0}
@@ -119,7 +119,7 @@ def test_stretches_lie_within_recordings_and_begin_everywhere(data):
 
 def test_ports_are_measured_by_their_shares():
     spec = FreeRunSpec(measured_share=0.25, mixed_share=0.25)
-    ports = measured_ports(spec, (30, 4000, 6), 10, np.random.default_rng(0))
+    ports = draw_measured_ports(spec, (30, 4000, 6), 10, np.random.default_rng(0))
     assert (ports[0] == 1).all()
     later = ports[10:]
     assert (later == later[:1]).all()

@@ -52,7 +52,7 @@ def bench():
     twin = BENCH.start(channels, fit_scales(channels, levers), levers, 0)
     table, numbers = twin.table, twin.table.nominal
     numbers[table.inertia_at], numbers[table.potential_at] = 0.07, 0.01  # 4.9 t, 20 kN
-    machine = twin.with_numbers(numbers)
+    machine = twin.with_parameters(numbers)
     start = np.tile(np.array([0.0, 0.5, 5e6, 5e6, 5e6], np.float32), (len(levers), 1))
     commands = np.stack([series.inputs for series in levers])
     state = machine.initial_state(commands[:, 0], start)
@@ -122,7 +122,7 @@ def test_a_fit_finds_a_machine_again(bench):
         which = [number.name for number in table.numbers].index(name)
         begin[which] *= np.exp(rng.choice([-0.4, 0.4]))
     before = errors(machine, begin, runs[3], (50, 300, 500), False, ticks=60)[2].sum()
-    result = fit_grey_box(machine.with_numbers(begin), runs[:2], runs[2:3], seed=0)
+    result = fit_grey_box(machine.with_parameters(begin), runs[:2], runs[2:3], seed=0)
     fitted = result.twin
     after = errors(machine, fitted.numbers, runs[3], (50, 300, 500), False, ticks=60)[2].sum()
     assert after < 0.05 * before
@@ -223,7 +223,7 @@ def test_what_is_left_out_does_nothing_and_is_not_fitted(bench):
     bare = spec.build(machine.channels, scales, {"numbers": machine.numbers.astype(np.float32), "full": machine.full})
     names = [number.name for number in bare.table.numbers]
     numbers = np.where(bare.table.width == 0.0, bare.table.nominal, machine.numbers)
-    bare = bare.with_numbers(numbers)
+    bare = bare.with_parameters(numbers)
     # As little as the equations with the parts in them do when those are out of reach.
     far = machine.numbers.copy()
     for name, value in (("power_limit", 1e4), ("cushion_least", 1.0), ("play", 1e-12)):
@@ -232,7 +232,7 @@ def test_what_is_left_out_does_nothing_and_is_not_fitted(bench):
     start = np.stack([series.targets[0] for series in runs])
     answers, other, whole = (
         twin.rollout(commands, twin.initial_state(commands[:, 0], start))[0]
-        for twin in (bare, machine.with_numbers(far), machine)
+        for twin in (bare, machine.with_parameters(far), machine)
     )
     width = scales.answer_width
     np.testing.assert_allclose(answers / width, other / width, atol=1e-4)

@@ -36,7 +36,7 @@ def twin():
     """Its load is that of M22; everything else plausible."""
     channels, series = front_channels(), [series_of()]
     made = front().start(channels, fit_scales(channels, series), series, 0)
-    return made.with_numbers(made.table.nominal)
+    return made.with_parameters(made.table.nominal)
 
 
 def strokes_and_angles(count, seed=0):

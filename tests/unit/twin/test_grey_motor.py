@@ -62,7 +62,7 @@ def arm(spec=ARM, seed=0):
     numbers[names.index("inertia_root_swing_swing_00")] = 0.015  # 225 kg m^2
     numbers[names.index("inertia_root_swing_swing_10")] = 0.004
     numbers[names.index("inertia_root_swing_ram_00")] = 0.001
-    return twin.with_numbers(numbers), levers[None].astype(np.float32)
+    return twin.with_parameters(numbers), levers[None].astype(np.float32)
 
 
 START = np.array([[0.0, 0.0, 0.5, 0.3, 5e6, 5e6, 5e6, 5e6, 5e6]], np.float32)
@@ -128,7 +128,7 @@ def test_a_motor_turns_without_end_and_its_load_follows_the_strokes_of_others():
     names, numbers = [number.name for number in twin.table.numbers], twin.numbers.copy()
     numbers[names.index("inertia_root_swing_swing_00")] = 0.08
     numbers[names.index("inertia_root_swing_swing_10")] = 0.04
-    heavy = twin.with_numbers(numbers)
+    heavy = twin.with_parameters(numbers)
     out = np.concatenate([START, START]) + np.array([[-0.4], [0.4]], np.float32) * np.eye(9, dtype=np.float32)[2]
     both, _ = heavy.rollout(commands[:1, :300].repeat(2, axis=0), heavy.initial_state(0 * commands[:, 0], out))
     assert both[1, 10:30, 1].mean() < 0.7 * both[0, 10:30, 1].mean()

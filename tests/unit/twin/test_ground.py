@@ -16,7 +16,7 @@ from edp.networks.twin.grey.ground_drag import DragLaw
 from edp.networks.twin.static_map import StaticMap
 from edp.sim.machine.machine_files import load_machine
 from edp.storage.seals import HASH, content_digest
-from edp.training.ground_fit import logged_forces
+from edp.training.ground_fit import read_forces
 from edp.training.twin_bundle import GROUNDED, TwinBundle, load_twin, plant_bundle, save_twin
 
 MACHINE = load_machine("m22")
@@ -31,7 +31,7 @@ def twin():
     """Its load is that of M22; everything else plausible."""
     channels, series = front_channels(), [series_of()]
     made = front().start(channels, fit_scales(channels, series), series, 0)
-    return made.with_numbers(made.table.nominal)
+    return made.with_parameters(made.table.nominal)
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +161,7 @@ def test_forces_along_a_log_that_the_twin_made_are_small(twin):
     rows = np.concatenate([np.tile(start, (PREFIX, 1)), answers[0]])
     # Row t of a log is the machine before the command of row t.
     log = replace(series, targets=np.concatenate([rows[:1], rows[:-1]]))
-    places, speeds, forces = logged_forces(twin, log)
+    places, speeds, forces = read_forces(twin, log)
     assert places.shape == speeds.shape == forces.shape == (60, 3)
     assert np.median(np.abs(forces[20:])) < 1e3
 

@@ -37,7 +37,7 @@ def machine():
     numbers[twin.table.inertia_at], numbers[twin.table.potential_at] = 0.07, 0.01
     # Far above what acts, unlike where a fit starts: limited all the time, faults of a valve would hardly show.
     numbers[[number.name for number in twin.table.numbers].index("power_limit")] *= 10.0
-    twin = twin.with_numbers(numbers)
+    twin = twin.with_parameters(numbers)
     start = np.tile(np.array([0.0, 0.5, 5e6, 5e6, 5e6], np.float32), (len(levers), 1))
     commands = np.stack([series.inputs for series in levers])
     answers, _ = twin.rollout(commands[:, :-1], twin.initial_state(commands[:, 0], start))
@@ -48,14 +48,14 @@ def machine():
 def scaled_case(twin, runs, ticks, starts):
     """Commands, measured values and truth of stretches, scaled, tick first."""
     rows = [slice(first, first + ticks + 1) for first in starts]
-    commands = np.stack([twin.scaled_commands(runs[0].inputs[row])[:-1] for row in rows], axis=1)
+    commands = np.stack([twin.scale_commands(runs[0].inputs[row])[:-1] for row in rows], axis=1)
     answers = np.stack([twin.scaled(runs[0].targets[row]) for row in rows], axis=1)
     return torch.from_numpy(commands), torch.from_numpy(answers[:-1]), torch.from_numpy(answers[1:])
 
 
 def drawn(twin, size):
     """The same grey box with a network whose answers are not zero."""
-    again = twin.without_network()
+    again = twin.drop_network()
     generator = torch.Generator().manual_seed(1)
     for weight in again.network.parameters():
         weight.data.normal_(0, size, generator=generator)
@@ -127,7 +127,7 @@ def test_a_network_learns_what_the_equations_lack_and_is_kept(machine):
     names = [number.name for number in twin.table.numbers]
     for name in ("into_extend_45", "into_retract_45", "viscous"):
         lame[names.index(name)] *= 3.0
-    start = twin.with_numbers(lame).without_network()
+    start = twin.with_parameters(lame).drop_network()
     # Long enough for velocities and strokes, which choose the weights together.
     spec = replace(SPEC, updates=(200,))
     fit = fit_residual(start, spec, runs[:2], runs[2:3], FreeRunSpec(validation_s=2.0))
@@ -137,7 +137,7 @@ def test_a_network_learns_what_the_equations_lack_and_is_kept(machine):
     judge = FreeRunJudgeSpec(at_s=(2.0,))
     with_network, alone = (
         free_run_scores(free_runs(one, runs[2:3], 2.0, 32), judge).velocity_mae.mean
-        for one in (fit.twin, fit.twin.without_network())
+        for one in (fit.twin, fit.twin.drop_network())
     )
     assert with_network < 0.9 * alone
     assert fit.error == min(row["validation"] for row in fit.history)
@@ -181,4 +181,4 @@ def test_it_comes_back_from_disk_and_its_layers_are_a_network_on_a_grey_box(tmp_
     rows = random_inputs(plant, 120, seed=4)
     exact = stream(copy.deepcopy(plant).double(), rows)
     assert np.abs((stream(plant, rows) - exact) / twin.scales.answer_width).max() < 1e-4
-    assert np.abs(stream(TwinPlant(twin.without_network(), ""), rows) - exact).max() > 1e-2
+    assert np.abs(stream(TwinPlant(twin.drop_network(), ""), rows) - exact).max() > 1e-2

@@ -24,9 +24,9 @@ def bench():
     twin = BENCH.start(channels, fit_scales(channels, series), series, 0)
     numbers = twin.table.nominal
     numbers[twin.table.inertia_at], numbers[twin.table.potential_at] = 0.07, 0.01  # 4.9 t, 20 kN
-    twin, levers = twin.with_numbers(numbers), series[0].inputs
+    twin, levers = twin.with_parameters(numbers), series[0].inputs
     _, moves, _, _ = group_matrix(twin, ("dead_band",))
-    worn = twin.with_numbers(twin.numbers * np.exp(moves @ [np.log(1.5)]))
+    worn = twin.with_parameters(twin.numbers * np.exp(moves @ [np.log(1.5)]))
     start = np.array([[0.0, 0.5, 5e6, 5e6, 5e6]], np.float32)
     answers, _ = worn.rollout(levers[None, :-1], worn.initial_state(levers[None, 0], start))
     return twin, levers, np.concatenate([start, answers[0]])

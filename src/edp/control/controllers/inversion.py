@@ -80,7 +80,7 @@ class ModelInversion:
         if models.predictor is not None:
             model = PredictorAhead(models.predictor, ticks)
         else:
-            model = TwinAhead(models.needed_twin("inversion"), ticks, [channel.name for channel in plant.channels])
+            model = TwinAhead(models.require_twin("inversion"), ticks, [channel.name for channel in plant.channels])
         return InversionController(self, plant, limits, model)
 
 
@@ -115,7 +115,7 @@ class InversionController(Controller):
         error = self._strokes[min(tick, last)] - measured[len(self.model.reads) :]
         ahead = self._speeds[min(tick + self.model.ticks, last)]
         speed = ahead + self.spec.proportional * error + self._sum
-        asked = np.where(np.abs(speed) > self.spec.rest_m_s, self._solved(speed, self._row), 0.0)
+        asked = np.where(np.abs(speed) > self.spec.rest_m_s, self._solve_levers(speed, self._row), 0.0)
         free = (asked > self.limits.lever_low) & (asked < self.limits.lever_high)
         total = self._sum + self.spec.integral * error / self.plant.rate_hz
         self._sum = np.where(free, np.clip(total, -MOST_SUM, MOST_SUM), self._sum)
@@ -129,7 +129,7 @@ class InversionController(Controller):
         if self._row is not None and self._tick != tick:
             self.model.advance(self._row, self.plant.commands(self.before))
 
-    def _solved(self, speed: Array, row: Array) -> Array:
+    def _solve_levers(self, speed: Array, row: Array) -> Array:
         """Levers for wanted speeds, each axis with the others at the last solution."""
         low, high = np.array(self.limits.lever_low), np.array(self.limits.lever_high)
         tried = np.clip(self._solution[:, None] + self._offsets, low[:, None], high[:, None])

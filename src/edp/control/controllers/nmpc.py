@@ -121,8 +121,8 @@ class PredictiveControl:
             ConfigError: one of them is missing or does not fit, or DAQP is not installed.
         """
         window = max(1, round(self.window_s * plant.rate_hz))
-        model = TwinModel(models.needed_twin("nmpc"), plant, window, self.smoothing, self.load)
-        valves = models.needed_map("nmpc")
+        model = TwinModel(models.require_twin("nmpc"), plant, window, self.smoothing, self.load)
+        valves = models.require_map("nmpc")
         fallback = PiController(ProportionalIntegral(), plant, limits, valves) if self.fallback else None
         return NmpcController(self, limits, model, SpeedToLever(valves, limits), fallback)
 
@@ -205,19 +205,19 @@ class NmpcController(Controller):
 
     def levers(self, measured: Array, tick: int) -> Array:
         """Return the levers of the first block of the plan, or of the PI loop if there is no plan."""
-        spare = self._followed(measured, tick)
+        spare = self._update_models(measured, tick)
         try:
             self._improve(measured, tick)
         except ControlFault as fault:
-            return self._given_up(spare, tick, fault)
+            return self._give_up(spare, tick, fault)
         return self._valves.levers(self._latest)
 
     def fallback(self, measured: Array, tick: int, reason: str) -> Array:
         """Levers of the PI loop, while the twin's memory follows."""
         fault = ControlFault(f"a guard does not trust the model{f' ({reason})' if reason else ''}")
-        return self._given_up(self._followed(measured, tick), tick, fault)
+        return self._give_up(self._update_models(measured, tick), tick, fault)
 
-    def _followed(self, measured: Array, tick: int) -> Array | None:
+    def _update_models(self, measured: Array, tick: int) -> Array | None:
         """Update twin, disturbance and PI loop, and return the levers of the PI loop; None without one."""
         if self._row is not None:
             # After the limits: what was given, not what was asked for.
@@ -229,7 +229,7 @@ class NmpcController(Controller):
             return None
         return self._fallback.levers(strokes, tick)
 
-    def _given_up(self, spare: Array | None, tick: int, fault: ControlFault) -> Array:
+    def _give_up(self, spare: Array | None, tick: int, fault: ControlFault) -> Array:
         """Discard the plan and return the output of the PI loop.
 
         Raises:
@@ -269,7 +269,7 @@ class NmpcController(Controller):
         gradient -= self.spec.feedforward * self._ahead[min(tick, len(self._ahead) - 1)]
         # The first change is from what was asked for last.
         gradient[:AXES] -= self.spec.change * self._latest
-        solution, iterations = self._solved(hessian, gradient, *self._limits(strokes, pressures, steps.ravel()))
+        solution, iterations = self._solve_step(hessian, gradient, *self._limits(strokes, pressures, steps.ravel()))
         self._speeds += solution.reshape(speeds.shape)
         self._latest = self._speeds[0].copy()
         first, second, third = self.model.disturbance.tolist()
@@ -312,7 +312,7 @@ class NmpcController(Controller):
         slopes, low, high = self._room
         return slopes[:rows], low[:rows], high[:rows]
 
-    def _solved(self, hessian: Array, gradient: Array, rows: Array, low: Array, high: Array) -> tuple[Array, int]:
+    def _solve_step(self, hessian: Array, gradient: Array, rows: Array, low: Array, high: Array) -> tuple[Array, int]:
         """Return the step of the plan, within the speeds allowed by the lever ranges.
 
         Raises:

@@ -63,7 +63,7 @@ class ProportionalIntegral:
         Raises:
             ConfigError: there is no map, or the plant does not measure its strokes.
         """
-        return PiController(self, plant, limits, models.needed_map("pi"))
+        return PiController(self, plant, limits, models.require_map("pi"))
 
 
 class PiController(Controller):

@@ -98,7 +98,7 @@ class FmuEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         check_air(chosen.get("material"), "an FMU")
         shares = chosen.get("strokes") or MIDDLE
         self._tick = self._elapsed = 0
-        row = self._fed(shares) if self._ports.measured[0] else self._started(shares)
+        row = self._begin_with_measurements(shares) if self._ports.measured[0] else self._begin_with_parameters(shares)
         self._begun = True
         return row, self._info(row)
 
@@ -118,7 +118,7 @@ class FmuEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._fmu.put(self._ports.inputs, pilots.tolist())
         self._go()
         self._tick += 1
-        row = self._answered(pilots)
+        row = self._read_outputs(pilots)
         return row, 0.0, False, self._tick >= self._ticks, self._info(row)
 
     def close(self) -> None:
@@ -126,7 +126,7 @@ class FmuEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._fmu.close()
         self._begun = False
 
-    def _fed(self, shares: Any) -> NDArray[np.float32]:
+    def _begin_with_measurements(self, shares: Any) -> NDArray[np.float32]:
         """Begin with measured values: a steady phase, then the prefix that initialises a twin's memory."""
         rows = self._rest.rows(shares)
         values, flags = self._ports.measured
@@ -139,13 +139,13 @@ class FmuEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._fmu.put(flags, [0.0] * len(flags))
         return np.asarray(rows[-1])
 
-    def _started(self, shares: Any) -> NDArray[np.float32]:
+    def _begin_with_parameters(self, shares: Any) -> NDArray[np.float32]:
         """Begin by parameters, or where the FMU begins."""
         asked_m = np.array([float(share) for share in shares]) * self._geometry.full_m
         self._fmu.begin(self._ports.starts, asked_m.tolist() if self._ports.starts else ())
         neutral = self.commands(np.zeros(AXES))[self._pilots].astype(np.float32)
         self._fmu.put(self._ports.inputs, neutral.tolist())
-        row = self._answered(neutral)
+        row = self._read_outputs(neutral)
         apart = np.abs(row[self._strokes] - asked_m) / self._geometry.full_m
         if apart.max() > START_SHARE:
             axis = int(np.argmax(apart))
@@ -160,7 +160,7 @@ class FmuEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._fmu.step(self._elapsed / self.rate_hz, 1.0 / self.rate_hz)
         self._elapsed += 1
 
-    def _answered(self, pilots: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _read_outputs(self, pilots: NDArray[np.float32]) -> NDArray[np.float32]:
         answers = np.array(self._fmu.read(self._ports.outputs))
         if not np.isfinite(answers).all():
             name = self.channels[int(np.argmin(np.isfinite(answers)))].name

@@ -57,8 +57,8 @@ class FmuInstance:
         archive.unpack(folder, (f"binaries/{platform}", "resources"))
         kind = fmi2.FMU2Slave if description.version == 2 else fmi3.FMU3Slave
         self._fmu: Any = None
-        self._guarded("be loaded", lambda: self._load(kind, description, folder))
-        self._guarded("be instantiated", lambda: self._instantiate(fmi2))
+        self._call_guarded("be loaded", lambda: self._load(kind, description, folder))
+        self._call_guarded("be instantiated", lambda: self._instantiate(fmi2))
         self._fresh = True
 
     def begin(self, references: Sequence[int] = (), values: Sequence[float] = ()) -> None:
@@ -139,7 +139,7 @@ class FmuInstance:
         # Twice what is shown, since a character may take several bytes.
         self._message = printable((message or b"")[:400].decode("utf-8", "replace"))
 
-    def _guarded(self, what: str, run: Callable[[], None]) -> None:
+    def _call_guarded(self, what: str, run: Callable[[], None]) -> None:
         try:
             run()
         except Exception as error:  # FMPy raises plain exceptions

@@ -80,7 +80,7 @@ class TaskEpisodes:
         Raises:
             ConfigError: no reference of this seed, or of `DRAWS` drawn ones, can be done.
         """
-        task = self._drawn(seed, rng)
+        task = self._draw_feasible_task(seed, rng)
         reference = task.reference
         shares = np.clip(reference.strokes[0] / self.plant.geometry.full_m, 0.0, 1.0)
         self._lanes.begin(lane, task.seed, tuple(map(float, shares)), task.material)
@@ -95,17 +95,17 @@ class TaskEpisodes:
             self._base[lane] = self._bases[lane].step(observed, 0)
         return {"seed": task.seed, "seconds": float(self._ends[lane] / self.plant.rate_hz)}
 
-    def _drawn(self, seed: int | None, rng: np.random.Generator) -> ControlTask:
+    def _draw_feasible_task(self, seed: int | None, rng: np.random.Generator) -> ControlTask:
         """Return the task for a seed, or a random feasible task; the last of `DRAWS` raises the reason."""
         low, high = self.spec.seeds
         for _ in range(DRAWS - 1 if seed is None else 0):
             try:
-                return self._of_seed(int(rng.integers(low, high + 1)))
+                return self._draw_task(int(rng.integers(low, high + 1)))
             except ConfigError:
                 continue
-        return self._of_seed(int(rng.integers(low, high + 1)) if seed is None else seed)
+        return self._draw_task(int(rng.integers(low, high + 1)) if seed is None else seed)
 
-    def _of_seed(self, seed: int) -> ControlTask:
+    def _draw_task(self, seed: int) -> ControlTask:
         return draw_task(self._task, self.plant.geometry, self.plant.rate_hz, seed)
 
     def act(self, actions: Array, going: Bools) -> tuple[Array, Bools, Bools]:
@@ -138,7 +138,7 @@ class TaskEpisodes:
         self.tick = self.tick + going
         attitude = self._measure()
         travel = np.abs(applied - before).sum(axis=1)
-        violated = self._violated()
+        violated = self._check_limits()
         judged = going & self._rows.judged(self.tick)
         position = self.position_m
         parts = np.stack([np.ones(self.count), position**2, attitude**2, travel, violated], axis=1)
@@ -152,7 +152,7 @@ class TaskEpisodes:
         self.position_m = np.hypot(apart[:, 0], apart[:, 1])
         return np.arctan2(np.sin(apart[:, 2]), np.cos(apart[:, 2]))
 
-    def _violated(self) -> Bools:
+    def _check_limits(self) -> Bools:
         shares = self._lanes.strokes / self.plant.geometry.full_m
         margin = self._limits.stroke_margin
         ends = ((shares < margin) | (shares > 1.0 - margin)).any(axis=1)

@@ -77,12 +77,12 @@ class PolicyController(Controller):
             row = min(tick, self._last)
             now = self._rows.now(np.array([row]))
             seen = self._features.values(measured[None, : self._width], now, self._past, base[None])[0]
-            self._action = self._asked_policy(seen)
+            self._action = self._ask_policy(seen)
         if self._inner is None:
             return self._action
         return base + self._authority * self._action
 
-    def _asked_policy(self, seen: NDArray[np.float32]) -> Array:
+    def _ask_policy(self, seen: NDArray[np.float32]) -> Array:
         try:
             action = np.asarray(self._policy(seen), dtype=float)
         except Exception as error:  # a policy is anybody's code; a loop must end in the safe command

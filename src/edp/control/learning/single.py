@@ -12,7 +12,7 @@ from edp.control.learning.episodes import TaskEpisodes
 from edp.control.learning.spec import LearningSpec, learning_spec
 from edp.errors import ConfigError
 from edp.sim.environment.library import gymnasium
-from edp.sim.environment.start import checked_seed
+from edp.sim.environment.start import check_seed
 
 Row = NDArray[np.float32]
 
@@ -65,7 +65,7 @@ class TaskEnvironment(gymnasium.Env[Row, Row]):
             ConfigError: the seed has no reference that the machine can do, or an option came.
         """
         check_options(options)
-        seed = checked_seed(seed)
+        seed = check_seed(seed)
         super().reset(seed=seed)
         facts = self._episodes.begin(0, seed, self.np_random)
         self._under_way = True

@@ -15,7 +15,7 @@ from edp.control.learning.spec import LearningSpec, learning_spec
 from edp.errors import ConfigError
 from edp.settings.bounds import shown
 from edp.sim.environment.library import gymnasium
-from edp.sim.environment.start import checked_mask, checked_seed
+from edp.sim.environment.start import check_mask, check_seed
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -93,7 +93,7 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv[Rows, Rows, NDArray[Any]]
             ConfigError: an option or the number of seeds is not possible.
         """
         options = dict(options or {})
-        mask = checked_mask(self.num_envs, options.pop("reset_mask", None))
+        mask = check_mask(self.num_envs, options.pop("reset_mask", None))
         check_options(options)
         seeds = [None] * self.num_envs if seed is None else seed
         if isinstance(seeds, int | np.integer):
@@ -135,7 +135,7 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv[Rows, Rows, NDArray[Any]]
         """Begin the masked episodes; returns what began."""
         infos = infos or {}
         for lane in np.flatnonzero(mask).tolist():
-            seed = checked_seed(seeds[lane])
+            seed = check_seed(seeds[lane])
             if seed is not None:
                 self._generators[lane] = gymnasium.utils.seeding.np_random(seed)[0]
             facts = self._episodes.begin(lane, seed, self._generators[lane])

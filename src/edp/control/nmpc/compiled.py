@@ -18,7 +18,7 @@ compiler = Compiler("control", lambda: (Path(__file__),))
 
 
 @compiler.inner
-def _interpolated(value: float, xs: Array, ys: Array, count: int) -> float:
+def _interpolate(value: float, xs: Array, ys: Array, count: int) -> float:
     """`np.interp` on the first `count` points; the end values beyond them."""
     if value <= xs[0]:
         return float(ys[0])
@@ -43,7 +43,7 @@ def fill_levers(speeds: Array, xs: Array, ys: Array, counts: NDArray[np.int64], 
         for axis in range(speeds.shape[1]):
             speed = speeds[row, axis]
             side = 0 if speed >= 0.0 else 1
-            lever = _interpolated(abs(speed), xs[axis, side], ys[axis, side], counts[axis, side])
+            lever = _interpolate(abs(speed), xs[axis, side], ys[axis, side], counts[axis, side])
             levers[row, axis] = lever if side == 0 else -lever
 
 

@@ -95,7 +95,7 @@ class TaskSpec(ABC):
             ConfigError: it cannot be reached; other numbers are drawn then.
         """
 
-    def drawn_speed(self, rng: np.random.Generator) -> float:
+    def draw_speed(self, rng: np.random.Generator) -> float:
         """Return the speed of the tip, m/s."""
         return float(rng.uniform(*SPEED_M_S)) if self.speed_m_s is None else self.speed_m_s
 

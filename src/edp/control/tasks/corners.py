@@ -39,4 +39,4 @@ class CornerPath(TaskSpec):
         along, up = rng.choice([-1.0, 1.0], 2) * (self.width_m, self.height_m)
         steps = np.array([[along, 0.0, 0.0], [0.0, up, 0.0], [-along, 0.0, 0.0], [0.0, -up, 0.0]])[: self.legs]
         points = start + np.concatenate((np.zeros((1, 3)), np.cumsum(steps, axis=0)))
-        return self.tip_reference(name, points, self.drawn_speed(rng), geometry, rate_hz)
+        return self.tip_reference(name, points, self.draw_speed(rng), geometry, rate_hz)

@@ -61,7 +61,7 @@ class DigCycle(TaskSpec):
                 _tip_of(dump, ground + height, opened, bucket),
             ]
         )
-        return self.tip_reference(name, points, self.drawn_speed(rng), geometry, rate_hz)
+        return self.tip_reference(name, points, self.draw_speed(rng), geometry, rate_hz)
 
 
 def _tip_of(x: float, y: float, attitude: float, bucket: float) -> list[float]:

@@ -60,7 +60,7 @@ class Grade(TaskSpec):
         if self.material:
             # A line anywhere in reach would mostly lie metres under ground.
             start[1] = geometry.ground_m - rng.uniform(*self.depth_m)
-        length, speed = rng.uniform(*self.length_m), self.drawn_speed(rng)
+        length, speed = rng.uniform(*self.length_m), self.draw_speed(rng)
         # In soil the bucket cuts inwards; outwards it would be pushed through it by its back.
         away = rng.random() < 0.5 and not self.material
         outwards = away if self.direction == "drawn" else self.direction == "outwards"

@@ -22,7 +22,7 @@ class LevelBucket(TaskSpec):
         """Return two random poses with the bucket attitude of the first."""
         start, goal = rng.uniform(*START, (2, 3)) * geometry.full_m
         goal[2] = start[2]
-        speed = self.drawn_speed(rng)
+        speed = self.draw_speed(rng)
         # The pin's way is not known before its path is; that of the tip at a fixed bucket stroke is about as long.
         way = float(np.hypot(*np.diff(geometry.tip(np.array([start, goal]))[:, :2], axis=0).T).item())
         seconds = [duration_s(way, speed, self.ramp_s)]

@@ -39,7 +39,7 @@ class PointToPoint(TaskSpec):
         for _ in range(self.points):
             shares.append(np.clip(shares[-1] + rng.uniform(-STEP, STEP, 3), *POINTS))
         points = np.array(shares) * geometry.full_m
-        speed = self.drawn_speed(rng)
+        speed = self.draw_speed(rng)
         ways = np.hypot(*np.diff(geometry.tip(points)[:, :2], axis=0).T)
         seconds = [duration_s(float(way), speed, self.ramp_s) for way in ways]
         rows, judged = timed(points, seconds, rate_hz, self.ramp_s, self.law, self.lead_s, self.hold_s)

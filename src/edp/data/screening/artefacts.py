@@ -117,7 +117,7 @@ def changing_flags(
     return [flag for flag in spread(of_channel, judged) if flag is not None]
 
 
-def broken_flags(
+def flag_broken(
     table: CandidateTable, live: Sequence[int], judged: Sequence[int], trusted: Sequence[int]
 ) -> list[Flag]:
     """Flag channels that follow another with one gain in some recordings, but with another sign or not in others.
@@ -137,7 +137,7 @@ def broken_flags(
     flags = []
     for i in judged:
         sources = [j for j in trusted if j != i]
-        verdicts = [(_broken(relations[:, i, j], np.abs(slopes[:, i, j]), squares[:, [i, j]]), j) for j in sources]
+        verdicts = [(_find_break(relations[:, i, j], np.abs(slopes[:, i, j]), squares[:, [i, j]]), j) for j in sources]
         reported = [(*verdict, j) for verdict, j in verdicts if verdict is not None]
         if reported:
             value, text, j = max(reported)
@@ -146,7 +146,7 @@ def broken_flags(
     return flags
 
 
-def _broken(relation: Array, slope: Array, squares: Array) -> tuple[float, str] | None:
+def _find_break(relation: Array, slope: Array, squares: Array) -> tuple[float, str] | None:
     """Mean correlation where there is one, and in words how it breaks; None where it does not.
 
     Args:

@@ -238,9 +238,7 @@ def _copy_flag(names: Sequence[str], pair: CopiedChannel, trusted: bool) -> Flag
     return Flag(name, FlagKind.COPY, source, pair.lag, value, text)
 
 
-def explained_flags(
-    names: Sequence[str], correlations: Array, judged: Sequence[int], base: Sequence[int]
-) -> list[Flag]:
+def flag_explained(names: Sequence[str], correlations: Array, judged: Sequence[int], base: Sequence[int]) -> list[Flag]:
     """Channels that the presents and pasts of others make up, one after the other, so that something remains.
 
     Args:

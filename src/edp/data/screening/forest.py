@@ -184,7 +184,7 @@ def importances(
     permuted = Permuted(model.estimators_, tests, number)
     plain = permuted.errors(None, np.arange(len(tests.inputs)))
     # The same permutations for every group, so that groups differ by what they are and not by chance.
-    orders = [_shuffled(tests.pieces, spec.seed + r) for r in range(forest.repeats)]
+    orders = [_shuffle_rows(tests.pieces, spec.seed + r) for r in range(forest.repeats)]
 
     def of_group(g: int) -> Array:
         """Return the mean error increase in each left-out segment, ``(piece, target)``."""
@@ -194,12 +194,12 @@ def importances(
     increases = np.stack(spread(of_group, range(len(groups))))
     power = np.stack([np.square(tests.changes[tests.pieces == p]).mean(axis=0) for p in held_out]).mean(axis=0)
     names = [table.names[i] for i in columns]
-    return _listed(
+    return _list_importances(
         increases / power, [[names[k] for k in group] for group in groups], [table.names[i] for i in table.targets]
     )
 
 
-def _shuffled(pieces: Ints, seed: int) -> Ints:
+def _shuffle_rows(pieces: Ints, seed: int) -> Ints:
     """Return a permutation of the rows within each segment, which keeps the distribution of each channel there."""
     rng = np.random.default_rng(seed)
     order = np.arange(len(pieces))
@@ -209,7 +209,9 @@ def _shuffled(pieces: Ints, seed: int) -> Ints:
     return order
 
 
-def _listed(increases: Array, members: Sequence[Sequence[str]], targets: Sequence[str]) -> list[GroupImportance]:
+def _list_importances(
+    increases: Array, members: Sequence[Sequence[str]], targets: Sequence[str]
+) -> list[GroupImportance]:
     """Return the entries for every group, for each target and for all targets.
 
     The increases are ``(group, piece, target)``.

@@ -20,7 +20,7 @@ Orders = NDArray[np.int64]
 
 
 @compiled
-def _within(values: Array, row: int, radius: float) -> int:
+def _count_neighbours(values: Array, row: int, radius: float) -> int:
     """How many other values of a sorted array are nearer than `radius` to the one at `row`."""
     # doubling steps, then halving ones
     n = len(values)
@@ -102,7 +102,7 @@ def _information(x_sorted: Array, y_along_x: Array, y_sorted: Array, places: Ord
     total = 0.0
     for i in range(n):
         radius, along_x = _radius(x_sorted, y_along_x, i, nearest)
-        total += psi[along_x + 1] + psi[_within(y_sorted, places[i], radius) + 1]
+        total += psi[along_x + 1] + psi[_count_neighbours(y_sorted, places[i], radius) + 1]
     result: float = psi[n] + psi[k] - total / n
     return result
 

@@ -112,7 +112,7 @@ class _Spectra:
         return np.asarray(shown.T.reshape(-1, *product.shape[1:]), dtype=np.float32)
 
 
-def lagged_covariances(
+def compute_lagged_covariances(
     table: CandidateTable, reach: int, shifts: int = 4, on_share: Callable[[float], None] | None = None
 ) -> Lagged:
     """Return the covariances of all pairs up to lag `reach`, and the level that chance produces between segments.

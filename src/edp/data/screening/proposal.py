@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.data.screening.artefacts import lonely
-from edp.data.screening.copies import explained_flags
+from edp.data.screening.copies import flag_explained
 from edp.data.screening.result import (
     ChannelVerdict,
     Cluster,
@@ -143,7 +143,7 @@ def redundant_flags(evidence: ScreeningEvidence, judged: Sequence[str], free: Se
     order = [names.index(name) for name in sorted(idle, key=lambda name: (scores[name], name))]
     gone = {flag.channel for flag in flags}
     base = [k for k, name in enumerate(names) if name in free and name not in gone]
-    return flags + explained_flags(names, evidence.correlations, order, base)
+    return flags + flag_explained(names, evidence.correlations, order, base)
 
 
 def _adds(evidence: ScreeningEvidence, name: str) -> bool:

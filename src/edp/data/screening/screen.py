@@ -15,7 +15,7 @@ from edp.data.gathered import some_columns
 from edp.data.screening import artefacts, copies, forest, stability, values
 from edp.data.screening.clusters import clusters_of, least_of
 from edp.data.screening.information import Information
-from edp.data.screening.lagged import Lagged, lagged_covariances
+from edp.data.screening.lagged import Lagged, compute_lagged_covariances
 from edp.data.screening.proposal import ScreeningEvidence, noise_flags, propose, redundant_flags
 from edp.data.screening.ranks import Kendall, correlation, rank_columns
 from edp.data.screening.result import (
@@ -102,7 +102,7 @@ def _screen(recordings: Sequence[Recording], spec: ScreeningSpec, clock: _Clock)
         live = np.flatnonzero(table.live)
     matrices = _matrices(table, spec, clock)
     with clock.stage("lags") as tell:
-        lagged = lagged_covariances(table, spec.max_lag, _SHIFTS, lambda share: tell("lags", share))
+        lagged = compute_lagged_covariances(table, spec.max_lag, _SHIFTS, lambda share: tell("lags", share))
         names = [table.names[i] for i in live]
         targets = [table.names[i] for i in table.targets]
         curves, best = stability.lag_curves(table, lagged, names, targets, spec)
@@ -115,7 +115,7 @@ def _screen(recordings: Sequence[Recording], spec: ScreeningSpec, clock: _Clock)
     used = [int(i) for i in live if table.names[i] not in flagged or i in table.targets]
     measured = _Measured(matrices, metrics, curves, stable)
     evidence = _evidence(table, lagged, spec, measured, used, clock)
-    return _concluded(recordings, table, spec, measured, flags, evidence, clock.seconds)
+    return _assemble_result(recordings, table, spec, measured, flags, evidence, clock.seconds)
 
 
 @dataclass(frozen=True)
@@ -149,10 +149,10 @@ def _matrices(table: CandidateTable, spec: ScreeningSpec, clock: _Clock) -> Matr
         informed = Information(sample, spec.neighbours, spec.seed).matrix(
             lambda share: tell("mutual information", share)
         )
-    return Matrices(table.names, *(_widened(table, m) for m in (pearson, spearman, kendall, informed)))
+    return Matrices(table.names, *(_expand_matrix(table, m) for m in (pearson, spearman, kendall, informed)))
 
 
-def _widened(table: CandidateTable, matrix: Array) -> Array:
+def _expand_matrix(table: CandidateTable, matrix: Array) -> Array:
     """Expand a matrix over live channels to all channels, NaN elsewhere."""
     live = np.flatnonzero(table.live)
     full = np.full((len(table.names), len(table.names)), np.nan)
@@ -160,7 +160,7 @@ def _widened(table: CandidateTable, matrix: Array) -> Array:
     return full
 
 
-def trusted_names(table: CandidateTable, spec: ScreeningSpec) -> set[str]:
+def list_trusted(table: CandidateTable, spec: ScreeningSpec) -> set[str]:
     """Channels known to be measured on the machine: targets, the names of Table A.1, and those that the user names."""
     return {*(table.names[i] for i in table.targets), *spec.trusted, *TABLE_A1}
 
@@ -168,7 +168,7 @@ def trusted_names(table: CandidateTable, spec: ScreeningSpec) -> set[str]:
 def _structural_flags(table: CandidateTable, lagged: Lagged, spec: ScreeningSpec) -> list[Flag]:
     """Flag channels with problems independent of the targets: constant, clocks, per-file artefacts, leaks, copies."""
     names = [table.names[i] for i in lagged.live]
-    trust = trusted_names(table, spec)
+    trust = list_trusted(table, spec)
     trusted = [k for k, name in enumerate(names) if name in trust]
     targets = np.searchsorted(lagged.live, table.targets).tolist()
     flags = artefacts.dead_flags(table)
@@ -181,7 +181,7 @@ def _structural_flags(table: CandidateTable, lagged: Lagged, spec: ScreeningSpec
     correlations = lagged.pooled()
     support = np.abs(correlations[:, :, targets]).max(axis=(0, 2))
     flags += artefacts.changing_flags(names, lagged, open_ones(), trusted, support)
-    flags += artefacts.broken_flags(table, [int(k) for k in lagged.live], open_ones(), trusted)
+    flags += artefacts.flag_broken(table, [int(k) for k in lagged.live], open_ones(), trusted)
     flagged = sorted(set(range(len(names))) - set(open_ones()))
     flags += copies.find_leaks(names, correlations, trusted, targets, flagged)
     settled = {names.index(flag.channel) for flag in flags if flag.channel in names}
@@ -203,7 +203,7 @@ def _evidence(
     targets = np.searchsorted(lagged.live, table.targets)
     relations = stability.relations_of(lagged, targets, measured.metrics, spec.level)
     groups = clusters_of(spearman[np.ix_(columns, columns)], spec.collinear)
-    held_out = values.held_out_pieces(len(table.pieces), spec.forest.held_out, spec.seed)
+    held_out = values.choose_held_out(len(table.pieces), spec.forest.held_out, spec.seed)
     read = columns if spec.horizon else columns[~np.isin(columns, table.targets)]
     if not len(read):
         raise DataError(
@@ -230,7 +230,7 @@ def _evidence(
         )
         history = values.window_needed(lagged, among, targets.tolist(), spec.horizon, held_out)
     clusters = _clusters(table, spearman, columns, groups, relations.linear[np.searchsorted(lagged.live, columns)])
-    pieces = _at_best(lagged, targets, relations)
+    pieces = _select_best_lags(lagged, targets, relations)
     correlations = lagged.pooled()
     return ScreeningEvidence(
         table, lagged.live, correlations, relations, pieces, measured.curves, importance, worth, clusters, history
@@ -261,7 +261,7 @@ def _clusters(
     return clusters
 
 
-def _at_best(lagged: Lagged, targets: NDArray[np.int64], relations: stability.Relations) -> Array:
+def _select_best_lags(lagged: Lagged, targets: NDArray[np.int64], relations: stability.Relations) -> Array:
     """Return the correlation in each segment at the target and lag with the largest mean, ``(piece, channel)``."""
     pieces = lagged.by_piece(targets)[:, : lagged.reach + 1]
     target = np.abs(relations.linear).argmax(axis=1)
@@ -270,7 +270,7 @@ def _at_best(lagged: Lagged, targets: NDArray[np.int64], relations: stability.Re
     return np.asarray(chosen[:, lag, np.arange(pieces.shape[2])], dtype=np.float64)
 
 
-def _concluded(
+def _assemble_result(
     recordings: Sequence[Recording],
     table: CandidateTable,
     spec: ScreeningSpec,
@@ -284,7 +284,7 @@ def _concluded(
     free = {name for name in table.names if name not in targets} - {flag.channel for flag in flags}
     flags = flags + noise_flags(evidence, sorted(free))
     free = set(table.names) - {flag.channel for flag in flags}
-    trust = trusted_names(table, spec)
+    trust = list_trusted(table, spec)
     flags = flags + redundant_flags(evidence, sorted(free - trust), sorted(free))
     return ScreeningResult(
         tuple(recording.name for recording in recordings),

@@ -183,7 +183,7 @@ def build_table(recordings: Sequence[Recording], spec: ScreeningSpec) -> Candida
         names,
         tuple(group_of(name, kinds[name]) for name in names),
         tuple(names.index(name) for name in targets),
-        _thinned(_pieces([r.name for r in recordings], columns, spec), spec.max_lag),
+        _thin_segments(_pieces([r.name for r in recordings], columns, spec), spec.max_lag),
         first.rate_hz,
         missing,
         short,
@@ -266,7 +266,7 @@ def _pieces(names: Sequence[str], columns: Sequence[FloatArray], spec: Screening
     return tuple(pieces)
 
 
-def _thinned(pieces: tuple[Piece, ...], max_lag: int) -> tuple[Piece, ...]:
+def _thin_segments(pieces: tuple[Piece, ...], max_lag: int) -> tuple[Piece, ...]:
     """Return segments with about `MOST_ROWS` rows in total, as evenly spaced parts of each recording in memory."""
     lengths = [len(stretch) for piece in pieces for stretch in piece.stretches]
     if sum(lengths) <= MOST_ROWS:

@@ -27,7 +27,7 @@ ENOUGH = 0.02
 """A window is long enough when the held-out error is within this share of the best."""
 
 
-def held_out_pieces(count: int, share: float, seed: int) -> NDArray[np.int64]:
+def choose_held_out(count: int, share: float, seed: int) -> NDArray[np.int64]:
     """Choose the left-out segments: at least two, at most all but two."""
     # Two on either side at least, or there is no spread to judge by.
     piece_count = min(max(2, round(count * share)), count - 2)

@@ -59,7 +59,7 @@ class SmallMlp(Baseline):
 
     def _train(self, table: LagTable, held_out: LagTable) -> None:
         """Epochs with early stopping on whole held-out series: random rows of a time series would flatter."""
-        features = self._standardised(table.features)
+        features = self._standardise(table.features)
         changes = ((table.changes - self._out_centre) / self._out_scale).astype(np.float32)
         # scikit-learn wants a vector when there is one output.
         changes = changes[:, 0] if self.task.outputs == 1 else changes
@@ -86,11 +86,11 @@ class SmallMlp(Baseline):
         return predict_from_lags(inputs, self.task, self._means, self._change)
 
     def _change(self, features: FloatArray) -> DoubleArray:
-        output = self._model.predict(self._standardised(features)).reshape(len(features), self.task.outputs)
+        output = self._model.predict(self._standardise(features)).reshape(len(features), self.task.outputs)
         changes: DoubleArray = output * self._out_scale + self._out_centre
         return changes
 
-    def _standardised(self, features: FloatArray) -> FloatArray:
+    def _standardise(self, features: FloatArray) -> FloatArray:
         # Beyond ten deviations nothing was learned; the clip keeps a spike from becoming an absurd prediction.
         return np.clip((features - self._centre) / self._scale, -10.0, 10.0).astype(np.float32)
 

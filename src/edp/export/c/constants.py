@@ -80,10 +80,10 @@ class CConstant:
         if self.kind in STRUCTS:
             pointers, numbers = STRUCTS[self.kind]
             # A struct is as aligned as its pointers.
-            each = _up_to(pointers * machine.pointer + 4 * numbers, machine.pointer)
+            each = _round_up(pointers * machine.pointer + 4 * numbers, machine.pointer)
         else:
             each = NUMBER_BYTES[self.kind]  # scalars and arrays
-        return _up_to(self.count * each, machine.boundary)
+        return _round_up(self.count * each, machine.boundary)
 
 
 def total_bytes(constants: Iterator[CConstant] | list[CConstant], machine: DataModel = CORTEX_M) -> int:
@@ -123,7 +123,7 @@ def constants_of(graph: Graph, plan: MemoryPlan, written: bool = False) -> Itera
 
 def stored(layer: Layer, name: str, values: NDArray[Any]) -> NDArray[Any]:
     """Return the elements of a constant in the order of the C code."""
-    return laid(layer, name, integer_calls.laid_out(layer, values))
+    return laid(layer, name, integer_calls.lay_out(layer, values))
 
 
 def _tensor(layer: Layer, name: str, values: NDArray[Any], written: bool) -> CConstant:
@@ -154,6 +154,6 @@ def _integer(value: int) -> str:
     return "(-2147483647 - 1)" if value == -(2**31) else str(value)
 
 
-def _up_to(size: int, multiple: int) -> int:
+def _round_up(size: int, multiple: int) -> int:
     """Round a number of bytes up to the next multiple."""
     return -(-size // multiple) * multiple

@@ -146,7 +146,7 @@ def structs(layer: Layer) -> list[str]:
     return []
 
 
-def laid_out(layer: Layer, values: NDArray[Any]) -> NDArray[Any]:
+def lay_out(layer: Layer, values: NDArray[Any]) -> NDArray[Any]:
     """Return a constant in the order in which the runtime reads it: see ``edp_q_products``."""
     if values.dtype != np.int8 or values.ndim < 2:
         return values
@@ -154,10 +154,10 @@ def laid_out(layer: Layer, values: NDArray[Any]) -> NDArray[Any]:
         # Taps first: the runtime multiplies one tick of the ring after the other.
         values = values.transpose(1, 0, 2)
     matrices = values.reshape(-1, *values.shape[-2:])
-    return np.concatenate([_in_order(matrix) for matrix in matrices])
+    return np.concatenate([_reorder_weights(matrix) for matrix in matrices])
 
 
-def _in_order(matrix: NDArray[Any]) -> NDArray[Any]:
+def _reorder_weights(matrix: NDArray[Any]) -> NDArray[Any]:
     out, into = matrix.shape
     rows, columns = out - out % 4, into - into % 4
     # Pairs of products: the order in which the Cortex-M4's SIMD instruction reads bytes after widening

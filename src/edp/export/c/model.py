@@ -210,7 +210,11 @@ class Model:
             (f"{upper}_AHEAD_{k} = {i},", f"{k} ticks, {1000 * k / task.rate_hz:g} ms")
             for i, k in enumerate(task.horizons)
         ]
-        return {"input_enum": _listed(inputs), "target_enum": _listed(targets), "horizon_enum": _listed(ahead)}
+        return {
+            "input_enum": _write_enumeration(inputs),
+            "target_enum": _write_enumeration(targets),
+            "horizon_enum": _write_enumeration(ahead),
+        }
 
     def _state(self) -> dict[str, str]:
         declared, cleared = remembered(self.graph)
@@ -221,7 +225,7 @@ class Model:
         return {
             "work_fields": indented(f"{STATES[kind]} {WORK[kind]}[{size}];" for kind, size in sizes.items()),
             "work_pointers": indented(f"{STATES[kind]} *const {WORK[kind]} = s->{WORK[kind]};" for kind in sizes),
-            "clear_work": indented(cleared_work(self.plan)),
+            "clear_work": indented(clear_work(self.plan)),
         }
 
     def _tangent(self, changes: MemoryPlan) -> dict[str, object]:
@@ -291,7 +295,7 @@ def remembered(graph: Graph) -> tuple[list[str], list[str]]:
     return declared, cleared
 
 
-def cleared_work(plan: MemoryPlan) -> list[str]:
+def clear_work(plan: MemoryPlan) -> list[str]:
     """Statements that clear the work memories."""
     return [f"{FILLS[kind]}{size}u, s->{WORK[kind]});" for kind, size in plan.sizes.items()]
 
@@ -312,7 +316,7 @@ def computed(graph: Graph, plan: MemoryPlan) -> tuple[list[str], list[str]]:
     return lines[1:], [*checks, "if (finite) {", *copies, "}", "return finite;"]
 
 
-def _listed(entries: Sequence[tuple[str, str]]) -> Code:
+def _write_enumeration(entries: Sequence[tuple[str, str]]) -> Code:
     """Lines of an enumeration with a comment each."""
     wide = max(len(entry) for entry, _ in entries)
     return Code("\n".join(f"    {entry:<{wide}} /* {c_comment(text)} */" for entry, text in entries))

@@ -58,14 +58,14 @@ def called(statements: Iterable[str]) -> set[str]:
 
 def runtime_bytes(functions: Iterable[str]) -> int:
     """Functions of the runtime, with the functions, tables and parts of the C library that they need."""
-    sizes, needs = _measured()
+    sizes, needs = _read_measurements()
     # A set: functions share what they need, and the linker takes it once.
     every = {symbol for function in functions for symbol in needs[function]}
     return sum(sizes[symbol] for symbol in every)
 
 
 @cache
-def _measured() -> tuple[dict[str, int], dict[str, list[str]]]:
+def _read_measurements() -> tuple[dict[str, int], dict[str, list[str]]]:
     text = resources.files("edp.export.c").joinpath("kernels.toml").read_text(encoding="utf-8")
     table = tomllib.loads(text)
     return table["bytes"], table["needs"]

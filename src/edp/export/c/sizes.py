@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from edp.export.c import adaptation as adapting
 from edp.export.c.constants import CORTEX_M, DataModel, constants_of, total_bytes
-from edp.export.c.model import cleared_work, computed, remembered
+from edp.export.c.model import clear_work, computed, remembered
 from edp.export.c.plan import plan
 from edp.export.c.program import FIXED, MOST_COPIED, called, own_bytes, runtime_bytes
 from edp.ir import Graph
@@ -61,7 +61,7 @@ def program_bytes(graph: Graph, adaptation: Adaptation | None = None) -> int:
     places = plan(graph)
     compute, finish = computed(graph, places)
     statements = [*compute, *finish, *remembered(graph)[1]]
-    functions = {*FIXED, *called(statements), *called(cleared_work(places))}
+    functions = {*FIXED, *called(statements), *called(clear_work(places))}
     # The output is copied as a struct; beyond `MOST_COPIED` the compiler calls `memcpy`.
     copied = 4 * sum(map(graph.width_of, graph.results.values()))
     own = own_bytes(statements)

@@ -142,7 +142,7 @@ def _dense(t: Tangents, layer: layers.Dense) -> list[str]:
     return t.before(layer, "edp_dense_tangent", *t.changes(layer), constant(layer, "weight"), *sizes)
 
 
-def _grouped(t: Tangents, layer: layers.GroupedDense) -> list[str]:
+def _write_grouped(t: Tangents, layer: layers.GroupedDense) -> list[str]:
     weight = constant(layer, "weight")
     return t.before(layer, "edp_grouped_dense_tangent", *t.changes(layer), weight, *layer.weight.shape)
 
@@ -229,7 +229,7 @@ def _mean(t: Tangents, layer: memory.TrailingMean) -> list[str]:
     return t.before(layer, "edp_trailing_mean_tangent", *t.changes(layer), *parameters)
 
 
-def _attended(t: Tangents, layer: memory.AttentionPool | memory.WindowAttention, *slots: str) -> str:
+def _write_attention(t: Tangents, layer: memory.AttentionPool | memory.WindowAttention, *slots: str) -> str:
     past, moved = (", ".join(of(layer, name) for name in slots) for of in (slot, changed))
     struct = f"{{{past}}}, {{{moved}}}, {ring(layer)}, {layer.window}u"
     return f"&(const edp_attended){{{struct}, {t.calls.scratch(layer)}, {t.scratch(layer)}}}"
@@ -237,12 +237,12 @@ def _attended(t: Tangents, layer: memory.AttentionPool | memory.WindowAttention,
 
 def _pool(t: Tangents, layer: memory.AttentionPool) -> list[str]:
     score = (constant(layer, "score"), f"{constant(layer, 'bias')}[0]", layer.width)
-    attended = _attended(t, layer, "ring", "scores")
+    attended = _write_attention(t, layer, "ring", "scores")
     return t.before(layer, "edp_attention_pool_tangent", *t.values(layer), *t.changes(layer), *score, attended)
 
 
 def _window(t: Tangents, layer: memory.WindowAttention) -> list[str]:
-    attended = _attended(t, layer, "keys", "values")
+    attended = _write_attention(t, layer, "keys", "values")
     six = (_pointers(t.values(layer)), _pointers(t.changes(layer)))
     return t.before(layer, "edp_window_attention_tangent", *six, layer.size, layer.heads, attended)
 
@@ -282,7 +282,7 @@ TANGENTS: dict[type[Layer], Write] = {
     layers.Glu: _glu,
     layers.Accumulate: lambda t, x: t.before(x, "edp_accumulate_tangent", *t.changes(x), x.rows, x.size),
     layers.Dense: _dense,
-    layers.GroupedDense: _grouped,
+    layers.GroupedDense: _write_grouped,
     # Between thresholds a sum of trees is constant.
     layers.TreeSums: lambda t, x: t.before(x, "edp_fill_tangent", x.width),
     layers.LayerNorm: _norm,

@@ -29,9 +29,11 @@ def blanks(graph: Graph, name: str) -> dict[str, object]:
                 continue
             for lines, who, fill in ((load, "s", None), (load_change, "t", None)):
                 # The ring of the C code begins anywhere; CasADi's column has the oldest tick first.
-                lines.append(_moved(graph, state, "load", who, fill))
-            store.append(_moved(graph, state, "store", "s", number(UNSEEN if state.slot.name == "scores" else 0.0)))
-            store_change.append(_moved(graph, state, "store", "t", "0.0f"))
+                lines.append(_move_state(graph, state, "load", who, fill))
+            store.append(
+                _move_state(graph, state, "store", "s", number(UNSEEN if state.slot.name == "scores" else 0.0))
+            )
+            store_change.append(_move_state(graph, state, "store", "t", "0.0f"))
     every = ["x_next", *graph.results]
     sizes = [len(start(graph)), *map(graph.width_of, graph.results.values())]
     members = [f"&out->{result}{'[0][0]' if result == 'prediction' else '[0][0][0]'}" for result in graph.results]
@@ -75,7 +77,7 @@ def _load_count(graph: Graph, layer: Layer, layer_states: list[Place]) -> list[s
     return lines
 
 
-def _moved(graph: Graph, state: Place, way: str, who: str, fill: str | None) -> str:
+def _move_state(graph: Graph, state: Place, way: str, who: str, fill: str | None) -> str:
     field, column = f"{who}->{state.field}", f"x + {state.at}"
     if not is_ring(graph, state):
         return call(f"{way}_numbers", column, state.slot.size, field)

@@ -71,7 +71,7 @@ class HydraulicMachine:
         self.moved = np.where(self.w["scale"] > 0.0, 1.0, 0.0)
         self.load = self._load_function()
         self.advance = [self._advance_function(length) for length in (GAMMA * step, step - GAMMA * step)]
-        self.displaced = self._displaced_function(step)
+        self.displaced = self._make_displacement_function(step)
         self.root, self.residual = self._stage(GAMMA * step)
         self.bristles = self._bristle_function(GAMMA * step)
 
@@ -98,7 +98,7 @@ class HydraulicMachine:
             columns.append(ca.vertcat(*self.equations.advance_valve(state, command, factors)))
         return ca.Function("advance", [rows, history], [ca.horzcat(*columns)])
 
-    def _displaced_function(self, step: float) -> ca.Function:
+    def _make_displacement_function(self, step: float) -> ca.Function:
         """Return the function for the pump displacements: pilot demands under the common power limit."""
         rows = ca.SX.sym("rows", at.VALVE_STATES, self.valves)
         d, p = ca.SX.sym("d", self.pumps), ca.SX.sym("p", self.pumps)

@@ -223,7 +223,7 @@ def _dense(p: _Part, x: Any) -> Any:
     return ca.vertcat(*(p.w["weight"] @ column + p.w["bias"] for column in columns))
 
 
-def _grouped(p: _Part, x: Any) -> Any:
+def _grouped_dense(p: _Part, x: Any) -> Any:
     columns = ca.horzsplit(_rows(x, len(p.w["bias"])))
     return ca.vertcat(*(w @ column + b for w, column, b in zip(p.w["weight"], columns, p.w["bias"], strict=True)))
 
@@ -240,14 +240,14 @@ def _trees(p: _Part, x: Any) -> Any:
     return _keep_nan(ca.sum1(x), ca.sum1(ca.reshape(y, trees, outputs)).T)
 
 
-def _normed(x: Any, epsilon: float) -> Any:
+def _normalise(x: Any, epsilon: float) -> Any:
     count, middle = x.shape[0], x - ca.sum1(x) / x.shape[0]
     return middle / ca.sqrt(ca.sum1(middle * middle) / count + epsilon)
 
 
 def _norm(p: _Part, x: Any) -> Any:
     columns = ca.horzsplit(_rows(x, p.rows)) if p.rows > 1 else [x]
-    return ca.vertcat(*(_normed(column, p.epsilon) * p.w["gain"] + p.w["shift"] for column in columns))
+    return ca.vertcat(*(_normalise(column, p.epsilon) * p.w["gain"] + p.w["shift"] for column in columns))
 
 
 def _row_attention(p: _Part, *qkv: Any) -> Any:
@@ -291,9 +291,9 @@ def _cell(p: _Part, gates: Any, squash: Callable[[Any], Any]) -> Any:
 
 
 def _layer_norm_lstm(p: _Part, x: Any) -> Any:
-    driven = _normed(p.w["weight_x"] @ x, p.epsilon) * p.w["gain_x"]
-    gates = driven + _normed(p.w["weight_h"] @ p.m["h"], p.epsilon) * p.w["gain_h"] + p.w["bias"]
-    return _cell(p, gates, lambda c: _normed(c, p.epsilon) * p.w["gain_c"] + p.w["shift_c"])
+    driven = _normalise(p.w["weight_x"] @ x, p.epsilon) * p.w["gain_x"]
+    gates = driven + _normalise(p.w["weight_h"] @ p.m["h"], p.epsilon) * p.w["gain_h"] + p.w["bias"]
+    return _cell(p, gates, lambda c: _normalise(c, p.epsilon) * p.w["gain_c"] + p.w["shift_c"])
 
 
 def _gru(p: _Part, x: Any) -> Any:
@@ -379,7 +379,7 @@ LAYERS: dict[str, Callable[..., Any]] = {
     "Glu": _glu,
     "Accumulate": _accumulate,
     "Dense": _dense,
-    "GroupedDense": _grouped,
+    "GroupedDense": _grouped_dense,
     "TreeSums": _trees,
     "LayerNorm": _norm,
     "RowAttention": _row_attention,

@@ -91,14 +91,14 @@ class LaneModel:
 
     def files(self) -> dict[str, str]:
         """Model and runtime by file name."""
-        return model_files(self.name, self._filled, "plant", self.model, RUNTIME)
+        return model_files(self.name, self._fill_template, "plant", self.model, RUNTIME)
 
     @property
     def sources(self) -> tuple[str, ...]:
         """C files that a program with this model compiles."""
         return (f"{self.name}.c", *(name for name in (*self.model.runtime, *RUNTIME) if name.endswith(".c")))
 
-    def _filled(self, template: str) -> Code:
+    def _fill_template(self, template: str) -> Code:
         text = own_file(f"templates/{template}")
         graph, twin = self.model.graph, self.plant.twin
         fields, cleared = remembered(graph)
@@ -123,13 +123,13 @@ class LaneModel:
             "low": filled(map(number, low)),
             "high": filled(map(number, high)),
             "mean": filled(map(number, np.asarray(twin.scales.answer_offset))),
-            "compute": indented(self._computed(free=False)),
-            "run": indented(self._computed(free=True)),
+            "compute": indented(self._write_statements(free=False)),
+            "run": indented(self._write_statements(free=True)),
             "result": Code(f" + {at}" if at else ""),
         }
         return fill(text, values)
 
-    def _computed(self, free: bool) -> Iterator[str]:
+    def _write_statements(self, free: bool) -> Iterator[str]:
         """Yield the statements of a time step. Neighbouring layers without products share one loop over the copies.
 
         Args:
@@ -138,7 +138,7 @@ class LaneModel:
         calls, together = Calls(self.model.graph, self.model.plan), list[str]()
         for layer in self.model.graph.layers:
             if free and layer.name.startswith(PORTS):
-                together += self._fed(calls, layer)
+                together += self._write_port_layer(calls, layer)
                 continue
             whole = self._whole(calls, layer)
             if whole is None:
@@ -149,7 +149,7 @@ class LaneModel:
             together = []
         yield from _loop(self.name, together)
 
-    def _fed(self, calls: Calls, layer: Layer) -> list[str]:
+    def _write_port_layer(self, calls: Calls, layer: Layer) -> list[str]:
         """Return the remaining statements of a port layer if all ports run free."""
         if layer.name != FED:
             return []

@@ -103,7 +103,7 @@ class NearModel:
 
     def files(self) -> dict[str, str]:
         """Model and runtime by file name."""
-        return model_files(self.name, self._filled, "plant_near", self.model, RUNTIME)
+        return model_files(self.name, self._fill_template, "plant_near", self.model, RUNTIME)
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -111,7 +111,7 @@ class NearModel:
         runtime = (*self.model.runtime, *RUNTIME)
         return (f"{self.name}.c", *(name for name in runtime if name.endswith(".c") and name != WITHIN))
 
-    def _filled(self, template: str) -> Code:
+    def _fill_template(self, template: str) -> Code:
         text = own_file(f"templates/{template}")
         graph, twin, machine = self.model.graph, self.twin, self.machine
         actuators, valves, pumps = machine.sizes

@@ -71,11 +71,11 @@ def constants_of_controller(parts: ControllerParts, near: bool = False) -> Const
     tables.floats("input_low", parts.limits_low)
     tables.floats("input_high", parts.limits_high)
     tables.floats("front_angles", parts.angles)
-    full, lengths = (_braced(values) for values in (parts.full_m, parts.lengths_m))
+    full, lengths = (_write_initialiser(values) for values in (parts.full_m, parts.lengths_m))
     tables.text(f"static const edp_front front = {{{len(parts.angles)}u, front_angles, {full}, {lengths}}};")
     # A rounding below: levers are sums in single precision, and a limit is one.
     slew = np.maximum(np.asarray(parts.slew) - ROUNDED, 0.5 * np.asarray(parts.slew))
-    limits = ", ".join(_braced(values) for values in (parts.lever_low, parts.lever_high, slew))
+    limits = ", ".join(_write_initialiser(values) for values in (parts.lever_low, parts.lever_high, slew))
     tables.text(f"static const edp_lever_limits limits = {{{limits}}};")
     if parts.plan is None or parts.plan.fallback:
         _set_sides(tables, "loop", parts.sides)
@@ -99,7 +99,7 @@ def _set_plan(tables: ConstantTables, parts: ControllerParts, plan: PlanParts, n
         tables.small("velocity_answers", plan.velocities)
     if plan.pressures:
         tables.small("pressure_answers", plan.pressures)
-    tables.text(f"static const edp_lever_shape lever_shape = {_braced(plan.lever_shape)};")
+    tables.text(f"static const edp_lever_shape lever_shape = {_write_initialiser(plan.lever_shape)};")
     pilots = ",\n".join(
         f"    {{{pilot.axis}u, {_truth(pilot.second)}, {_truth(pilot.extend)}, {number(pilot.share)}}}"
         for pilot in plan.pilots
@@ -136,7 +136,7 @@ def _rising(speeds: ArrayLike) -> np.ndarray:
     return nodes
 
 
-def _braced(values: Iterable[float]) -> Code:
+def _write_initialiser(values: Iterable[float]) -> Code:
     return Code(f"{{{', '.join(map(number, values))}}}")
 
 

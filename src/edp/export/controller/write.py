@@ -102,8 +102,8 @@ class ControllerFiles:
         """Every file by name, the one to read first in front."""
         name = self.name
         texts: dict[str, str] = {
-            f"{name}_control.h": self._filled("control.h.in"),
-            f"{name}_control.c": self._filled("control.c.in"),
+            f"{name}_control.h": self._fill_template("control.h.in"),
+            f"{name}_control.c": self._fill_template("control.c.in"),
             f"{name}_control_numbers.h": self._numbers(),
         }
         texts |= self._runtime() if self.model is None else self.model.files()
@@ -113,9 +113,9 @@ class ControllerFiles:
             texts |= {file: own_file(file) for file in (*SOLVER_FILES, LICENCE)}
         if self.parts.golden is not None:
             texts[f"{name}_control_golden.h"] = self._golden(self.parts.golden)
-            texts["host_test.c"] = self._filled("host_test.c.in")
-        texts["example_task.c"] = self._filled("example_task.c.in")
-        texts["CMakeLists.txt"] = self._filled("CMakeLists.txt.in")
+            texts["host_test.c"] = self._fill_template("host_test.c.in")
+        texts["example_task.c"] = self._fill_template("example_task.c.in")
+        texts["CMakeLists.txt"] = self._fill_template("CMakeLists.txt.in")
         return texts
 
     def _runtime(self) -> dict[str, str]:
@@ -125,7 +125,7 @@ class ControllerFiles:
         head = f"/* Constants of {self.name}_control. Written by EDP {__version__}; do not edit. */\n"
         return Code(head + self.tables.finished())
 
-    def _filled(self, template: str) -> Code:
+    def _fill_template(self, template: str) -> Code:
         return fill(own_file(f"templates/{template}"), self._values())
 
     def _values(self) -> dict[str, object]:

@@ -88,7 +88,7 @@ def fmu_files(
         # Only the plumbing of its own version: two sets of entry points would clash in one library.
         sources = {**core, **{file: texts[file] for file in (*COMMON, *OWN[v])}}
         content = _content(v, about, sources, description)
-        files[f"{about.name}_fmi{v}.fmu"] = _packed(content | built[v])
+        files[f"{about.name}_fmi{v}.fmu"] = _zip(content | built[v])
     return files
 
 
@@ -114,6 +114,6 @@ def c_files(names: Sequence[str]) -> list[str]:
     return [name for name in names if name.endswith(".c")]
 
 
-def _packed(content: Mapping[str, bytes]) -> bytes:
+def _zip(content: Mapping[str, bytes]) -> bytes:
     # Executable rights: without them the libraries cannot be loaded after unpacking on Linux.
     return zip_bytes(content.items(), DATE, 0o755)

@@ -52,7 +52,7 @@ class FmuTarget:
         tangent = self.derivatives and _differentiable(bundle)
         model = make_model(name, bundle, tangent)
         core = core_files(model)
-        about = _about(model, variables(model), core)
+        about = _describe(model, variables(model), core)
         macros = TANGENT.format(name) if about.derivatives else ""
         core["fmu_model.h"] = model_header(about, bundle.predictor.required, macros)
         described = as_json(Description(name, bundle, model.graph).content())
@@ -64,7 +64,7 @@ def _differentiable(bundle: Bundle) -> bool:
     return not isinstance(bundle.predictor, IntegerPredictor) and differentiable(bundle.predictor.graph())
 
 
-def _about(model: Model, listed: list[Variable], core: Mapping[str, str]) -> About:
+def _describe(model: Model, listed: list[Variable], core: Mapping[str, str]) -> About:
     """Return the content of the XML files with a token computed from sources and variables."""
     described = Description(model.name, model.bundle, model.graph).content()
     keys = ("model_hash", "scale_hash", "number_format", "window", "mode")

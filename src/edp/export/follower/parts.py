@@ -68,7 +68,7 @@ class FollowerParts:
         correction, rng = self.correction(), np.random.default_rng(0)
         tuned, scales = correction.tuned, self.twin.scales
         signs = np.where(np.arange(len(tuned.labels)) % 2, -WORN, WORN)
-        worn = self.twin.with_numbers(self.twin.numbers * np.exp(tuned.moves @ signs))
+        worn = self.twin.with_parameters(self.twin.numbers * np.exp(tuned.moves @ signs))
         levels = np.repeat(rng.normal(size=(GOLDEN_TICKS // 20, len(scales.command_offset))), 20, axis=0)
         commands = (scales.command_offset + scales.command_width * levels).astype(np.float32)
         start = np.clip(scales.answer_offset, scales.low, scales.high).astype(np.float32)[None]

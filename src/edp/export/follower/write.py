@@ -173,8 +173,8 @@ class FollowerFiles:
             "command_enum": _enum(f"{upper}_COMMAND_", channels.commands),
             "answer_enum": _enum(f"{upper}_MEASURED_", channels.answers),
             "target_enum": _enum(f"{upper}_TARGET_", [speeds[name] for name in parts.targets]),
-            "horizon_enum": _listed(f"{upper}_AHEAD_", [str(k) for k in parts.horizons], ahead),
-            "group_enum": _listed(f"{upper}_GROUP_", self.tuned.labels, self.tuned.labels),
+            "horizon_enum": _write_enumeration(f"{upper}_AHEAD_", [str(k) for k in parts.horizons], ahead),
+            "group_enum": _write_enumeration(f"{upper}_GROUP_", self.tuned.labels, self.tuned.labels),
             "low": filled(map(number, np.asarray(twin.scales.low) / twin.units)),
             "high": filled(map(number, np.asarray(twin.scales.high) / twin.units)),
             "constants": Code("\n".join(tables.lines)),
@@ -210,10 +210,10 @@ def _own(path: str) -> str:
 
 def _enum(prefix: str, channels: Iterable[Channel]) -> Code:
     every = si_channels(channels)
-    return _listed(prefix, [c.name for c in every], ["; ".join((c.unit, c.description)) for c in every])
+    return _write_enumeration(prefix, [c.name for c in every], ["; ".join((c.unit, c.description)) for c in every])
 
 
-def _listed(prefix: str, names: Iterable[str], texts: Iterable[str]) -> Code:
+def _write_enumeration(prefix: str, names: Iterable[str], texts: Iterable[str]) -> Code:
     """Lines of an enumeration, each with a text that is escaped here as its comment."""
     ends = c_names(names, C_SIGNIFICANT - len(prefix))
     lines = (

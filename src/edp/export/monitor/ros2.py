@@ -51,7 +51,7 @@ def write_monitor_ros2(parts: MonitorParts, name: str, folder: Path) -> list[Pat
     package, texts = f"{name}_ros", monitor_files(parts, name).texts()
     shared = resources.files("edp.export.ros2")
     own = resources.files("edp.export.monitor")
-    about = _about(parts, name)
+    about = _describe(parts, name)
     blanks = _blanks(parts, package, name, about)
 
     def filled(template: str) -> str:
@@ -77,7 +77,7 @@ def write_monitor_ros2(parts: MonitorParts, name: str, folder: Path) -> list[Pat
     return write_export(folder, {file: text.encode() for file, text in files.items()})
 
 
-def _about(parts: MonitorParts, name: str) -> dict[str, object]:
+def _describe(parts: MonitorParts, name: str) -> dict[str, object]:
     """Return the description with names valid for parameters and messages, and the outputs as one result."""
     about = description(parts, name)
     names = message_names(entry["name"] for entry in about["inputs"])

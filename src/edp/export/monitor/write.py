@@ -58,8 +58,8 @@ class MonitorFiles:
         """Every file by name, the one to read first in front."""
         name = self.name
         texts: dict[str, str] = {
-            f"{name}.h": self._filled("monitor.h.in"),
-            f"{name}.c": self._filled("monitor.c.in"),
+            f"{name}.h": self._fill_template("monitor.h.in"),
+            f"{name}.c": self._fill_template("monitor.c.in"),
             f"{name}_numbers.h": self._numbers(),
         }
         texts |= {file: _own(f"runtime/{file}") for file in OWN}
@@ -72,9 +72,9 @@ class MonitorFiles:
         """Return the texts with self-test, example and CMake file."""
         return self.texts() | {
             f"{self.name}_golden.h": golden_header(self.name, self.parts),
-            "host_test.c": self._filled("host_test.c.in"),
-            "example_task.c": self._filled("example_task.c.in"),
-            "CMakeLists.txt": self._filled("CMakeLists.txt.in"),
+            "host_test.c": self._fill_template("host_test.c.in"),
+            "example_task.c": self._fill_template("example_task.c.in"),
+            "CMakeLists.txt": self._fill_template("CMakeLists.txt.in"),
         }
 
     @property
@@ -164,7 +164,7 @@ class MonitorFiles:
         tables.text(f"#define POINTS {self.parts.points}u")
         tables.text(f"#define BLOCK_S {number(chain.block / self.parts.rate_hz)}")
 
-    def _filled(self, template: str) -> Code:
+    def _fill_template(self, template: str) -> Code:
         return fill(_own(f"templates/{template}"), self._values())
 
     def _values(self) -> dict[str, object]:

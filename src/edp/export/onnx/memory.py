@@ -69,14 +69,14 @@ def _convolution(nodes: Nodes, layer: memory.Convolution, state: Held, x: str) -
     return value, {"ring": nodes.join([*pieces[1:], x], 0)}
 
 
-def _mixed(nodes: Nodes, old: str, new: str, share: float) -> str:
+def _mix_states(nodes: Nodes, old: str, new: str, share: float) -> str:
     if share == 1.0:
         # Without zoneout the mix would be two products by 1 and 0.
         return new
     return nodes.add("Add", nodes.times(old, np.float32(1 - share)), nodes.times(new, np.float32(share)))
 
 
-def _gated(nodes: Nodes, layer: Any, state: Held, gates: str) -> tuple[str, dict[str, str]]:
+def _add_gates(nodes: Nodes, layer: Any, state: Held, gates: str) -> tuple[str, dict[str, str]]:
     i, f, g, o = nodes.split(gates, [layer.width] * 4, 1)
     decayed = nodes.add("Mul", nodes.add("Sigmoid", f), state["c"])
     cell = nodes.add("Add", decayed, nodes.add("Mul", nodes.add("Sigmoid", i), nodes.add("Tanh", g)))
@@ -84,13 +84,13 @@ def _gated(nodes: Nodes, layer: Any, state: Held, gates: str) -> tuple[str, dict
     if isinstance(layer, memory.LayerNormLstm):
         squashed = nodes.plus(nodes.times(normed(nodes, cell, layer.epsilon), layer.gain_c), layer.shift_c)
     out = nodes.add("Mul", nodes.add("Sigmoid", o), nodes.add("Tanh", squashed))
-    new = {name: _mixed(nodes, state[name], fresh, layer.share) for name, fresh in (("h", out), ("c", cell))}
+    new = {name: _mix_states(nodes, state[name], fresh, layer.share) for name, fresh in (("h", out), ("c", cell))}
     return new["h"], new
 
 
 def _lstm(nodes: Nodes, layer: memory.Lstm, state: Held, x: str) -> tuple[str, dict[str, str]]:
     driven = nodes.linear(x, layer.weight_x, layer.bias)
-    return _gated(nodes, layer, state, nodes.linear(state["h"], layer.weight_h, driven))
+    return _add_gates(nodes, layer, state, nodes.linear(state["h"], layer.weight_h, driven))
 
 
 def _layer_norm_lstm(nodes: Nodes, layer: memory.LayerNormLstm, state: Held, x: str) -> tuple[str, dict[str, str]]:
@@ -99,7 +99,7 @@ def _layer_norm_lstm(nodes: Nodes, layer: memory.LayerNormLstm, state: Held, x: 
     driven = normed(nodes, nodes.linear(x, layer.weight_x, none), layer.epsilon)
     back = normed(nodes, nodes.linear(state["h"], layer.weight_h, none), layer.epsilon)
     both = nodes.add("Add", nodes.times(driven, layer.gain_x), nodes.times(back, layer.gain_h))
-    return _gated(nodes, layer, state, nodes.plus(both, layer.bias))
+    return _add_gates(nodes, layer, state, nodes.plus(both, layer.bias))
 
 
 def _gru(nodes: Nodes, layer: memory.Gru, state: Held, x: str) -> tuple[str, dict[str, str]]:

@@ -51,7 +51,7 @@ def content(
     return described.content() | {"rules": RULES, "graphs": graphs}
 
 
-def with_full_starts(about: Table, states: Sequence[State]) -> dict[str, object]:
+def expand_starts(about: Table, states: Sequence[State]) -> dict[str, object]:
     """`content` with whole arrays as the starts of states, for MATLAB."""
     # MATLAB has no rule for the short form of a start.
     step = about["graphs"]["step"]

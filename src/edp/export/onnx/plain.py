@@ -137,7 +137,7 @@ def _dense(nodes: Nodes, layer: layers.Dense, ticks: int, values: Sequence[str],
     return _flat(nodes, nodes.linear(rows, layer.weight, layer.bias), ticks, layer.rows, layer.width)
 
 
-def _grouped(nodes: Nodes, layer: layers.GroupedDense, ticks: int, values: Sequence[str], *_: object) -> str:
+def _grouped_dense(nodes: Nodes, layer: layers.GroupedDense, ticks: int, values: Sequence[str], *_: object) -> str:
     count, _, into = layer.weight.shape
     rows = nodes.split(values[0], [into] * count, 1)
     parts = [nodes.linear(x, w, b) for x, w, b in zip(rows, layer.weight, layer.bias, strict=True)]
@@ -198,7 +198,7 @@ PLAIN: dict[type[Layer], Plain] = {
     layers.Glu: _glu,
     layers.Accumulate: _accumulate,
     layers.Dense: _dense,
-    layers.GroupedDense: _grouped,
+    layers.GroupedDense: _grouped_dense,
     layers.TreeSums: _trees,
     layers.LayerNorm: _norm,
     layers.RowAttention: _row_attention,

@@ -11,7 +11,7 @@ from edp.export.base import TARGETS
 from edp.export.description import Description, as_json, as_mat, float_graph, golden
 from edp.export.escape import LONGEST_NAME, visible
 from edp.export.folder import write_export
-from edp.export.onnx.metadata import content, notes, with_full_starts
+from edp.export.onnx.metadata import content, expand_starts, notes
 from edp.export.onnx.nodes import DEFAULT_OPSET, OPSETS
 from edp.export.onnx.step import states_of, step_model
 from edp.export.onnx.window import window_model
@@ -51,7 +51,7 @@ class OnnxTarget:
         if not graph.fed_back:
             files["window"] = window_model(graph, targets, f"{name}_window", carried, self.opset)
         about = content(described, files, states, self.opset)
-        tables = {"edp": with_full_starts(about, states), "golden": golden(bundle.predictor, graph.window)}
+        tables = {"edp": expand_starts(about, states), "golden": golden(bundle.predictor, graph.window)}
         contents = {f"{name}.json": as_json(about), f"{name}.mat": as_mat(tables)}
         contents |= {f"{name}_{kind}.onnx": data for kind, data in files.items()}
         return write_export(folder, contents)

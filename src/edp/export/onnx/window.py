@@ -84,7 +84,7 @@ class Window:
         write = getattr(self, f"_{WINDOWS[type(layer)]}") if type(layer) in WINDOWS else None
         if write is not None:
             write(layer, rows)
-        elif (number_by_number := self._on_channels(layer)) and any(
+        elif (number_by_number := self._find_writer(layer)) and any(
             self.values.in_columns(name, rows) for name in layer.inputs
         ):
             input_names = [self.values.columns(name, rows) for name in layer.inputs]
@@ -100,7 +100,7 @@ class Window:
         else:
             raise refuse(layer)
 
-    def _on_channels(self, layer: Layer) -> Callable[..., str] | None:
+    def _find_writer(self, layer: Layer) -> Callable[..., str] | None:
         """Return the writer of a layer that is independent of the element layout; None for other layers."""
         if isinstance(layer, layers.Activate):
             return partial(activate, self.nodes, layer.function)
@@ -153,26 +153,26 @@ class Window:
         if rows == 1:
             self._give(layer, nodes.mean(source, 0), rows)
             return
-        seen = self._seen(layer.window, rows, reach)
+        seen = self._mask_visible(layer.window, rows, reach)
         # Weights are known when the graph is written: at the start of a window fewer ticks count.
         weights = (seen / seen.sum(axis=1, keepdims=True)).astype(np.float32)
         self._give(layer, nodes.product(nodes.constant(weights, "weights"), source), rows)
 
-    def _seen(self, window: int, rows: int, reach: int) -> np.ndarray:
+    def _mask_visible(self, window: int, rows: int, reach: int) -> np.ndarray:
         """Return a mask of the last `reach` samples visible to each of the last `rows` samples, ``(rows, reach)``."""
         at, of = np.arange(reach - rows, reach)[:, None], np.arange(reach)[None]
         return (of <= at) & (of > at - window)
 
-    def _hidden(self, window: int, rows: int, reach: int) -> str | None:
+    def _mask_scores(self, window: int, rows: int, reach: int) -> str | None:
         """Return the term added to scores that masks invisible samples."""
-        seen = self._seen(window, rows, reach)
+        seen = self._mask_visible(window, rows, reach)
         return None if seen.all() else self.nodes.constant(np.where(seen, 0, UNSEEN).astype(np.float32), "hidden")
 
     def _attention_pool(self, layer: memory.AttentionPool, rows: int) -> None:
         nodes, reach = self.nodes, rows_before(layer, rows, self.ticks)
         source = self.values.rows(layer.inputs[0], reach)
         scores = nodes.shaped(nodes.linear(source, layer.score[None], layer.bias), 1, reach)
-        hidden = self._hidden(layer.window, rows, reach)
+        hidden = self._mask_scores(layer.window, rows, reach)
         weights = nodes.softmax(scores if hidden is None else nodes.add("Add", scores, hidden))
         self._give(layer, nodes.product(weights, source), rows)
 
@@ -180,7 +180,7 @@ class Window:
         reach = rows_before(layer, rows, self.ticks)
         query = self.values.rows(layer.inputs[0], rows)
         keys, values = (self.values.rows(name, reach) for name in layer.inputs[1:])
-        hidden = self._hidden(layer.window, rows, reach)
+        hidden = self._mask_scores(layer.window, rows, reach)
         self._give(layer, attend(self.nodes, layer, (query, keys, values), hidden), rows)
 
     def _recurrence(self, layer: Layer) -> None:
@@ -245,7 +245,7 @@ WINDOWS = {
 """Layers with memory that are written over the whole window, by kind: methods of `Window`."""
 
 
-def _reordered(array: np.ndarray, order: Sequence[int]) -> np.ndarray:
+def _reorder_gates(array: np.ndarray, order: Sequence[int]) -> np.ndarray:
     """Gates in another order; a leading axis of one direction."""
     return np.concatenate([np.split(array, len(order))[at] for at in order])[None]
 
@@ -261,13 +261,13 @@ def lstm(
 ) -> tuple[str, dict[str, str]]:
     """Write an LSTM; the gates of the ONNX operator are in the order i, o, f, c."""
     order, units = (0, 3, 1, 2), layer.width
-    bias = np.concatenate([_reordered(layer.bias, order), np.zeros((1, 4 * units), np.float32)], axis=1)
+    bias = np.concatenate([_reorder_gates(layer.bias, order), np.zeros((1, 4 * units), np.float32)], axis=1)
     y, h, c = nodes.several(
         "LSTM",
         [
             nodes.shaped(source, ticks, 1, layer.weight_x.shape[1]),
-            nodes.constant(_reordered(layer.weight_x, order), "w"),
-            nodes.constant(_reordered(layer.weight_h, order), "r"),
+            nodes.constant(_reorder_gates(layer.weight_x, order), "w"),
+            nodes.constant(_reorder_gates(layer.weight_h, order), "r"),
             nodes.constant(bias, "b"),
             "",
             _first(nodes, state["h"], units),
@@ -284,13 +284,13 @@ def gru(
 ) -> tuple[str, dict[str, str]]:
     """Write a GRU; the gates of the ONNX operator are in the order z, r, h, with the reset gate after the product."""
     order, units = (1, 0, 2), layer.width
-    bias = np.concatenate([_reordered(layer.bias_x, order), _reordered(layer.bias_h, order)], axis=1)
+    bias = np.concatenate([_reorder_gates(layer.bias_x, order), _reorder_gates(layer.bias_h, order)], axis=1)
     y, h = nodes.several(
         "GRU",
         [
             nodes.shaped(source, ticks, 1, layer.weight_x.shape[1]),
-            nodes.constant(_reordered(layer.weight_x, order), "w"),
-            nodes.constant(_reordered(layer.weight_h, order), "r"),
+            nodes.constant(_reorder_gates(layer.weight_x, order), "w"),
+            nodes.constant(_reorder_gates(layer.weight_h, order), "r"),
             nodes.constant(bias, "b"),
             "",
             _first(nodes, state["h"], units),

@@ -132,7 +132,7 @@ class RlsCorrector:
 
     def _step(self, x: Array, y: Array, fresh: bool, learn: bool) -> tuple[Array, RlsStatus]:
         constants, out, taught = self.adaptation, y.copy(), False
-        measured, directed = x[self._columns], self._directed(x)
+        measured, directed = x[self._columns], self._project_inputs(x)
         for h, k in enumerate(constants.horizons):
             error = np.zeros(len(measured), dtype=np.float32)
             # The prediction of k ticks ago is judged only if all ticks since then came without a gap.
@@ -151,21 +151,21 @@ class RlsCorrector:
             return out, RlsStatus.FALLBACK
         return out, RlsStatus.LEARNING if taught else RlsStatus.HOLDING
 
-    def _directed(self, x: Array) -> Array:
+    def _project_inputs(self, x: Array) -> Array:
         """Return the projections of the inputs on the directions ``(r,)``."""
         constants = self.adaptation
         if not constants.spec.rank:
             return np.zeros(0, dtype=np.float32)
-        scaled = _within((x - constants.offset) / constants.scale, FEATURE_LIMIT)
-        return _within(total(constants.directions * scaled), FEATURE_LIMIT)
+        scaled = _clip((x - constants.offset) / constants.scale, FEATURE_LIMIT)
+        return _clip(total(constants.directions * scaled), FEATURE_LIMIT)
 
     def _phi(self, h: int, measured: Array, y: Array, error: Array, directed: Array) -> Array:
         constants = self.adaptation
         if not (self._moves(measured) or self._moves(y)):
             return np.zeros(constants.features, dtype=np.float32)
-        present = _within((measured - constants.middle) / constants.spread, FEATURE_LIMIT)
-        change = _within((y - measured) / constants.change[h], FEATURE_LIMIT)
-        return np.concatenate([np.ones(1, dtype=np.float32), present, change, _within(error, FEATURE_LIMIT), directed])
+        present = _clip((measured - constants.middle) / constants.spread, FEATURE_LIMIT)
+        change = _clip((y - measured) / constants.change[h], FEATURE_LIMIT)
+        return np.concatenate([np.ones(1, dtype=np.float32), present, change, _clip(error, FEATURE_LIMIT), directed])
 
     def _moves(self, values: Array) -> bool:
         """Return whether a target is outside its dead zone around the middle."""
@@ -186,7 +186,7 @@ class RlsCorrector:
         if damaged.any():
             self.theta[h][damaged], correction[damaged] = 0.0, 0.0
             self.repairs += 1
-        return _within(correction, self._numbers["limit"])
+        return _clip(correction, self._numbers["limit"])
 
     def _due(self, h: int, error: Array, learn: bool) -> bool:
         """Judge, and learn from, the prediction that has come due; returns whether something was learned."""
@@ -222,9 +222,9 @@ class RlsCorrector:
             return False
         inverse = np.float32(1.0) / d
         # The innovation is clipped, not the error: outliers may judge, but not teach.
-        innovation = _within(error - total(self.theta[h] * phi), CLIP)
+        innovation = _clip(error - total(self.theta[h] * phi), CLIP)
         step = (innovation * inverse)[:, None]
-        self.theta[h] = _within(constants["keep"] * (self.theta[h] + g * step), constants["bound"])
+        self.theta[h] = _clip(constants["keep"] * (self.theta[h] + g * step), constants["bound"])
         p = constants["keep_squared"] * (p - (g[:, None] * g) * inverse)
         diagonal = np.einsum("ii->i", p)
         diagonal += constants["refresh"]
@@ -242,7 +242,7 @@ class RlsCorrector:
         return np.eye(self.adaptation.features, dtype=np.float32) * self._numbers["prior"]
 
 
-def _within(values: Array, limit: float | np.floating) -> Array:
+def _clip(values: Array, limit: float | np.floating) -> Array:
     """Numbers cut off at plus and minus `limit`."""
     bound = np.float32(limit)
     return np.asarray(np.minimum(np.maximum(values, -bound), bound), dtype=np.float32)

@@ -44,7 +44,7 @@ def frac_for(largest: float, bits: int = 15) -> int:
     return max(-bits, min(2 * bits, frac))
 
 
-def rounded_shift(x: Any, bits: int) -> Fixed:
+def round_shift(x: Any, bits: int) -> Fixed:
     """``x 2^-bits``, rounded half up."""
     # Half up rather than half to even: one addition and a shift in C.
     x = np.asarray(x, dtype=np.int64)
@@ -111,20 +111,20 @@ NORMAL = _table(lambda x: 0.5 * (1.0 + math.erf(x / math.sqrt(2.0))), 8.0)
 """Cumulated normal distribution on [0, 8], in 2^-16."""
 
 
-def looked_up(table: NDArray[np.uint16], x: Fixed, step: int) -> Fixed:
+def look_up(table: NDArray[np.uint16], x: Fixed, step: int) -> Fixed:
     """Interpolate a table at x >= 0 with spacing `2^step`; beyond its end the last entries are used."""
     # The last entry has no neighbour to interpolate to; x stays just below it.
     x = np.minimum(x, ((TABLE - 1) << step) - 1)
     at, rest = x >> step, x & ((1 << step) - 1)
     low = table[at].astype(np.int64)
     high = table[at + 1].astype(np.int64)
-    result: Fixed = low + rounded_shift((high - low) * rest, step)
+    result: Fixed = low + round_shift((high - low) * rest, step)
     return result
 
 
 def tanh(x: Fixed, frac: int) -> Fixed:
     """In 2^-15, of x in ``2^-frac``, `frac` at least 6."""
-    size = looked_up(TANH, np.abs(x), frac - 6)
+    size = look_up(TANH, np.abs(x), frac - 6)
     result: Fixed = np.where(x < 0, -1, 1) * np.minimum((size + 1) >> 1, LARGEST)
     return result
 
@@ -132,23 +132,23 @@ def tanh(x: Fixed, frac: int) -> Fixed:
 def sigmoid(x: Fixed) -> Fixed:
     """In 2^-15, of x in 2^-16: ``(1 + tanh(x / 2)) / 2``."""
     # A half of x: one bit less of the step, instead of a shift that would lose that bit.
-    half = looked_up(TANH, np.abs(x), GATE_FRAC - 5)
-    return np.minimum(rounded_shift(65536 + np.where(x < 0, -1, 1) * half, 2), LARGEST)
+    half = look_up(TANH, np.abs(x), GATE_FRAC - 5)
+    return np.minimum(round_shift(65536 + np.where(x < 0, -1, 1) * half, 2), LARGEST)
 
 
 def exp(x: Fixed) -> Fixed:
     """In 2^-16, of x <= 0 in 2^-16."""
-    return looked_up(EXP, -x, GATE_FRAC - 5)
+    return look_up(EXP, -x, GATE_FRAC - 5)
 
 
 def softplus(x: Fixed) -> Fixed:
     """In 2^-16, of x in 2^-16."""
-    return np.maximum(x, 0) + looked_up(LOG1P_EXP, np.abs(x), GATE_FRAC - 5)
+    return np.maximum(x, 0) + look_up(LOG1P_EXP, np.abs(x), GATE_FRAC - 5)
 
 
 def normal(x: Fixed) -> Fixed:
     """Cumulated normal distribution in 2^-16, of x in 2^-16."""
-    above = looked_up(NORMAL, np.abs(x), GATE_FRAC - 6)
+    above = look_up(NORMAL, np.abs(x), GATE_FRAC - 6)
     return np.where(x < 0, 65536 - above, above)
 
 

@@ -53,7 +53,7 @@ def calibrate(
     moments = InputMoments(graph)
     for rows in recordings:
         # Values before the first weights are cheap: their range is taken over all ticks, not over a sample.
-        for name, values in _before_weights(graph, rows).items():
+        for name, values in _compute_inputs(graph, rows).items():
             _raise(ranges, name, values)
     for rows in pieces(recordings, ticks):
         moments.add(_follow(graph, rows, ranges))
@@ -89,7 +89,7 @@ def pieces(recordings: Sequence[NDArray[np.floating]], ticks: int) -> list[NDArr
     return cut
 
 
-def _before_weights(graph: Graph, rows: NDArray[np.floating]) -> dict[str, object]:
+def _compute_inputs(graph: Graph, rows: NDArray[np.floating]) -> dict[str, object]:
     inside = integer_part(graph)
     values: dict[str, object] = {INPUT: np.asarray(rows, dtype=np.float32)[:, None]}
     for layer in graph.layers:

@@ -28,7 +28,7 @@ class InputMoments:
     def add(self, values: Mapping[str, Array]) -> None:
         """Add a segment that begins with a reset: values ``(time, number)`` of every layer."""
         for layer in self.graph.layers:
-            for matrix, x in _multiplied(layer, values).items():
+            for matrix, x in _list_matrix_inputs(layer, values).items():
                 product = np.einsum("tri,trj->rij", x, x)
                 self._sums[matrix] = self._sums.get(matrix, 0.0) + product
         self._ticks += len(next(iter(values.values())))
@@ -40,7 +40,7 @@ class InputMoments:
         return {name: mean if name in apart else mean.mean(axis=0) for name, mean in means.items()}
 
 
-def _multiplied(layer: Layer, values: Mapping[str, Array]) -> dict[str, Array]:
+def _list_matrix_inputs(layer: Layer, values: Mapping[str, Array]) -> dict[str, Array]:
     """Return the inputs of the matrices of a layer, ``(time, row, terms)``."""
     if not layer.inputs:
         return {}

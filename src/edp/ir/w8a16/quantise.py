@@ -92,7 +92,7 @@ class _Work:
             self.integer_fracs[name] = self.frac(value)
         return name
 
-    def as_float(self, value: str) -> str:
+    def to_float(self, value: str) -> str:
         """Return the name of a value as floats."""
         if value not in self.integer_fracs:
             return value
@@ -141,14 +141,14 @@ def quantise(graph: Graph, chosen: Formats, moments: Mapping[str, NDArray[np.flo
                     f"layer '{layer.name}' multiplies what a feedback edge hands on; 8-bit weights would move its "
                     "poles, so it has no form in integer arithmetic: export in float32"
                 )
-            work.out.append(replace(layer, inputs=tuple(work.as_float(name) for name in layer.inputs)))
+            work.out.append(replace(layer, inputs=tuple(work.to_float(name) for name in layer.inputs)))
             continue
         inputs = tuple(work.as_fixed(name) for name in layer.inputs)
         # Inputs are brought into integers first, since a layer's own format depends on theirs.
         done = LOWER[kind](work, layer, [work.integer_fracs[name] for name in inputs])
         work.out.append(replace(done, inputs=inputs))
         work.integer_fracs[layer.name] = done.frac
-    results = {meaning: work.as_float(value) for meaning, value in graph.results.items()}
+    results = {meaning: work.to_float(value) for meaning, value in graph.results.items()}
     finished = Graph(graph.inputs, tuple(work.out), results, {}, graph.window)
     return replace(finished, initial=_initial(graph, finished, work))
 
@@ -186,7 +186,7 @@ def _initial(graph: Graph, finished: Graph, work: _Work) -> dict[tuple[str, str]
     return start
 
 
-def _within(frac: int, finest: int) -> int:
+def _limit_format(frac: int, finest: int) -> int:
     """Return a format that a right shift of 0 to 31 bits reaches from `finest`."""
     return min(max(frac, finest - 31), finest)
 
@@ -215,12 +215,12 @@ def _sum(work: _Work, x: layers.Elementwise, input_fracs: list[int]) -> quantise
     # 14 bits of difference: 16-bit values shifted by more would leave 32 bits.
     common = min(max(a, b), min(a, b) + 14)
     lefts, minus = (common - a, common - b), x.operation is BinaryOperation.SUBTRACT
-    frac = _within(frac, common)
+    frac = _limit_format(frac, common)
     return quantised.QSum(name=x.name, inputs=(), frac=frac, size=x.size, lefts=lefts, right=common - frac, minus=minus)
 
 
 def _multiply(work: _Work, x: layers.Elementwise, input_fracs: list[int]) -> quantised.FixedLayer:
-    frac = _within(work.frac(x.name), sum(input_fracs))
+    frac = _limit_format(work.frac(x.name), sum(input_fracs))
     return quantised.QMultiply(name=x.name, inputs=(), frac=frac, size=x.size, right=sum(input_fracs) - frac)
 
 
@@ -229,7 +229,7 @@ def _scale_shift(work: _Work, x: layers.ScaleShift, input_fracs: list[int]) -> q
     # Product and offset share the accumulator; 30 bits leave one for their sum.
     most = fixed.frac_for(float(np.abs(x.shift).max()), 30) - input_fracs[0]
     gain, bits = halves(x.gain, most)
-    frac = _within(work.frac(x.name), input_fracs[0] + bits)
+    frac = _limit_format(work.frac(x.name), input_fracs[0] + bits)
     offset = fixed.to_fixed(x.shift, input_fracs[0] + bits, 2**30 - 1).astype(np.int32)
     right = input_fracs[0] + bits - frac
     return quantised.QScaleShift(name=x.name, inputs=(), frac=frac, gain=gain, offset=offset, right=right)
@@ -256,7 +256,7 @@ def _dense(work: _Work, x: layers.Dense, input_fracs: list[int]) -> quantised.Fi
     return quantised.QDense(name=x.name, inputs=(), frac=work.frac(x.name), rows=x.rows, **work.rows(x, input_fracs[0]))
 
 
-def _grouped(work: _Work, x: layers.GroupedDense, input_fracs: list[int]) -> quantised.FixedLayer:
+def _quantise_grouped(work: _Work, x: layers.GroupedDense, input_fracs: list[int]) -> quantised.FixedLayer:
     return quantised.QGroupedDense(name=x.name, inputs=(), frac=work.frac(x.name), **work.rows(x, input_fracs[0]))
 
 
@@ -266,7 +266,7 @@ def _trees(work: _Work, x: layers.TreeSums, input_fracs: list[int]) -> quantised
     floor = np.floor(np.ldexp(x.threshold.astype(np.float64), input_fracs[0]))
     threshold = np.clip(floor, -(2**15), 2**15 - 1).astype(np.int16)
     leaf, bits = halves(x.leaf)
-    frac = _within(work.frac(x.name), bits)
+    frac = _limit_format(work.frac(x.name), bits)
     return quantised.QTreeSums(
         name=x.name,
         inputs=(),
@@ -312,7 +312,7 @@ def _min_gru(work: _Work, x: memory.MinGru, input_fracs: list[int]) -> quantised
 def _rotation(work: _Work, x: memory.Rotation, input_fracs: list[int]) -> quantised.FixedLayer:
     # The state must not be coarser than its input, which is shifted left to it.
     state_frac = max(work.frac(f"{x.name}/h"), input_fracs[0])
-    frac = _within(work.frac(x.name), state_frac)
+    frac = _limit_format(work.frac(x.name), state_frac)
     work.slots[x.name, "h"] = state_frac
     factor = fixed.to_fixed(x.factor, 30, 2**30).astype(np.int32)
     return quantised.QRotation(
@@ -322,7 +322,7 @@ def _rotation(work: _Work, x: memory.Rotation, input_fracs: list[int]) -> quanti
 
 def _difference(work: _Work, x: memory.Difference, input_fracs: list[int]) -> quantised.FixedLayer:
     factor, bits = halves(x.factor)
-    frac = _within(work.frac(x.name), input_fracs[0] + bits)
+    frac = _limit_format(work.frac(x.name), input_fracs[0] + bits)
     work.slots[x.name, "before"] = input_fracs[0]
     right = input_fracs[0] + bits - frac
     return quantised.QDifference(name=x.name, inputs=(), frac=frac, factor=factor, from_zero=x.from_zero, right=right)
@@ -363,7 +363,7 @@ LOWER: dict[type[Layer], Lower] = {
     layers.Activate: _activate,
     layers.Glu: _glu,
     layers.Dense: _dense,
-    layers.GroupedDense: _grouped,
+    layers.GroupedDense: _quantise_grouped,
     layers.TreeSums: _trees,
     memory.Convolution: _convolution,
     memory.Lstm: _lstm,

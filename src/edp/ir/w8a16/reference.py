@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from edp.ir import memory
 from edp.ir.base import INPUT, Graph, Layer, Number
-from edp.ir.descent import reached_leaves
+from edp.ir.descent import find_leaves
 from edp.ir.layers import Function
 from edp.ir.w8a16 import arithmetic as fixed
 from edp.ir.w8a16 import layers as quantised
-from edp.ir.w8a16.arithmetic import GATE_FRAC, GATE_LIMIT, LARGEST, UNIT_FRAC, Fixed, rounded_shift, saturated, scaled
+from edp.ir.w8a16.arithmetic import GATE_FRAC, GATE_LIMIT, LARGEST, UNIT_FRAC, Fixed, round_shift, saturated, scaled
 from edp.ir.w8a16.single import OVER_TIME, flat, gather, split
 
 Memory = dict[str, Any]
@@ -72,14 +72,14 @@ class Integers:
             if run is not None:
                 values[layer.name] = run(layer, self.memory[layer.name], *layer_inputs)
             elif isinstance(layer, quantised.Quantise):
-                values[layer.name] = self._quantised(layer, layer_inputs[0])
+                values[layer.name] = self._quantise(layer, layer_inputs[0])
             elif isinstance(layer, memory.Feed):
                 self.memory[layer.into]["last"] = layer_inputs[0][-1]
             else:
                 raise KeyError(type(layer))
         return values
 
-    def _quantised(self, layer: quantised.Quantise, x: NDArray[np.float32]) -> Fixed:
+    def _quantise(self, layer: quantised.Quantise, x: NDArray[np.float32]) -> Fixed:
         wide = x * np.float32(2.0**layer.frac)
         top = np.float32(LARGEST)
         self.clipped += int((~((wide >= -top) & (wide <= top))).sum())
@@ -100,7 +100,7 @@ def _gates(x: Fixed, weight: NDArray[np.int8], multiplier: Any, shift: Any) -> F
 
 
 def _to_gate(x: Fixed, frac: int) -> Fixed:
-    return saturated(rounded_shift(x, frac - GATE_FRAC), GATE_LIMIT)
+    return saturated(round_shift(x, frac - GATE_FRAC), GATE_LIMIT)
 
 
 def _dequantise(layer: quantised.Dequantise, m: Memory, x: Fixed) -> NDArray[np.float32]:
@@ -108,12 +108,12 @@ def _dequantise(layer: quantised.Dequantise, m: Memory, x: Fixed) -> NDArray[np.
 
 
 def _gather(layer: quantised.QGather, m: Memory, *parts: Fixed) -> Fixed:
-    return np.asarray(gather(layer, m, *map(rounded_shift, parts, layer.shifts)))
+    return np.asarray(gather(layer, m, *map(round_shift, parts, layer.shifts)))
 
 
 def _sum(layer: quantised.QSum, m: Memory, a: Fixed, b: Fixed) -> Fixed:
     a, b = a << layer.lefts[0], b << layer.lefts[1]
-    return saturated(rounded_shift(a - b if layer.minus else a + b, layer.right))
+    return saturated(round_shift(a - b if layer.minus else a + b, layer.right))
 
 
 def _activate(layer: quantised.QActivate, m: Memory, x: Fixed) -> Fixed:
@@ -125,14 +125,14 @@ def _activate(layer: quantised.QActivate, m: Memory, x: Fixed) -> Fixed:
     if layer.function is Function.TANH:
         return fixed.tanh(gate, GATE_FRAC)
     if layer.function is Function.GELU:
-        return saturated(rounded_shift(x * fixed.normal(gate), 16))
-    return saturated(rounded_shift(fixed.softplus(gate), GATE_FRAC - layer.frac))
+        return saturated(round_shift(x * fixed.normal(gate), 16))
+    return saturated(round_shift(fixed.softplus(gate), GATE_FRAC - layer.frac))
 
 
 def _glu(layer: quantised.QGlu, m: Memory, x: Fixed) -> Fixed:
     halves = x.reshape(*x.shape[:-1], layer.rows, 2, -1)
     gate = fixed.sigmoid(_to_gate(halves[..., 1, :], layer.frac))
-    return np.asarray(flat(rounded_shift(halves[..., 0, :] * gate, UNIT_FRAC)))
+    return np.asarray(flat(round_shift(halves[..., 0, :] * gate, UNIT_FRAC)))
 
 
 def _dense(layer: quantised.QDense, m: Memory, x: Fixed) -> Fixed:
@@ -140,15 +140,15 @@ def _dense(layer: quantised.QDense, m: Memory, x: Fixed) -> Fixed:
     return np.asarray(flat(saturated(scaled(sums, layer.multiplier, layer.shift))))
 
 
-def _grouped(layer: quantised.QGroupedDense, m: Memory, x: Fixed) -> Fixed:
+def _grouped_dense(layer: quantised.QGroupedDense, m: Memory, x: Fixed) -> Fixed:
     rows = split(x, len(layer.bias))
     sums = np.einsum("roi,tbri->tbro", layer.weight.astype(np.int64), rows) + layer.bias
     return np.asarray(flat(saturated(scaled(sums, layer.multiplier, layer.shift))))
 
 
 def _trees(layer: quantised.QTreeSums, m: Memory, x: Fixed) -> Fixed:
-    leaves = reached_leaves(layer.feature, layer.threshold, layer.leaf, x)
-    return saturated(rounded_shift(leaves.sum(axis=-1, dtype=np.int64), layer.right))
+    leaves = find_leaves(layer.feature, layer.threshold, layer.leaf, x)
+    return saturated(round_shift(leaves.sum(axis=-1, dtype=np.int64), layer.right))
 
 
 def _convolution(layer: quantised.QConvolution, m: Memory, x: Fixed) -> Fixed:
@@ -170,10 +170,10 @@ def _lstm(layer: quantised.QLstm, m: Memory, x: Fixed) -> Fixed:
         i, f, o = np.moveaxis(fixed.sigmoid(gates[..., [0, 1, 3], :]), -2, 0)
         # Both terms in the format of the product, so that one rounding remains.
         product = f * c + ((i * fixed.tanh(gates[..., 2, :], GATE_FRAC)) << (fixed.CELL_FRAC - UNIT_FRAC))
-        fresh = saturated(rounded_shift(product, UNIT_FRAC), fixed.CELL_LIMIT)
-        shown = rounded_shift(o * fixed.tanh(fresh, fixed.CELL_FRAC), UNIT_FRAC)
-        c = c + rounded_shift(layer.share * (fresh - c), UNIT_FRAC)
-        h = h + rounded_shift(layer.share * (shown - h), UNIT_FRAC)
+        fresh = saturated(round_shift(product, UNIT_FRAC), fixed.CELL_LIMIT)
+        shown = round_shift(o * fixed.tanh(fresh, fixed.CELL_FRAC), UNIT_FRAC)
+        c = c + round_shift(layer.share * (fresh - c), UNIT_FRAC)
+        h = h + round_shift(layer.share * (shown - h), UNIT_FRAC)
         out[tick] = h
     m["h"], m["c"] = h, c
     return out
@@ -186,8 +186,8 @@ def _gru(layer: quantised.QGru, m: Memory, x: Fixed) -> Fixed:
     for tick, ahead in enumerate(split(driven, 3)):
         back = split(_gates(h, layer.weight_h, layer.multiplier_h, layer.shift_h) + layer.bias_h, 3)
         r, z = np.moveaxis(fixed.sigmoid(ahead[..., :2, :] + back[..., :2, :]), -2, 0)
-        n = fixed.tanh(ahead[..., 2, :] + rounded_shift(r * back[..., 2, :], UNIT_FRAC), GATE_FRAC)
-        h = n + rounded_shift(z * (h - n), UNIT_FRAC)
+        n = fixed.tanh(ahead[..., 2, :] + round_shift(r * back[..., 2, :], UNIT_FRAC), GATE_FRAC)
+        h = n + round_shift(z * (h - n), UNIT_FRAC)
         out[tick] = h
     m["h"] = h
     return out
@@ -198,10 +198,10 @@ def _min_gru(layer: quantised.QMinGru, m: Memory, x: Fixed) -> Fixed:
     fresh, h = x[..., layer.units :] << layer.EXTRA, m["h"]
     out = np.empty_like(fresh)
     for tick in range(len(x)):
-        h = h + rounded_shift(z[tick] * (fresh[tick] - h), UNIT_FRAC)
+        h = h + round_shift(z[tick] * (fresh[tick] - h), UNIT_FRAC)
         out[tick] = h
     m["h"] = h
-    return saturated(rounded_shift(out, layer.EXTRA))
+    return saturated(round_shift(out, layer.EXTRA))
 
 
 def _rotation(layer: quantised.QRotation, m: Memory, x: Fixed) -> Fixed:
@@ -210,18 +210,18 @@ def _rotation(layer: quantised.QRotation, m: Memory, x: Fixed) -> Fixed:
     re, im = m["h"][..., 0], m["h"][..., 1]
     out = np.empty_like(driven)
     for tick, add in enumerate(driven):
-        turned = rounded_shift(a * re - b * im, 30), rounded_shift(a * im + b * re, 30)
+        turned = round_shift(a * re - b * im, 30), round_shift(a * im + b * re, 30)
         re, im = (saturated(turned[i] + add[..., i], fixed.CELL_LIMIT) for i in (0, 1))
         out[tick, ..., 0], out[tick, ..., 1] = re, im
     m["h"] = np.stack([re, im], axis=-1)
-    return saturated(rounded_shift(out.reshape(x.shape), layer.right))
+    return saturated(round_shift(out.reshape(x.shape), layer.right))
 
 
 def _difference(layer: quantised.QDifference, m: Memory, x: Fixed) -> Fixed:
     before = m["before"] if layer.from_zero or m["age"][0] > 0 else x[0]
     change = x - np.concatenate([before[None], x[:-1]])
     m["before"], m["age"] = x[-1], np.ones_like(m["age"])
-    return saturated(rounded_shift(layer.factor * change, layer.right))
+    return saturated(round_shift(layer.factor * change, layer.right))
 
 
 def _mean(layer: quantised.QTrailingMean, m: Memory, x: Fixed) -> Fixed:
@@ -245,7 +245,7 @@ def _pool(layer: quantised.QAttentionPool, m: Memory, x: Fixed) -> Fixed:
         first, stop = tick + window - min(age + tick + 1, window), tick + window
         weights = fixed.softmax(scores[first:stop].T).astype(np.float64)
         sums = np.einsum("bs,sbn->bn", weights, ring[first:stop].astype(np.float64))
-        out[tick] = rounded_shift(sums.astype(np.int64), UNIT_FRAC)
+        out[tick] = round_shift(sums.astype(np.int64), UNIT_FRAC)
     m["ring"], m["scores"] = ring[len(x) :], scores[len(x) :]
     m["age"] = np.full_like(m["age"], min(age + len(x), window))
     return saturated(out)
@@ -255,12 +255,12 @@ INTEGER_STEPS: dict[type[Layer], Callable[..., Any]] = {
     quantised.Dequantise: _dequantise,
     quantised.QGather: _gather,
     quantised.QSum: _sum,
-    quantised.QMultiply: lambda layer, m, a, b: saturated(rounded_shift(a * b, layer.right)),
-    quantised.QScaleShift: lambda layer, m, x: saturated(rounded_shift(x * layer.gain + layer.offset, layer.right)),
+    quantised.QMultiply: lambda layer, m, a, b: saturated(round_shift(a * b, layer.right)),
+    quantised.QScaleShift: lambda layer, m, x: saturated(round_shift(x * layer.gain + layer.offset, layer.right)),
     quantised.QActivate: _activate,
     quantised.QGlu: _glu,
     quantised.QDense: _dense,
-    quantised.QGroupedDense: _grouped,
+    quantised.QGroupedDense: _grouped_dense,
     quantised.QTreeSums: _trees,
     quantised.QConvolution: _convolution,
     quantised.QLstm: _lstm,

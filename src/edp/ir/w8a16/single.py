@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from edp.ir import layers, memory
 from edp.ir.base import Layer
-from edp.ir.descent import reached_leaves, summed
+from edp.ir.descent import find_leaves, summed
 from edp.ir.layers import BinaryOperation, Function
 
 Rows = NDArray[np.float32]
@@ -93,7 +93,7 @@ def _gelu(x: Rows) -> Rows:
     return np.asarray(np.float32(0.5) * x * (ONE + erf))
 
 
-def _turned(x: Rows, quarters: int) -> Rows:
+def _sine_of_quadrant(x: Rows, quarters: int) -> Rows:
     """Return the runtime's sine of x plus a number of quarter turns."""
     f = np.float32
     # 8,192 rad: up to there n times the parts of pi/2 below stays exact.
@@ -120,8 +120,8 @@ FUNCTIONS: dict[Function, Callable[[Rows], Rows]] = {
     Function.SOFTPLUS: _softplus,
     Function.EXP: exp,
     Function.SQRT: np.sqrt,
-    Function.SINE: lambda x: _turned(x, 0),
-    Function.COSINE: lambda x: _turned(x, 1),
+    Function.SINE: lambda x: _sine_of_quadrant(x, 0),
+    Function.COSINE: lambda x: _sine_of_quadrant(x, 1),
     Function.LOG: _log,
     Function.POSITIVE: lambda x: (x > 0).astype(np.float32),
 }
@@ -239,7 +239,7 @@ def _glu(layer: layers.Glu, m: Memory, x: Rows) -> Rows:
 
 
 def _trees(layer: layers.TreeSums, m: Memory, x: Rows) -> Rows:
-    return summed(reached_leaves(layer.feature, layer.threshold, layer.leaf, x))
+    return summed(find_leaves(layer.feature, layer.threshold, layer.leaf, x))
 
 
 def _clip(layer: layers.Clip, m: Memory, x: Rows) -> Rows:

@@ -88,7 +88,7 @@ def _readers() -> tuple[Any, Any]:
     from rosbags.rosbag2 import storage_mcap
 
     for kind in ("bz2", "lz4"):
-        rosbag1.decompressors[kind] = partial(_by_ratio, kind)
+        rosbag1.decompressors[kind] = partial(_unpack_by_ratio, kind)
     for kind in ("lz4", "zstd"):
         storage_mcap.DECOMPRESSORS[kind] = partial(_to_size, kind)
     for name, replacement in {"zstd": _Zstd, "TemporaryDirectory": NoFolder, "Path": place}.items():
@@ -122,7 +122,7 @@ def _to_size(kind: str, data: bytes, size: int) -> bytes:
     return unpack_to(kind, data, size)
 
 
-def _by_ratio(kind: str, data: bytes) -> bytes:
+def _unpack_by_ratio(kind: str, data: bytes) -> bytes:
     """For packed parts whose size unpacked is announced nowhere that the library looks."""
     # A chunk of ROS 1 announces its size in its header, which the library's call does not hand over.
     limit = RATIO * len(data) + SPARE
@@ -137,7 +137,7 @@ class _Zstd:
 
     @staticmethod
     def decompress(data: bytes) -> bytes:
-        return _by_ratio("zstd", data)
+        return _unpack_by_ratio("zstd", data)
 
     @staticmethod
     def open(stream: Any, mode: str) -> Any:

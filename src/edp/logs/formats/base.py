@@ -136,14 +136,14 @@ class RawLog:
         if name in self.repeated:
             raise DataError(
                 f"'{self.path}' has {len(self.repeated[name])} columns named '{name}': "
-                f"{self._told_apart(name)}; name the wanted one in the signal map"
+                f"{self._list_signals(name)}; name the wanted one in the signal map"
             )
         raise DataError(
             f"'{self.path}' has no column '{name}'{closest(name, [*self.signals, *self.scalars])}; "
             "name an existing column in the signal map"
         )
 
-    def _told_apart(self, name: str) -> str:
+    def _list_signals(self, name: str) -> str:
         same_named = [self.signals[full] for full in self.repeated[name]]
         return ", ".join(signal.name + (f" [{signal.unit}]" if signal.unit else "") for signal in same_named[:8])
 

@@ -30,7 +30,7 @@ from edp.logs.formats.base import (
 from edp.logs.formats.csv_controldesk import controldesk_head, read_controldesk
 from edp.logs.formats.csv_dates import dates_of, is_date
 from edp.logs.formats.csv_encoding import encoding_of
-from edp.logs.formats.csv_messages import at_own_times, message_columns
+from edp.logs.formats.csv_messages import drop_empty_rows, message_columns
 from edp.logs.formats.csv_preamble import TablePlace, find_table
 from edp.logs.formats.csv_scope import read_scope, scope_head
 from edp.logs.formats.csv_table import CsvTable, TextLayout, has_decimal_commas, is_grouped, is_number
@@ -96,7 +96,7 @@ class CsvFormat:
                 name = f"column_{column_index + 1}.{shared_name}"
                 repeated.setdefault(shared_name, []).append(name)
             if column_index in sparse and time is not None:
-                signals[name] = at_own_times(table, column_index, name, time)
+                signals[name] = drop_empty_rows(table, column_index, name, time)
                 continue
             key = str(column_index)
             load = partial(load_column, table, key, table.rows)
@@ -142,7 +142,7 @@ def _layout(path: Path, signal_map: SignalMap) -> TextLayout:
         decimal = ","
     if not signal_map.header:
         body = rows[table_place.first :]
-        names, units = _stated_columns(path, body, signal_map)
+        names, units = _read_mapped_columns(path, body, signal_map)
         used = table_place.first
     elif _holds_numbers_only(head, decimal):
         names, units, used = (
@@ -315,10 +315,10 @@ def _delimiter_of_numbers(path: Path, lines: list[str]) -> str:
         score = (round(sum(map(is_some_number, cells)) / len(cells), 2), width)
         if score > best_score:
             best, best_score = delimiter, score
-    return _BLANKS if best_score == (0.0, 0) and _parted_by_blanks(tail) else best
+    return _BLANKS if best_score == (0.0, 0) and _is_separated_by_blanks(tail) else best
 
 
-def _parted_by_blanks(lines: list[str]) -> bool:
+def _is_separated_by_blanks(lines: list[str]) -> bool:
     """Return whether each line has the same number of numeric cells, two or more, separated by blanks."""
     rows = [line.split() for line in lines]
     widths = {len(row) for row in rows}
@@ -358,7 +358,7 @@ def _is_unit_row(row: list[str]) -> bool:
     return any(is_unit) and not any(is_number(cell) or is_number(cell, ",") for cell in words)
 
 
-def _stated_columns(
+def _read_mapped_columns(
     path: Path, rows: list[list[str]], signal_map: SignalMap
 ) -> tuple[tuple[str, ...], tuple[str | None, ...]]:
     width = len(rows[0])
@@ -376,7 +376,7 @@ def _stamps(table: CsvTable, column_index: int, signal_map: SignalMap) -> Column
     if table.types[table.keys[column_index]] != pa.string():
         return load_column(table, str(column_index), table.rows) * time_factor(name, unit, signal_map)
     cells = table.texts(column_index)
-    numbers = table.grouped_numbers(column_index)
+    numbers = table.parse_grouped_numbers(column_index)
     if numbers is not None:
         return numbers * time_factor(name, unit, signal_map)
     try:

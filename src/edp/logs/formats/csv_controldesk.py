@@ -82,7 +82,7 @@ def controldesk_head(path: Path, lines: Sequence[str], encoding: str) -> Control
         raise DataError(
             f"'{path}': this export of ControlDesk has no column of time before its traces; export it again"
         )
-    told_apart = _told_apart(names, paths, times)
+    told_apart = _make_names_unique(names, paths, times)
     repeated: dict[str, list[str]] = {}
     for i, name in enumerate(names):
         if told_apart[i] and name and names.count(name) > 1:
@@ -127,7 +127,7 @@ def _rows_of_head(path: Path, encoding: str, delimiter: str) -> tuple[dict[str, 
     return rows, sample, used
 
 
-def _told_apart(names: Sequence[str], paths: Sequence[str], times: Sequence[int]) -> tuple[str, ...]:
+def _make_names_unique(names: Sequence[str], paths: Sequence[str], times: Sequence[int]) -> tuple[str, ...]:
     """Return unique column names: the trace name, or the block name in its path if the trace name is ambiguous."""
     shared = Counter(names)
     blocks = [

@@ -124,7 +124,7 @@ class PassedText(io.RawIOBase):
     def readinto(self, buffer: Any) -> int:
         """Fill a buffer with the available text."""
         while not self._rest:
-            text = self._changed()
+            text = self._convert_block()
             if text is None:
                 return 0
             self._rest = text
@@ -138,7 +138,7 @@ class PassedText(io.RawIOBase):
         self._stream.close()
         super().close()
 
-    def _changed(self) -> bytes | None:
+    def _convert_block(self) -> bytes | None:
         """Return the next lines after filtering; None at the end of the text."""
         raise NotImplementedError
 
@@ -161,7 +161,7 @@ class TableText(PassedText):
         self._names = leftovers.names
         self._marked = (MARK + delimiter * width + "\n").encode()
 
-    def _changed(self) -> bytes | None:
+    def _convert_block(self) -> bytes | None:
         lines = self._stream.readlines(min(_PIECE_BYTES, self._left)) if self._left > 0 else []
         text = bytearray()
         for line in lines:

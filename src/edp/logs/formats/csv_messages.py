@@ -36,7 +36,7 @@ def message_columns(table: CsvTable) -> set[int]:
     return sparse if len(sparse) > 1 and full <= 1 else set()
 
 
-def at_own_times(table: CsvTable, column_index: int, name: str, time: Column) -> RawSignal:
+def drop_empty_rows(table: CsvTable, column_index: int, name: str, time: Column) -> RawSignal:
     """Return a column reduced to the rows that contain a number."""
     values = load_column(table, str(column_index), table.rows)
     present = np.isfinite(values)

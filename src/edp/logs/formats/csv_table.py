@@ -93,7 +93,7 @@ def has_decimal_commas(rows: list[list[str]], delimiter: str) -> bool:
     return bool(with_comma)
 
 
-def _without_groups(cells: pa.Array) -> pa.Array | None:
+def _parse_without_groups(cells: pa.Array) -> pa.Array | None:
     """Parse numbers with decimal comma and thousands points; None if a text is neither a number nor missing."""
     cells = pc.utf8_trim_whitespace(cells)
     cells = pc.if_else(pc.is_in(cells, pa.array(NULLS)), pa.scalar(None, pa.string()), cells)
@@ -103,7 +103,7 @@ def _without_groups(cells: pa.Array) -> pa.Array | None:
     return pc.cast(pc.replace_substring_regex(plain, r"^\+", ""), pa.float64())
 
 
-def _switched(cells: pa.Array) -> pa.Array | None:
+def _parse_switch(cells: pa.Array) -> pa.Array | None:
     """Convert switch states to 0 and 1; None if a text is not a state."""
     cells = pc.utf8_lower(pc.utf8_trim_whitespace(cells))
     missing = pc.is_in(cells, pa.array([text.lower() for text in NULLS]))
@@ -113,7 +113,7 @@ def _switched(cells: pa.Array) -> pa.Array | None:
     return pc.if_else(missing, pa.scalar(None, pa.float64()), pc.cast(on, pa.float64()))
 
 
-def _scaled(cells: pa.Array) -> pa.Array | None:
+def _parse_scaled(cells: pa.Array) -> pa.Array | None:
     """Numbers with a prefix of SI behind them (``25.1m``), as panels of instruments write them; None for other text."""
     cells = pc.utf8_trim_whitespace(cells)
     cells = pc.if_else(pc.is_in(cells, pa.array(NULLS)), pa.scalar(None, pa.string()), cells)
@@ -151,7 +151,7 @@ class SqueezedText(PassedText):
         for _ in range(skip):
             self._stream.readline(_LONGEST_LINE)
 
-    def _changed(self) -> bytes | None:
+    def _convert_block(self) -> bytes | None:
         lines = self._stream.readlines(_SQUEEZED_BYTES)
         return "".join(" ".join(line.split()) + "\n" for line in lines).encode() if lines else None
 
@@ -281,27 +281,27 @@ class CsvTable:
             low, high = max(start - first, 0), min(stop - first, batch.num_rows)
             if high > low:
                 part = batch.slice(low, high - low)
-                columns = {key: self._grouped(part.column(key), at) for key, at in grouped.items()}
+                columns = {key: self._parse_grouped(part.column(key), at) for key, at in grouped.items()}
                 arrays = [columns[key] if key in columns else part.column(key) for key in keys]
                 yield [np.asarray(array.to_numpy(zero_copy_only=False), dtype=np.float64) for array in arrays]
             first += batch.num_rows
             if first >= stop:
                 return
 
-    def _grouped(self, cells: pa.Array, column_index: int) -> pa.Array:
+    def _parse_grouped(self, cells: pa.Array, column_index: int) -> pa.Array:
         """Numbers of a column of text: those that have points for thousands, or the states of a switch."""
-        numbers = _without_groups(cells) if self.layout.decimal == "," else None
-        numbers = _switched(cells) if numbers is None else numbers
-        numbers = _scaled(cells) if numbers is None and self.layout.decimal == "." else numbers
+        numbers = _parse_without_groups(cells) if self.layout.decimal == "," else None
+        numbers = _parse_switch(cells) if numbers is None else numbers
+        numbers = _parse_scaled(cells) if numbers is None and self.layout.decimal == "." else numbers
         if numbers is None:
             self.refuse_text(column_index)
         return numbers
 
-    def grouped_numbers(self, column_index: int) -> NDArray[np.float64] | None:
+    def parse_grouped_numbers(self, column_index: int) -> NDArray[np.float64] | None:
         """Return a text column as numbers with thousands points, shape ``(rows,)``; None if it is not numeric."""
         if self.layout.decimal != ",":
             return None
-        parts = [_without_groups(batch.column(0)) for batch in self.stream([self.keys[column_index]])]
+        parts = [_parse_without_groups(batch.column(0)) for batch in self.stream([self.keys[column_index]])]
         if any(part is None or part.null_count == len(part) for part in parts):
             return None
         columns = [

@@ -27,7 +27,7 @@ class EdpMetadata:
     digest: str | None = None
     truth_digest: str | None = None
 
-    def for_log(self) -> Table:
+    def to_log_metadata(self) -> Table:
         """Return the metadata for a `RawLog`."""
         return {
             "rate_hz": self.rate_hz,
@@ -54,15 +54,15 @@ def facts_text(recording: Recording, truth: Recording | None = None) -> str:
         "rate_hz": recording.rate_hz,
         "source": recording.source,
         "meta": dict(recording.meta),
-        "channels": _listed(recording.channels),
+        "channels": _list_channels(recording.channels),
         "digest": recording.digest,
     }
     if truth is not None:
-        facts |= {"truth": _listed(truth.channels), "truth_digest": truth.digest}
+        facts |= {"truth": _list_channels(truth.channels), "truth_digest": truth.digest}
     return json.dumps(facts)
 
 
-def _listed(channels: Sequence[Channel]) -> list[dict[str, str]]:
+def _list_channels(channels: Sequence[Channel]) -> list[dict[str, str]]:
     return [{"name": c.name, "unit": c.unit, "kind": str(c.kind), "description": c.description} for c in channels]
 
 

@@ -172,7 +172,7 @@ def _raw_log(path: Path, mat_variables: MatVariables, edp_metadata: EdpMetadata,
     repeated = {
         name: full for name, full in mat_variables.repeated.items() if name != time_name and set(full) <= set(signals)
     }
-    facts = edp_metadata.for_log()
+    facts = edp_metadata.to_log_metadata()
     if mat_variables.experiment_names:
         facts["meta"] = {**facts.get("meta", {}), EXPERIMENTS: mat_variables.experiment_names}
     return RawLog(path, signals, mat_variables.scalars, repeated=repeated, **facts)

@@ -140,11 +140,11 @@ def _dataset_of(recording: Recording, signals: list[tuple[str, str, Any]]) -> An
     elements = np.empty((1, len(signals)), dtype=object)
     for i, (name, unit, values) in enumerate(signals):
         elements[0, i] = _one_timeseries(recording, name, unit, values)
-    storage = _saved(_STORAGE, {"Version": np.array([[2.0]]), "Elements": elements})
-    return _saved(_DATASET, {"Name": np.array([""]), "Version": np.array([[3.0]]), "Storage": storage})
+    storage = _save_object(_STORAGE, {"Version": np.array([[2.0]]), "Elements": elements})
+    return _save_object(_DATASET, {"Name": np.array([""]), "Version": np.array([[3.0]]), "Storage": storage})
 
 
-def _saved(classname: str, fields: dict[str, object]) -> MatlabOpaque:
+def _save_object(classname: str, fields: dict[str, object]) -> MatlabOpaque:
     """Return an object as its ``saveobj`` stores it: a single property ``any`` with a struct."""
     struct = np.empty((1, 1), dtype=[(name, object) for name in fields])
     for name, value in fields.items():

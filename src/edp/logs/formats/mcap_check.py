@@ -35,7 +35,7 @@ def check_records(path: Path | MemoryFile) -> None:
     """
     size = path.stat().st_size
     if size < 2 * len(_MAGIC) + _PREFIX:
-        raise _broken(Path(str(path)), "ends inside its header (truncated)")
+        raise _damage_error(Path(str(path)), "ends inside its header (truncated)")
     if isinstance(path, MemoryFile):
         _walk(Path(path.name), memoryview(path.data), size)
         return
@@ -46,23 +46,23 @@ def check_records(path: Path | MemoryFile) -> None:
 def _walk(path: Path, view: mmap.mmap | memoryview, size: int) -> None:
     # Looked at first: without its end a file has no index, and the library would search for one.
     if view[-len(_MAGIC) :] != _MAGIC:
-        raise _broken(path, "has no end (truncated, half downloaded, or its recorder was killed)")
+        raise _damage_error(path, "has no end (truncated, half downloaded, or its recorder was killed)")
     walk = _Walk(path, view)
     at, last = len(_MAGIC), 0
     while at < size - len(_MAGIC):
         if at + _PREFIX > size - len(_MAGIC):
-            raise _broken(path, f"has at byte {at} a record that is cut off")
+            raise _damage_error(path, f"has at byte {at} a record that is cut off")
         last, length = struct.unpack_from("<BQ", view, at)
         # Operation code 0 is none of MCAP's: zeros of a lost block would be walked as empty records.
         if not last or at + _PREFIX + length > size - len(_MAGIC):
-            raise _broken(path, f"has at byte {at} a record of {length} bytes, more than the file holds")
+            raise _damage_error(path, f"has at byte {at} a record of {length} bytes, more than the file holds")
         try:
             walk.record(last, at + _PREFIX, length)
         except struct.error as error:
-            raise _broken(path, f"has at byte {at} a record that is cut off ({error})") from error
+            raise _damage_error(path, f"has at byte {at} a record that is cut off ({error})") from error
         at += _PREFIX + length
     if last != _FOOTER:
-        raise _broken(path, "has no footer (truncated)")
+        raise _damage_error(path, "has no footer (truncated)")
     walk.end()
 
 
@@ -79,7 +79,7 @@ class _Walk:
 
     def record(self, kind: int, at: int, length: int) -> None:
         if length > _LONGEST.get(kind, length):
-            raise _broken(self.path, f"has at byte {at} a definition of {length} bytes")
+            raise _damage_error(self.path, f"has at byte {at} a definition of {length} bytes")
         if kind == _CHUNK:
             self.chunk(at, length)
         elif kind == _CHUNK_INDEX:
@@ -95,31 +95,33 @@ class _Walk:
     def chunk(self, at: int, length: int) -> None:
         """Check a chunk: times (16 bytes), unpacked size (8), checksum (4), compression, packed size (8), content."""
         if length < 40:
-            raise _broken(self.path, f"has at byte {at} a chunk of {length} bytes")
+            raise _damage_error(self.path, f"has at byte {at} a chunk of {length} bytes")
         start, stop, unpacked, _, named = struct.unpack_from("<QQQII", self.view, at)
         if 40 + named > length:
-            raise _broken(self.path, f"has at byte {at} a chunk whose packing has a name of {named} bytes")
+            raise _damage_error(self.path, f"has at byte {at} a chunk whose packing has a name of {named} bytes")
         (packed,) = struct.unpack_from("<Q", self.view, at + 32 + named)
         if packed != length - 40 - named:
-            raise _broken(self.path, f"has at byte {at} a chunk of {length} bytes that announces {packed}")
+            raise _damage_error(self.path, f"has at byte {at} a chunk of {length} bytes that announces {packed}")
         self.weigh(at, start, stop, packed, unpacked)
 
     def index(self, at: int, length: int) -> None:
         """Check a chunk index: times (16 bytes), position and length of the chunk (16), lists, and both sizes (16)."""
         if length < 64:
-            raise _broken(self.path, f"has at byte {at} an index of {length} bytes")
+            raise _damage_error(self.path, f"has at byte {at} an index of {length} bytes")
         start, stop, chunk_offset, _ = struct.unpack_from("<QQQQ", self.view, at)
         packed, unpacked = struct.unpack_from("<QQ", self.view, at + length - 16)
         if chunk_offset in self.indexed:
-            raise _broken(self.path, f"has at byte {at} a second index of the chunk at byte {chunk_offset}")
+            raise _damage_error(self.path, f"has at byte {at} a second index of the chunk at byte {chunk_offset}")
         self.indexed.add(chunk_offset)
         if packed > len(self.view):
-            raise _broken(self.path, f"has at byte {at} an index of {packed} packed bytes, more than the file holds")
+            raise _damage_error(
+                self.path, f"has at byte {at} an index of {packed} packed bytes, more than the file holds"
+            )
         self.weigh(at, start, stop, packed, unpacked)
 
     def weigh(self, at: int, start: int, stop: int, packed: int, unpacked: int) -> None:
         if unpacked > RATIO * packed + SPARE:
-            raise _broken(self.path, f"has at byte {at} a chunk of {packed} bytes that claims to hold {unpacked}")
+            raise _damage_error(self.path, f"has at byte {at} a chunk of {packed} bytes that claims to hold {unpacked}")
         check_memory(self.path, unpacked, "a chunk of messages", "it may be damaged; record smaller chunks")
         self.unpacked += unpacked
         # Starts (1) sort before ends (2) of the same moment, so that touching chunks count together.
@@ -134,8 +136,8 @@ class _Walk:
         # Each chunk stands here twice, by itself and by its index.
         check_memory(self.path, most // 2, "the chunks of one moment", "it may be damaged; record it again")
         if self.announced * _SMALLEST_MESSAGE > self.unpacked:
-            raise _broken(self.path, f"announces {self.announced} messages in {self.unpacked} bytes")
+            raise _damage_error(self.path, f"announces {self.announced} messages in {self.unpacked} bytes")
 
 
-def _broken(path: Path, what: str) -> DataError:
+def _damage_error(path: Path, what: str) -> DataError:
     return DataError(f"'{path}' is a damaged MCAP file: it {what}; copy or record it again")

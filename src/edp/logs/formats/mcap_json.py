@@ -115,7 +115,7 @@ def read_json_mcap(path: Path) -> RawLog:
     signals, aliases, repeated = told_apart(named_signals)
     if facts.channels:
         signals, repeated = only(facts.channels, signals, repeated)
-    return RawLog(path, signals, aliases=aliases, repeated=repeated, **facts.for_log())
+    return RawLog(path, signals, aliases=aliases, repeated=repeated, **facts.to_log_metadata())
 
 
 def _signals(topic: _Topic, facts: EdpMetadata, origin: int) -> Iterator[tuple[str, RawSignal]]:
@@ -200,7 +200,7 @@ def _records(path: Path, view: memoryview) -> Iterator[tuple[int, memoryview]]:
         if kind == _DATA_END:
             return
         if kind == _CHUNK:
-            yield from _walk(memoryview(_unpacked(path, body)))
+            yield from _walk(memoryview(_unpack_chunk(path, body)))
         else:
             yield kind, body
 
@@ -216,7 +216,7 @@ def _walk(view: memoryview) -> Iterator[tuple[int, memoryview]]:
         at += length
 
 
-def _unpacked(path: Path, body: memoryview) -> bytes | memoryview:
+def _unpack_chunk(path: Path, body: memoryview) -> bytes | memoryview:
     """Return the records of a chunk, at most as many bytes as it announces (`mcap_check` has checked the size)."""
     size, _, named = struct.unpack_from("<QII", body, 16)
     packing = bytes(body[32 : 32 + named]).decode()

@@ -24,7 +24,7 @@ from edp.logs.formats.edp_metadata import EdpMetadata, facts_text, parse_edp_met
 from edp.logs.formats.mdf_check import check_blocks
 from edp.logs.formats.mdf_conversion import Conversion, refuse_engines
 from edp.logs.formats.mdf_events import LogEvent, event_blocks
-from edp.logs.formats.names import only, shown_name, told_apart
+from edp.logs.formats.names import only, quote_name, told_apart
 from edp.logs.units import normalise_unit
 from edp.recording import Recording
 from edp.signals import SignalMap
@@ -83,7 +83,7 @@ class MdfFormat:
         signals, aliases, repeated = told_apart(named_signals)
         if edp_metadata.channels:
             signals, repeated = only(edp_metadata.channels, signals, repeated)
-        return RawLog(path, signals, aliases=aliases, repeated=repeated, **edp_metadata.for_log())
+        return RawLog(path, signals, aliases=aliases, repeated=repeated, **edp_metadata.to_log_metadata())
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
         """Write one packed channel group of float32 with the time in s, and EDP's metadata as an attachment."""
@@ -141,13 +141,13 @@ class _File:
         if block is None:
             return raw
         name = self.log.groups[number].channels[channel_index].name
-        return Conversion(block, f"'{self.path}', channel {shown_name(name)}")(raw)
+        return Conversion(block, f"'{self.path}', channel {quote_name(name)}")(raw)
 
     def facts(self) -> EdpMetadata:
         for attachment in self.log.attachments:
             if attachment.file_name == _FACTS:
                 where = f"'{self.path}', attachment '{_FACTS}'"
-                return parse_edp_metadata(_embedded(attachment, where).decode(errors="replace"), where)
+                return parse_edp_metadata(_read_embedded(attachment, where).decode(errors="replace"), where)
         return EdpMetadata()
 
     def group(self, number: int, edp_metadata: EdpMetadata, signal_map: SignalMap) -> list[tuple[str, RawSignal]]:
@@ -244,7 +244,7 @@ def _valid(signal: Any, values: NDArray[Any]) -> NDArray[Any]:
     return np.where(invalid, np.nan, values) if invalid.any() else values
 
 
-def _embedded(attachment: Any, where: str) -> bytes:
+def _read_embedded(attachment: Any, where: str) -> bytes:
     """Return the bytes of an attachment inside the file, unpacked up to `_FACTS_BYTES`; no other file is opened.
 
     Raises:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from edp.errors import DataError
 from edp.storage.memory import check_memory
-from edp.storage.unpacking import DEFLATE_RATIO, unpacked_size
+from edp.storage.unpacking import DEFLATE_RATIO, measure_unpacked
 
 _HEAD = 24
 """Bytes of a block before its links: id 4, reserved 4, length 8, count of links 8."""
@@ -77,7 +77,7 @@ def check_blocks(path: Path) -> None:
     with path.open("rb") as stream:
         head = stream.read(_FIRST + _HEAD)
         if len(head) < _FIRST + _HEAD:
-            raise _broken(path, "ends inside its header (truncated)")
+            raise _damage_error(path, "ends inside its header (truncated)")
         version = struct.unpack_from("<H", head, 28)[0]
         if not 400 <= version < 500:
             raise DataError(
@@ -92,7 +92,7 @@ def check_blocks(path: Path) -> None:
             try:
                 _Walk(path, view).run()
             except struct.error as error:
-                raise _broken(path, f"has a block that is cut off ({error})") from error
+                raise _damage_error(path, f"has a block that is cut off ({error})") from error
 
 
 class _Walk:
@@ -160,7 +160,7 @@ class _Walk:
         if start + packed > block.at + block.length:
             raise self.broken(block.at, f"a packed block of {packed} bytes in {block.length}")
         try:
-            size = unpacked_size(_PACKINGS[kind], self.view[start : start + packed], original)
+            size = measure_unpacked(_PACKINGS[kind], self.view[start : start + packed], original)
         except Exception as error:
             # Each packing has exceptions of its own for damaged bytes.
             raise self.broken(block.at, f"a packed block that cannot be unpacked ({error})") from error
@@ -180,7 +180,7 @@ class _Walk:
                 count, more = self.conversion(block.links[4], seen, 0)
                 entries, text = entries + count, text + more
         if entries > _MOST_ENTRIES or text > _MOST_TEXT + _TEXT_RATIO * len(self.view):
-            raise _broken(
+            raise _damage_error(
                 self.path,
                 f"states {entries} entries of conversions and {text} bytes of text, by blocks used many times",
             )
@@ -222,7 +222,7 @@ class _Walk:
         needed = cycles * (values + (0 if columns else invalid))
         memory_bytes = 0 if data is None else self.held(data)
         if memory_bytes != needed:
-            raise _broken(
+            raise _damage_error(
                 self.path,
                 f"announces {cycles} records of {values + invalid} bytes and holds {memory_bytes} bytes of them "
                 "(truncated?)",
@@ -274,12 +274,12 @@ class _Walk:
         return block.length - _HEAD
 
     def broken(self, at: int, what: str) -> DataError:
-        return _broken(self.path, f"has at byte {at} {what}")
+        return _damage_error(self.path, f"has at byte {at} {what}")
 
 
 def _name(block: _Block) -> str:
     return block.id[2:].decode()
 
 
-def _broken(path: Path, what: str) -> DataError:
+def _damage_error(path: Path, what: str) -> DataError:
     return DataError(f"'{path}' is a damaged MDF file: it {what}; copy or export it again")

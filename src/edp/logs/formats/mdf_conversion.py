@@ -63,10 +63,10 @@ class Conversion:
         if self.kind in (_VALUE_TEXTS, _RANGE_TEXTS):
             blocks = block.referenced_blocks
             count = int(block.links_nr) - 5 if self.kind == _VALUE_TEXTS else int(block.val_param_nr) // 2
-            self.inner = [self._nested(blocks.get(f"text_{i}"), depth) for i in range(count)]
-            self.default = self._nested(blocks.get("default_addr"), depth)
+            self.inner = [self._read_nested(blocks.get(f"text_{i}"), depth) for i in range(count)]
+            self.default = self._read_nested(blocks.get("default_addr"), depth)
 
-    def _nested(self, block: Any, depth: int) -> Conversion | None:
+    def _read_nested(self, block: Any, depth: int) -> Conversion | None:
         return None if block is None or isinstance(block, bytes) else Conversion(block, self.where, depth + 1)
 
     def __call__(self, raw: NDArray[Any]) -> NDArray[Any]:
@@ -120,15 +120,15 @@ class Conversion:
         count = len(self.inner)
         if self.kind == _RANGE_TEXTS:
             lower, upper = (np.array([self.block[f"{end}_{i}"] for i in range(count)]) for end in _ENDS)
-            return _in_ranges(lower, upper, raw)
+            return _find_ranges(lower, upper, raw)
         keys = np.array([self.block[f"val_{i}"] for i in range(count)])
-        return _in_ranges(keys, keys, raw, closed=True)
+        return _find_ranges(keys, keys, raw, closed=True)
 
 
 _ENDS = ("lower", "upper")
 
 
-def _in_ranges(
+def _find_ranges(
     lower: NDArray[np.float64], upper: NDArray[np.float64], raw: NDArray[Any], closed: bool | None = None
 ) -> NDArray[np.intp]:
     """Return the index of the range that contains each value, -1 if there is none.
@@ -171,7 +171,7 @@ def _pairs(block: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return raw, physical
 
 
-def _interpolated(block: Any, raw: NDArray[Any]) -> NDArray[Any]:
+def _interpolate(block: Any, raw: NDArray[Any]) -> NDArray[Any]:
     result: NDArray[Any] = np.interp(raw, *_pairs(block))
     return result
 
@@ -189,7 +189,7 @@ def _nearest(block: Any, raw: NDArray[Any]) -> NDArray[Any]:
 def _ranges(block: Any, raw: NDArray[Any]) -> NDArray[Any]:
     count = (int(block.val_param_nr) - 1) // 3
     lower, upper = (np.array([block[f"{end}_{i}"] for i in range(count)]) for end in _ENDS)
-    range_index = _in_ranges(lower, upper, raw)
+    range_index = _find_ranges(lower, upper, raw)
     physical = np.array([block[f"phys_{i}"] for i in range(count)] + [block.default])
     return np.asarray(physical[range_index])
 
@@ -197,7 +197,7 @@ def _ranges(block: Any, raw: NDArray[Any]) -> NDArray[Any]:
 _NUMERIC = {
     _LINEAR: _linear,
     _RATIONAL: _rational,
-    _INTERPOLATED: _interpolated,
+    _INTERPOLATED: _interpolate,
     _NEAREST: _nearest,
     _RANGES: _ranges,
 }

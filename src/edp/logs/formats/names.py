@@ -62,6 +62,6 @@ SHOWN = 80
 """Characters of a name in a message."""
 
 
-def shown_name(name: str) -> str:
+def quote_name(name: str) -> str:
     """Return a quoted name for a message: shortened, with control characters escaped."""
     return repr(name if len(name) <= SHOWN else name[: SHOWN - 3] + "...")

@@ -89,7 +89,7 @@ class ParquetFormat:
         signals, aliases, repeated = told_apart(named_signals)
         if edp_metadata.channels:
             signals, repeated = only(edp_metadata.channels, signals, repeated)
-        return RawLog(path, signals, aliases=aliases, repeated=repeated, **edp_metadata.for_log())
+        return RawLog(path, signals, aliases=aliases, repeated=repeated, **edp_metadata.to_log_metadata())
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
         """Write float32 columns in row groups without a time column: row k is at k / rate_hz."""
@@ -151,7 +151,7 @@ class _Table:
         self.schema = self.file.schema_arrow
         self.rows = int(self.file.metadata.num_rows)
         self.which = [0] * len(self.schema.names)
-        for places in _by_name(self.schema.names).values():
+        for places in _group_by_name(self.schema.names).values():
             for which, field_index in enumerate(places):
                 self.which[field_index] = which
         self.weigh()
@@ -205,7 +205,7 @@ class _Table:
         column_names = list(dict.fromkeys(names[field_index] for field_index in places))
         try:
             for batch in self.file.iter_batches(PIECE_ROWS, row_groups=groups, columns=column_names):
-                columns_by_name = _by_name(batch.schema.names)
+                columns_by_name = _group_by_name(batch.schema.names)
                 yield (
                     skipped,
                     [
@@ -226,7 +226,7 @@ class _Table:
         return pa.concat_arrays(parts) if parts else pa.array([], self.schema.field(field_index).type)
 
 
-def _by_name(names: Sequence[str]) -> dict[str, list[int]]:
+def _group_by_name(names: Sequence[str]) -> dict[str, list[int]]:
     """Return the column positions of each name; duplicate names keep their order."""
     places: dict[str, list[int]] = {}
     for field_index, name in enumerate(names):

@@ -74,7 +74,7 @@ class BagFormat:
         bag.column_names = {aliases.get(name, name) for name in column_names}
         if edp_metadata.channels:
             signals, repeated = only(edp_metadata.channels, signals, repeated)
-        return RawLog(path, signals, aliases=aliases, repeated=repeated, **edp_metadata.for_log())
+        return RawLog(path, signals, aliases=aliases, repeated=repeated, **edp_metadata.to_log_metadata())
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
         """Write one topic with one float32 message per sample, and EDP's metadata as a text topic."""
@@ -128,15 +128,15 @@ class _Bag:
     @cached_property
     def together(self) -> None:
         """Read the wanted topics in one go; done at most once."""
-        chosen = [topic for topic in self.topics if topic.wanted_paths()]
-        values = sum(topic.samples * len(topic.wanted_paths()) for topic in chosen)
+        chosen = [topic for topic in self.topics if topic.list_wanted_paths()]
+        values = sum(topic.samples * len(topic.list_wanted_paths()) for topic in chosen)
         keep = 8 * values <= KEPT_BYTES
         self.scan(chosen, keep)
 
     def scan(self, topics: Sequence[_Topic], keep: bool) -> None:
         """Stamps of some topics, and with `keep` their wanted columns."""
         by_name = {topic.name: topic for topic in topics}
-        paths = {topic.name: [*topic.stamp_paths, *(topic.wanted_paths() if keep else [])] for topic in topics}
+        paths = {topic.name: [*topic.stamp_paths, *(topic.list_wanted_paths() if keep else [])] for topic in topics}
         collected = {name: _Collected(by_name[name], paths[name]) for name in by_name}
         with damage(self.path):
             for connection, log_ns, raw in self.reader.messages([c for topic in topics for c in topic.connections]):
@@ -226,7 +226,7 @@ class _Topic:
             named_signals.append((f"{self.name}.{path}", signal))
         return named_signals
 
-    def wanted_paths(self) -> list[str]:
+    def list_wanted_paths(self) -> list[str]:
         column_names = self.bag.column_names
         return [
             path for path, short in self.paths.items() if short in column_names or f"{self.name}.{path}" in column_names
@@ -237,7 +237,7 @@ class _Topic:
 
     def stamps(self) -> Column:
         """Seconds since the first message of the bag, by the message headers if they state time, or by the log."""
-        if self._stamps is None and self.wanted_paths():
+        if self._stamps is None and self.list_wanted_paths():
             _ = self.bag.together
         if self._stamps is None:
             self.bag.scan([self], keep=False)
@@ -274,7 +274,7 @@ class _Topic:
 
     def pieces(self, names: Sequence[str], start: int, stop: int) -> Iterator[list[NDArray[Any]]]:
         """See `edp.logs.formats.base.ColumnTable`."""
-        if self._stamps is None and set(names) <= set(self.wanted_paths()):
+        if self._stamps is None and set(names) <= set(self.list_wanted_paths()):
             _ = self.bag.together
         if all(name in self.kept for name in names):
             yield [self.kept[name][start:stop] for name in names]

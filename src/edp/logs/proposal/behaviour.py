@@ -225,7 +225,7 @@ def repeats(column: LogColumn, other: LogColumn) -> bool:
     if _scatter(own) == 0 or _scatter(theirs) == 0:
         # Both stand still, or one moves by less than the other can show.
         return min(_scatter(own), _scatter(theirs)) == 0 and max(_levels(own), _levels(theirs)) <= 2
-    return abs(_correlation(own, theirs)) > 1 - 1e-9 or _rounded_apart(own, theirs)
+    return abs(_correlation(own, theirs)) > 1 - 1e-9 or _is_rounded_copy(own, theirs)
 
 
 def _levels(values: Column) -> int:
@@ -246,10 +246,10 @@ def _differ_by_rounding(own: Column, theirs: Column) -> bool:
     """Return whether a column equals a scaled copy of another one up to the last printed digits."""
     # Encoders side by side agree to a count, too: only columns of many counts tell.
     many = min(np.ptp(own) / _last_digit(own), np.ptp(theirs) / _last_digit(theirs)) > _MANY_COUNTS
-    return bool(many) and _rounded_apart(own, theirs)
+    return bool(many) and _is_rounded_copy(own, theirs)
 
 
-def _rounded_apart(own: Column, theirs: Column) -> bool:
+def _is_rounded_copy(own: Column, theirs: Column) -> bool:
     slope, offset = np.polyfit(theirs, own, 1)
     printed = _last_digit(own) + abs(slope) * _last_digit(theirs)
     return bool(np.abs(own - slope * theirs - offset).max() <= printed)
@@ -311,13 +311,13 @@ def is_steered_by(command: LogColumn, reference: LogColumn, measured: LogColumn)
     if good.sum() < 100 or _scatter(own[good]) == 0:
         return False
     ones, reference_rate = np.ones(int(good.sum())), np.gradient(target)[good]
-    answer = _unexplained(own[good], np.column_stack([(target - actual)[good], rate[good], ones]))
+    answer = _compute_unexplained(own[good], np.column_stack([(target - actual)[good], rate[good], ones]))
     # What the motion says by itself, or that which is asked for, is a velocity and no answer.
-    velocity = _unexplained(own[good], np.column_stack([rate[good], reference_rate, ones]))
+    velocity = _compute_unexplained(own[good], np.column_stack([rate[good], reference_rate, ones]))
     return answer < 0.1 and velocity > max(0.02, 2.0 * answer)
 
 
-def _unexplained(own: Column, parts: Column) -> float:
+def _compute_unexplained(own: Column, parts: Column) -> float:
     """Share of the variance of a column that a linear combination of others, shape ``(rows, parts)``, leaves."""
     fitted, *_ = np.linalg.lstsq(parts, own, rcond=None)
     return float(np.var(own - parts @ fitted) / np.var(own))

@@ -64,8 +64,8 @@ def clock_of(look: LogLook, behaviours: Mapping[str, Behaviour]) -> ClockGuess:
         return _brought_down(ClockGuess(look.time, "s", None, 1.0 / look.step_s, confidence=0.9), look.rows)
     column = _time_column(look, behaviours)
     if column is not None:
-        return _of_column(column, behaviours[column.name], look)
-    return _without_column(look, behaviours)
+        return _guess_clock(column, behaviours[column.name], look)
+    return _guess_without_column(look, behaviours)
 
 
 def _time_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> LogColumn | None:
@@ -85,7 +85,7 @@ def _time_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> LogColum
         # A name that says nothing of time is doubted more than no name at all.
         nameless = look.headerless or column is not look.columns[0]
         numbered = nameless or is_counter_name(column.name)
-        if numbered and behaviour.counts and (second := _behind(column, look, behaviours)) is not None:
+        if numbered and behaviour.counts and (second := _find_next_column(column, look, behaviours)) is not None:
             return second
         paced = behaviour.even or behaviour.lossy or (nameless and behaviour.steady)
         if column in rising and behaviour.climbs and paced:
@@ -99,7 +99,7 @@ def _begins_anew(column: LogColumn, behaviour: Behaviour) -> bool:
     return few and not behaviour.even and (behaviour.steady or behaviour.lossy) and is_time_name(column.name)
 
 
-def _behind(column: LogColumn, look: LogLook, behaviours: Mapping[str, Behaviour]) -> LogColumn | None:
+def _find_next_column(column: LogColumn, look: LogLook, behaviours: Mapping[str, Behaviour]) -> LogColumn | None:
     """Return the column after a row counter, if it rises like a clock."""
     next_index = look.columns.index(column) + 1
     second = look.columns[next_index] if next_index < len(look.columns) else None
@@ -120,7 +120,7 @@ def _fronts(look: LogLook) -> list[LogColumn]:
     return [*look.columns[:1], *(column for column in first if column is not look.columns[0])]
 
 
-def _of_column(column: LogColumn, behaviour: Behaviour, look: LogLook) -> ClockGuess:
+def _guess_clock(column: LogColumn, behaviour: Behaviour, look: LogLook) -> ClockGuess:
     unit, confidence, check = _unit(column, behaviour)
     rate = 1.0 / (behaviour.step * TIME_UNITS[unit])
     if behaviour.holds > 0:
@@ -152,7 +152,7 @@ def _unit(column: LogColumn, behaviour: Behaviour) -> tuple[str, float, str]:
     return unit, 0.65, f"{unit}?"
 
 
-def _without_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> ClockGuess:
+def _guess_without_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> ClockGuess:
     """Determine the time of rows without a time column: a stated step, a restarting clock, or unknown."""
     for column in look.columns:
         behaviour = behaviours[column.name]

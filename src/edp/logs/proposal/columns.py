@@ -123,7 +123,7 @@ def look_at_log(path: Path, experiment: str | None = None) -> LogLook:
     Raises:
         DataError: the file cannot be read, or holds no column of numbers.
     """
-    with _bounded(path, TEXT_BYTES) as (part, note):
+    with _open_bounded(path, TEXT_BYTES) as (part, note):
         try:
             return _look(path, part, note, experiment)
         except DataError as error:
@@ -137,12 +137,12 @@ def names_in_log(path: Path) -> frozenset[str]:
     Raises:
         DataError: the file cannot be read.
     """
-    with _bounded(path, _HEAD_BYTES) as (part, _):
-        return frozenset(_of_the_machine(open_log(part, SignalMap(others=True, sample_time_s=1.0))).signals)
+    with _open_bounded(path, _HEAD_BYTES) as (part, _):
+        return frozenset(_drop_status_columns(open_log(part, SignalMap(others=True, sample_time_s=1.0))).signals)
 
 
 @contextmanager
-def _bounded(path: Path, most: int) -> Iterator[tuple[Path, str]]:
+def _open_bounded(path: Path, most: int) -> Iterator[tuple[Path, str]]:
     """Yield the log itself, or a temporary file with the first lines of a large text file."""
     size = status_of(path).st_size if is_file_at(path) else 0
     if size <= most or format_for(path).name != "csv":
@@ -162,9 +162,9 @@ def _bounded(path: Path, most: int) -> Iterator[tuple[Path, str]]:
 def _look(path: Path, part: Path, note: str, experiment: str | None) -> LogLook:
     # With a stated step no column is taken for time: all of them are looked at.
     whole = SignalMap(others=True, variable=experiment)
-    raw = _of_the_machine(open_log(part, replace(whole, sample_time_s=1.0)))
+    raw = _drop_status_columns(open_log(part, replace(whole, sample_time_s=1.0)))
     for time_name in (None, *islice((name for name in raw.signals if _is_time_word(name)), 1)):
-        paced = _of_own_pace(path, part, note, replace(whole, time=time_name))
+        paced = _look_at_signals(path, part, note, replace(whole, time=time_name))
         if paced is not None:
             return paced
     length = _usual_length(raw)
@@ -204,7 +204,7 @@ def _look(path: Path, part: Path, note: str, experiment: str | None) -> LogLook:
     )
 
 
-def _of_the_machine(raw: RawLog) -> RawLog:
+def _drop_status_columns(raw: RawLog) -> RawLog:
     """Return the log without the status columns of the logging program, unless it has no others."""
     own = {name: signal for name, signal in raw.signals.items() if not name.startswith(_OF_THE_LOGGER)}
     return replace(raw, signals=own) if own else raw
@@ -214,13 +214,13 @@ def _is_time_word(name: str) -> bool:
     return any(word in name.lower() for word in _TIME_WORDS)
 
 
-def _of_own_pace(path: Path, part: Path, note: str, signal_map: SignalMap) -> LogLook | None:
+def _look_at_signals(path: Path, part: Path, note: str, signal_map: SignalMap) -> LogLook | None:
     """Return a log whose signals have their own times at different rates, resampled to the fastest.
 
     None for other logs.
     """
     try:
-        timed = _of_the_machine(open_log(part, signal_map))
+        timed = _drop_status_columns(open_log(part, signal_map))
     except DataError:
         return None
     signals = [s for s in timed.signals.values() if s.time_s is not None and s.samples > 2]
@@ -247,7 +247,7 @@ def _of_own_pace(path: Path, part: Path, note: str, signal_map: SignalMap) -> Lo
     columns = []
     clocks = _clocks_of(numbers)
     for signal in numbers:
-        values = _held(signal, stamps)
+        values = _hold_values(signal, stamps)
         pieces = tuple(values[start:stop] for start, stop in ranges)
         clock = clocks.get(signal.name)
         columns.append(LogColumn(signal.name, pieces, len(stamps), signal.unit, signal.kind, True, clock))
@@ -289,7 +289,7 @@ def _step_s(signal: RawSignal) -> float:
     return float(np.median(rising)) if len(rising) else 0.0
 
 
-def _held(signal: RawSignal, stamps: Column) -> Column:
+def _hold_values(signal: RawSignal, stamps: Column) -> Column:
     """Return the latest value at each given time; the first value before that."""
     values = np.asarray(signal.load(), dtype=np.float64)
     own = np.asarray(signal.time_s, dtype=np.float64)

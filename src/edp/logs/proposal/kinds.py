@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from edp.logs.proposal.behaviour import Behaviour, Relation
 from edp.logs.proposal.columns import LogColumn
-from edp.logs.proposal.names import is_joint, kind_by_tag, kind_by_word, known_unit, unit_by_ending
+from edp.logs.proposal.names import find_unit, is_joint, kind_by_tag, kind_by_word, unit_by_ending
 from edp.logs.units import OTHER_UNITS, normalise_unit
 from edp.signals import KINDS, TIME_UNITS, UNITS, VOCABULARY, Kind
 
@@ -53,7 +53,7 @@ class KindGuess:
     check: str = ""
 
 
-def with_article(kind: Kind) -> str:
+def add_article(kind: Kind) -> str:
     """Return the kind with its article: ``an angular velocity``."""
     return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind.replace('_', ' ')}"
 
@@ -71,44 +71,44 @@ def kind_of(column: LogColumn, behaviour: Behaviour, family: int) -> KindGuess:
         family: how many tags of instruments with the same letters the log has, this one included.
     """
     if column.kind is not None:
-        unit = known_unit(column.unit) or KINDS[column.kind].si_unit
+        unit = find_unit(column.unit) or KINDS[column.kind].si_unit
         return KindGuess(column.kind, unit, 1.0, "the file states it")
     word = kind_by_word(column.name)
     if column.name in VOCABULARY:
-        return _of_vocabulary(column, behaviour)
+        return _look_up_vocabulary(column, behaviour)
     if column.unit:
-        return _of_unit(column.unit, word, behaviour)
+        return _guess_by_unit(column.unit, word, behaviour)
     ending = unit_by_ending(column.name)
     if ending is not None:
-        return _of_ending(ending, word, behaviour)
+        return _guess_by_ending(ending, word, behaviour)
     if word in _TURNING and is_joint(column.name):
-        return _of_joint(_TURNING[word], behaviour)
+        return _guess_joint(_TURNING[word], behaviour)
     if word is not None:
-        return _of_range(word, behaviour, 0.7, f"its name says {word}")
+        return _guess_by_range(word, behaviour, 0.7, f"its name says {word}")
     tag = kind_by_tag(column.name)
     if tag is not None:
         # One tag alone may be anything; a row of them is an instrument list.
-        return _of_range(tag, behaviour, 0.65 if family > 1 else 0.5, "its name is an instrument's tag")
+        return _guess_by_range(tag, behaviour, 0.65 if family > 1 else 0.5, "its name is an instrument's tag")
     return _numbers("no name or unit tells", "unit unknown")
 
 
-def _of_joint(kind: Kind, behaviour: Behaviour) -> KindGuess:
+def _guess_joint(kind: Kind, behaviour: Behaviour) -> KindGuess:
     """Return the kind of a joint channel: joints turn, with few exceptions, and robots use radians."""
     unit = KINDS[kind].si_unit
     if kind is Kind.ANGLE and unit_by_range(kind, behaviour) is not None:
-        return _of_range(kind, behaviour, 0.7, "a joint turns")
+        return _guess_by_range(kind, behaviour, 0.7, "a joint turns")
     if not is_plausible(kind, unit, behaviour):
-        return _numbers("a joint turns", f"{with_article(kind)}? unit unknown")
+        return _numbers("a joint turns", f"{add_article(kind)}? unit unknown")
     return KindGuess(kind, unit, 0.65, "a joint turns", f"{unit}? m if it slides")
 
 
-def _of_vocabulary(column: LogColumn, behaviour: Behaviour) -> KindGuess:
+def _look_up_vocabulary(column: LogColumn, behaviour: Behaviour) -> KindGuess:
     kind = VOCABULARY[column.name].kind
-    unit = known_unit(column.unit) or KINDS[kind].si_unit
+    unit = find_unit(column.unit) or KINDS[kind].si_unit
     fits = kind in UNITS[unit].kinds and (bool(column.unit) or not _looks_small(kind, behaviour))
     if fits and is_plausible(kind, unit, behaviour):
         return KindGuess(kind, unit, 0.95 if column.unit else 0.85, "a name of Table A.1 or the simulator")
-    return _of_range(kind, behaviour, 0.7, "a name of Table A.1, but its numbers are not SI")
+    return _guess_by_range(kind, behaviour, 0.7, "a name of Table A.1, but its numbers are not SI")
 
 
 def _looks_small(kind: Kind, behaviour: Behaviour) -> bool:
@@ -116,8 +116,8 @@ def _looks_small(kind: Kind, behaviour: Behaviour) -> bool:
     return kind in _PRESSURES and max(abs(behaviour.low), abs(behaviour.high)) < 1e3
 
 
-def _of_unit(stated: str, word: Kind | None, behaviour: Behaviour) -> KindGuess:
-    unit = known_unit(stated)
+def _guess_by_unit(stated: str, word: Kind | None, behaviour: Behaviour) -> KindGuess:
+    unit = find_unit(stated)
     if unit is None and normalise_unit(stated) in OTHER_UNITS | TIME_UNITS.keys():
         return _numbers("the file states a unit without a kind", f"in {stated[:12]}, as numbers", SURE_NUMBERS)
     if unit is None:
@@ -132,26 +132,26 @@ def _of_unit(stated: str, word: Kind | None, behaviour: Behaviour) -> KindGuess:
     if word is not None and word not in kinds:
         return _numbers(f"its name says {word}, its unit {kinds[0]}", f"is '{unit}' right?")
     if unit in _SHORT_UNITS and word is None:
-        return _numbers("its unit may be two things", f"is '{unit}' {with_article(kinds[0])}?")
+        return _numbers("its unit may be two things", f"is '{unit}' {add_article(kinds[0])}?")
     if not is_plausible(kind, unit, behaviour):
-        return _numbers(f"{unit} beyond what {with_article(kind)} reaches", f"is '{unit}' right?")
+        return _numbers(f"{unit} beyond what {add_article(kind)} reaches", f"is '{unit}' right?")
     return KindGuess(kind, unit, 0.95, "the file states its unit")
 
 
-def _of_ending(unit: str, word: Kind | None, behaviour: Behaviour) -> KindGuess:
+def _guess_by_ending(unit: str, word: Kind | None, behaviour: Behaviour) -> KindGuess:
     kinds = UNITS[unit].kinds
     if (word is not None and word not in kinds) or not is_plausible(word or kinds[0], unit, behaviour):
         return _numbers("name, ending and numbers disagree", f"is it in {unit}?")
     return KindGuess(word or kinds[0], unit, 0.85, f"its name ends with {unit}")
 
 
-def _of_range(kind: Kind, behaviour: Behaviour, confidence: float, why: str) -> KindGuess:
+def _guess_by_range(kind: Kind, behaviour: Behaviour, confidence: float, why: str) -> KindGuess:
     """Return a kind with a unit derived from the range of the values."""
     unit = unit_by_range(kind, behaviour)
     if unit is None:
-        return _numbers(why, f"{with_article(kind)}? unit unknown")
+        return _numbers(why, f"{add_article(kind)}? unit unknown")
     if confidence < BOUND:
-        return _numbers(why, f"{with_article(kind)} in {unit}?", confidence)
+        return _numbers(why, f"{add_article(kind)} in {unit}?", confidence)
     return KindGuess(kind, unit, confidence, f"{why}, its numbers {unit}", f"unit {unit}?")
 
 

@@ -105,14 +105,14 @@ def kind_by_word(name: str) -> Kind | None:
     for word, kind in KIND_WORDS.items():
         if word in words or (len(word) > _LONG and any(word in other for other in words)):
             return kind
-    glued = _glued(words)
+    glued = _match_glued(words)
     if glued is not None:
         return KIND_WORDS.get(glued[1])
     # Cyl_P, pump_p: what is said before tells that it is no gain.
     return Kind.PRESSURE if words[-1:] == ("p",) and not _HYDRAULIC.isdisjoint(words[:-1]) else None
 
 
-def _glued(words: Sequence[str]) -> re.Match[str] | None:
+def _match_glued(words: Sequence[str]) -> re.Match[str] | None:
     """Match a first word composed of kind and role: ``posd``, ``velact``, ``accref``."""
     return _GLUED.fullmatch(words[0]) if words else None
 
@@ -148,7 +148,7 @@ def unit_by_ending(name: str) -> str | None:
     return UNIT_ENDINGS.get(words[-1]) if len(words) > 1 else None
 
 
-def known_unit(stated: str | None) -> str | None:
+def find_unit(stated: str | None) -> str | None:
     """Return a stated unit in EDP's spelling; None if it is unknown."""
     unit = normalise_unit(stated)
     return unit if unit in UNITS else None
@@ -163,7 +163,7 @@ def role_by_word(name: str) -> str:
     roles = {
         ROLE_WORDS[word] for word in (*letters, *words) if word in ROLE_WORDS and (len(word) > 1 or word in letters)
     }
-    glued = _glued(words)
+    glued = _match_glued(words)
     if not roles and glued is not None:
         return _GLUED_ROLES[glued[2]]
     # A reference of a valve is a reference, its measured opening is measured.

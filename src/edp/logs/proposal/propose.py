@@ -12,7 +12,7 @@ import numpy as np
 from edp.logs.proposal.behaviour import Behaviour, Relation, behaviour_of, is_steered_by, relations_of, repeats
 from edp.logs.proposal.clocks import ClockGuess, clock_of
 from edp.logs.proposal.columns import LogColumn, LogLook
-from edp.logs.proposal.kinds import BOUND, KindGuess, kind_of, kind_of_change, with_article
+from edp.logs.proposal.kinds import BOUND, KindGuess, add_article, kind_of, kind_of_change
 from edp.logs.proposal.names import (
     ends_as_stamp,
     is_counter_name,
@@ -87,7 +87,7 @@ class MapProposal:
     columns: tuple[ColumnGuess, ...]
     signal_map: SignalMap
 
-    def of_role(self, *roles: str) -> tuple[ColumnGuess, ...]:
+    def select_role(self, *roles: str) -> tuple[ColumnGuess, ...]:
         """Return the channels with one of the given roles, in order."""
         return tuple(guess for guess in self.columns if guess.channel and guess.role in roles)
 
@@ -108,12 +108,12 @@ def propose_map(look: LogLook, common: Collection[str] | None = None, beside: Se
     behaviours = _where_they_move(behaviours, beside)
     ranges = _ranges_of_all(behaviours, beside)
     kinds = {c.name: kind_of(c, ranges[c.name], families[tag_family(c.name)]) for c in look.columns}
-    kinds = _of_brothers(look.columns, kinds)
+    kinds = _unify_kinds(look.columns, kinds)
     for name, relation in relations.items():
         change = kind_of_change(relation, kinds[relation.other], clock.rate_hz)
         if change is not None and kinds[name].confidence < BOUND:
             kinds[name] = change
-    steered = _steered(moving, relations)
+    steered = _find_controlled(moving, relations)
     # What follows a reference is measured, also where a coarse sensor makes it move in steps.
     following = {
         r.other: Relation("follows", name, 1.0, r.strength) for name, r in relations.items() if r.how == "reference"
@@ -125,7 +125,7 @@ def propose_map(look: LogLook, common: Collection[str] | None = None, beside: Se
     ]
     if common is not None:
         guesses = [g if g.column in common else replace(g, channel="", check="not in all logs") for g in guesses]
-    guesses = _named(_without_copies(guesses, beside))
+    guesses = _name_channels(_drop_copies(guesses, beside))
     texts = [
         ColumnGuess(name, "", "time", _NO_KIND, clock.confidence, "dates", clock.check)
         if name == clock.column
@@ -168,7 +168,7 @@ def _ranges_of_all(behaviours: dict[str, Behaviour], beside: Sequence[LogLook]) 
     return ranges
 
 
-def _of_brothers(columns: Sequence[LogColumn], kinds: dict[str, KindGuess]) -> dict[str, KindGuess]:
+def _unify_kinds(columns: Sequence[LogColumn], kinds: dict[str, KindGuess]) -> dict[str, KindGuess]:
     """Return the kinds; a column of a series of axes with an ambiguous unit takes the kind of the others."""
     rows: dict[str, list[LogColumn]] = {}
     for column in columns:
@@ -192,7 +192,7 @@ def _is_free(column: LogColumn, behaviour: Behaviour, clock: ClockGuess) -> bool
     return column.name != clock.column and column.name not in clock.beside and not idle
 
 
-def _steered(columns: Sequence[LogColumn], relations: dict[str, Relation]) -> dict[str, str]:
+def _find_controlled(columns: Sequence[LogColumn], relations: dict[str, Relation]) -> dict[str, str]:
     """Return the columns that are controller outputs, each with its reference."""
     by_name = {column.name: column for column in columns}
     pairs = [(name, relation.other) for name, relation in relations.items() if relation.how == "reference"]
@@ -288,9 +288,9 @@ def _role(
     if column.unit == "us":
         return "command", 0.75, "the width of a pulse"
     if kind.kind in _COMMANDS and kind.confidence >= BOUND:
-        return "command", 0.65, with_article(kind.kind)
+        return "command", 0.65, add_article(kind.kind)
     if kind.kind in _MEASURED and kind.confidence >= BOUND:
-        return "measured", 0.85, with_article(kind.kind)
+        return "measured", 0.85, add_article(kind.kind)
     if behaviour.steps:
         return "command", 0.65, "moves in steps"
     if relation is not None and relation.how == "change":
@@ -298,7 +298,7 @@ def _role(
     return "measured", 0.65, "moves by itself"
 
 
-def _without_copies(guesses: Sequence[ColumnGuess], beside: Sequence[LogLook]) -> list[ColumnGuess]:
+def _drop_copies(guesses: Sequence[ColumnGuess], beside: Sequence[LogLook]) -> list[ColumnGuess]:
     """Remove channels that repeat an earlier column in another unit, since they would be predicted twice."""
     columns = [{column.name: column for column in look.columns} for look in beside]
     channels: set[str] = set()
@@ -306,7 +306,7 @@ def _without_copies(guesses: Sequence[ColumnGuess], beside: Sequence[LogLook]) -
     for guess in guesses:
         name, relation = guess.column, guess.relation
         copied = relation is not None and relation.how == "copy" and relation.other in channels and not is_known(name)
-        if copied and relation is not None and all(_repeated(log, name, relation.other) for log in columns):
+        if copied and relation is not None and all(_is_repeated(log, name, relation.other) for log in columns):
             guess = replace(guess, channel="", why=f"repeats {relation.other[:40]}", check="a copy; not taken")
         elif guess.channel:
             channels.add(guess.column)
@@ -314,11 +314,11 @@ def _without_copies(guesses: Sequence[ColumnGuess], beside: Sequence[LogLook]) -
     return single
 
 
-def _repeated(columns: dict[str, LogColumn], name: str, other: str) -> bool:
+def _is_repeated(columns: dict[str, LogColumn], name: str, other: str) -> bool:
     return name in columns and other in columns and repeats(columns[name], columns[other])
 
 
-def _named(guesses: Sequence[ColumnGuess]) -> list[ColumnGuess]:
+def _name_channels(guesses: Sequence[ColumnGuess]) -> list[ColumnGuess]:
     """Channels under names that every export takes and a person can type; too many ones are left out."""
     named, used, count = [], set[str](), 0
     for i, guess in enumerate(guesses):

@@ -91,7 +91,7 @@ def _faster(values: Column, rate_hz: float, limit_hz: float) -> float:
     return float(power[np.fft.rfftfreq(len(values), 1.0 / rate_hz) > limit_hz].sum()) / total if total > 0 else 0.0
 
 
-def beside_notes(source: Path, paths: Collection[Path]) -> list[str]:
+def note_ignored_files(source: Path, paths: Collection[Path]) -> list[str]:
     """Return warnings about text files with tables that are ignored next to logs of other formats.
 
     Args:

@@ -114,18 +114,18 @@ def _clocks(look: LogLook, clock: ClockGuess) -> list[Clock]:
 def _repairs(clock: Clock) -> set[str]:
     if clock.uniform:
         return set()
-    repairs = {f"falling={_of_falls(clock)}"} if len(clock.falling) else set()
+    repairs = {f"falling={_choose_falling_repair(clock)}"} if len(clock.falling) else set()
     repairs |= {"duplicates=last"} if len(clock.duplicates) else set()
-    return repairs | ({f"gaps={_of_gaps(clock)}"} if len(clock.gaps) else set())
+    return repairs | ({f"gaps={_choose_gap_repair(clock)}"} if len(clock.gaps) else set())
 
 
-def _of_falls(clock: Clock) -> str:
+def _choose_falling_repair(clock: Clock) -> str:
     """Return ``cut`` if a clock restarts, since sorting would mix two sessions; otherwise ``sort``."""
     back = np.diff(clock.stamps)[clock.falling - 1]
     return "cut" if back.min() < -max(_LONG_S, _LONG_STEPS * clock.step_s) else "sort"
 
 
-def _of_gaps(clock: Clock) -> str:
+def _choose_gap_repair(clock: Clock) -> str:
     """``cut`` where a long break leaves nearly all rows on one side, else ``hold``."""
     breaks = clock.gaps[np.diff(clock.stamps)[clock.gaps] > max(_LONG_S, _LONG_STEPS * clock.step_s)]
     if not len(breaks):

@@ -75,7 +75,7 @@ def look_into(
         DataError: as `inspect_log`.
     """
     original_map = signal_map or SignalMap()
-    raw, signal_map, sources, problems = _opened(Path(path), original_map)
+    raw, signal_map, sources, problems = _open_with_map(Path(path), original_map)
     proposed = signal_map != original_map
     findings = [Finding("error", None, str(problem)) for problem in problems]
     if proposed:
@@ -87,7 +87,7 @@ def look_into(
         Finding("note", None, what, 1, f"line {raw.meta[fact]}") for fact, what in _LEFT_OUT.items() if fact in raw.meta
     ]
     if not signal_map.channels and not signal_map.others:
-        findings += _near_misses(raw)
+        findings += _find_near_misses(raw)
     findings += _unit_clashes(raw, signal_map)
     # Columns that cannot be read are findings here; the others are still looked at.
     usable, more = _readable(sources)
@@ -100,7 +100,7 @@ def look_into(
         findings.append(Finding("error", None, str(error)))
         empty = Recording(name or name_of_file(raw.path), (), np.empty((0, 0), dtype=np.float32), 1.0, str(raw.path))
         return replace(inspect(empty, tuple(findings)), proposed=proposed), None
-    findings += _changed(raw, recording, signal_map, rows)
+    findings += _check_digest(raw, recording, signal_map, rows)
     for signal, clock in clocks:
         findings += _time_findings(signal, clock, repair or Repair())
     facts = tuple(_clock_facts(signal, clock) for signal, clock in clocks)
@@ -113,7 +113,7 @@ def unreadable(path: Path, why: DataError) -> QualityReport:
     return inspect(empty, (Finding("error", None, str(why)),))
 
 
-def _opened(path: Path, signal_map: SignalMap) -> tuple[RawLog, SignalMap, list[ChannelSource], list[EdpError]]:
+def _open_with_map(path: Path, signal_map: SignalMap) -> tuple[RawLog, SignalMap, list[ChannelSource], list[EdpError]]:
     """Open a log with its channels by the map, or by a proposed map if none is given and no column is known.
 
     Raises:
@@ -145,7 +145,7 @@ def _is_misspelt(name: str) -> bool:
     return len(name) <= _LONGEST_MISS and bool(get_close_matches(name, VOCABULARY, n=1, cutoff=_MISSPELT))
 
 
-def _changed(
+def _check_digest(
     raw: RawLog, recording: Recording, signal_map: SignalMap, rows: tuple[int, int | None] | None
 ) -> list[Finding]:
     """Whether reading would refuse the values, as not those that EDP wrote."""
@@ -189,7 +189,7 @@ def _readable(sources: list[ChannelSource]) -> tuple[list[ChannelSource], list[F
     return usable, findings
 
 
-def _near_misses(raw: RawLog) -> list[Finding]:
+def _find_near_misses(raw: RawLog) -> list[Finding]:
     """Columns that are not taken although their names nearly are in the vocabulary."""
     findings = []
     for name in islice(raw.signals, _MOST_NAMES):

@@ -110,7 +110,7 @@ def find_repeats(sketches: Sequence[Sketch]) -> tuple[Repeat, ...]:
     copies = {second for _, second in repeats_by_pair}
     own = [i for i in range(len(sketches)) if i not in copies]
     for (first, second), lag in _candidates([sketches[i] for i in own]).items():
-        repeat = _checked(sketches[own[first]], sketches[own[second]], lag)
+        repeat = _check_candidate(sketches[own[first]], sketches[own[second]], lag)
         if repeat is not None:
             repeats_by_pair[own[first], own[second]] = repeat
     return tuple(sorted(repeats_by_pair.values(), key=lambda repeat: -repeat.seconds))
@@ -146,7 +146,7 @@ def _candidates(sketches: Sequence[Sketch]) -> dict[tuple[int, int], int]:
     labels: list[Labels] = []
     for i, column in columns_of:
         values = sketches[i].values[:, column]
-        marks, places = _fingerprints(values, _searched_places(len(values) - WINDOW + 1))
+        marks, places = _fingerprints(values, _select_windows(len(values) - WINDOW + 1))
         searched.append(marks)
         labels.append(np.stack([np.full(len(places), i), places], axis=1))
     owners = np.concatenate(labels)
@@ -162,7 +162,7 @@ def _candidates(sketches: Sequence[Sketch]) -> dict[tuple[int, int], int]:
         theirs = owners[which[asked, rank]]
         other = theirs[:, 0] != i
         votes.append(_votes(i, places[asked][other], theirs[other]))
-    return _elected(*(np.concatenate(part) for part in zip(*votes, strict=True)))
+    return _elect_lags(*(np.concatenate(part) for part in zip(*votes, strict=True)))
 
 
 def _votes(i: int, places: NDArray[np.int64], theirs: Labels) -> tuple[Labels, NDArray[np.int64]]:
@@ -176,7 +176,7 @@ def _votes(i: int, places: NDArray[np.int64], theirs: Labels) -> tuple[Labels, N
     return np.unique(np.stack([a[:, 0], b[:, 0], b[:, 1] - a[:, 1]], axis=1), axis=0, return_counts=True)
 
 
-def _elected(votes: Labels, numbers: NDArray[np.int64]) -> dict[tuple[int, int], int]:
+def _elect_lags(votes: Labels, numbers: NDArray[np.int64]) -> dict[tuple[int, int], int]:
     """Return the lag of each pair with enough votes."""
     votes, where = np.unique(votes, axis=0, return_inverse=True)
     counts = np.zeros(len(votes), dtype=np.int64)
@@ -223,7 +223,7 @@ def _lively(entry: Sketch) -> list[float]:
     return [float(share) for share in moved.mean(axis=0)] if len(moved) else [0.0] * len(entry.channels)
 
 
-def _searched_places(windows: int) -> NDArray[np.int64]:
+def _select_windows(windows: int) -> NDArray[np.int64]:
     """Return the first blocks of the searched windows, even and odd alternately."""
     every = np.arange(0, windows, _HOP)
     every[1::2] += 1
@@ -249,7 +249,7 @@ def _fingerprints(values: Floats, places: NDArray[np.int64]) -> tuple[Floats, ND
     return marks / np.linalg.norm(marks, axis=1, keepdims=True), places[moving_windows]
 
 
-def _checked(a: Sketch, b: Sketch, lag: int) -> Repeat | None:
+def _check_candidate(a: Sketch, b: Sketch, lag: int) -> Repeat | None:
     """Return the repeat at a lag (block k of `a` is block k + `lag` of `b`); None if the recordings differ."""
     if abs(a.hz - b.hz) > 1e-6:
         return None
@@ -275,10 +275,10 @@ def _checked(a: Sketch, b: Sketch, lag: int) -> Repeat | None:
             best = (score, alike)
         if shift == 0.0 and float(np.mean(np.nan_to_num(alike) > _HOPELESS)) * alike.shape[0] < 1:
             return None
-    return None if best is None else _judged(a, b, lag, start, pairs, best[1])
+    return None if best is None else _compare_pair(a, b, lag, start, pairs, best[1])
 
 
-def _judged(
+def _compare_pair(
     a: Sketch, b: Sketch, lag: int, start: int, pairs: list[tuple[int, int]], alike: NDArray[np.float64]
 ) -> Repeat | None:
     """Return a repeat from the correlations ``(window, channel)``, with NaN for channels without motion."""

@@ -39,7 +39,7 @@ class Sketch:
     digest: str
     seconds: float
 
-    def with_hash_alone(self) -> Sketch:
+    def drop_values(self) -> Sketch:
         """Return the sketch without values; the recording is then compared by the hash of its samples only."""
         return replace(self, values=self.values[:0].copy())
 
@@ -54,7 +54,7 @@ class Sketches:
         """Keep one more."""
         self.left -= sketch.values.nbytes
         if self.left < 0:
-            sketch = sketch.with_hash_alone()
+            sketch = sketch.drop_values()
             self.by_hash += 1
         self.all.append(sketch)
 

@@ -31,6 +31,7 @@ from edp.logs.store.index import (
     StoreEntry,
     StoreIndex,
     check_places,
+    check_seal,
     index_of,
     is_store,
     listed,
@@ -38,7 +39,6 @@ from edp.logs.store.index import (
     read_index,
     rows_path,
     stamped,
-    without_seal,
     write_plain,
 )
 from edp.progress import SILENT, Progress
@@ -170,16 +170,16 @@ def build_store(
         check_writable(make_folder(top / ROWS))
         remove_unfinished(top / ROWS)
         remove_unfinished(top)
-        return _built(_distinct(logs), top, workers, progress)
+        return _build_index(_distinct(logs), top, workers, progress)
     finally:
         release(top / LOCK, lock) if is_file_at(top / INDEX) else lock.close()
 
 
-def _built(logs: dict[str, StoredLog], top: Path, workers: Workers, progress: Progress) -> StoreIndex:
+def _build_index(logs: dict[str, StoredLog], top: Path, workers: Workers, progress: Progress) -> StoreIndex:
     before = read_index(top) if is_file_at(top / INDEX) else StoreIndex()
-    index = _without_replaced(_without_lost(before, top), logs)
+    index = _drop_replaced(_drop_lost(before, top), logs)
     for record in _records_beside(top, index):
-        index = _with_record(index, record, logs)
+        index = _add_record(index, record, logs)
     stored = {entry.log_key for entry in index.recordings}
     index = replace(index, refused=())
     missing = {key: log for key, log in logs.items() if key not in stored}
@@ -201,17 +201,17 @@ def _built(logs: dict[str, StoredLog], top: Path, workers: Workers, progress: Pr
         refused += len(records[number]["refused"])
         read.step(done, refused=refused)
     for number in range(len(batches)):
-        index = _with_record(index, records[number], logs)
+        index = _add_record(index, records[number], logs)
     order = {key: number for number, key in enumerate(logs)}
     # As the logs are in order; those of earlier builds first.
     recordings = sorted(index.recordings, key=lambda entry: order.get(entry.log_key, -1))
-    index = _in_order(replace(index, recordings=tuple(recordings)))
+    index = _sort_index(replace(index, recordings=tuple(recordings)))
     write_plain(top / INDEX, plain_index(index))
     _remove_unused(top, index)
     return index
 
 
-def _in_order(index: StoreIndex) -> StoreIndex:
+def _sort_index(index: StoreIndex) -> StoreIndex:
     """Return the index with files and lists of channels in the order of the recordings, whoever read first."""
     files = {file.key: file for file in index.files}
     used = dict.fromkeys(entry.rows for entry in index.recordings)
@@ -229,7 +229,7 @@ def _distinct(logs: Sequence[StoredLog]) -> dict[str, StoredLog]:
     return {log.key: log for log in logs}
 
 
-def _without_replaced(index: StoreIndex, logs: dict[str, StoredLog]) -> StoreIndex:
+def _drop_replaced(index: StoreIndex, logs: dict[str, StoredLog]) -> StoreIndex:
     """Return the index without recordings whose log was changed or is read with other options."""
     paths = {log.where for log in logs.values()}
     unchanged = tuple(entry for entry in index.recordings if entry.log not in paths or entry.log_key in logs)
@@ -237,7 +237,7 @@ def _without_replaced(index: StoreIndex, logs: dict[str, StoredLog]) -> StoreInd
     return replace(index, recordings=unchanged, files=tuple(file for file in index.files if file.key in used))
 
 
-def _without_lost(index: StoreIndex, top: Path) -> StoreIndex:
+def _drop_lost(index: StoreIndex, top: Path) -> StoreIndex:
     """Return the index without recordings whose data file is missing or truncated; their logs are read again."""
     whole = {file.key for file in index.files if _size(rows_path(top, file.key)) == file.bytes}
     recordings = tuple(entry for entry in index.recordings if entry.rows in whole)
@@ -304,8 +304,8 @@ def store_batch(batch: LogBatch) -> Table:
         for key, log in batch.logs:
             at = stream.tell()
             try:
-                with _at_hand(log) as near:
-                    entry, channels = _stored(replace(log, path=near), key, batch.key, first, stream.write)
+                with _copy_locally(log) as near:
+                    entry, channels = _store_log(replace(log, path=near), key, batch.key, first, stream.write)
                 # What a recording says of its source must not be the copy, which is gone.
                 entry = replace(
                     entry,
@@ -338,12 +338,12 @@ def store_batch(batch: LogBatch) -> Table:
     return record
 
 
-def _at_hand(log: StoredLog) -> AbstractContextManager[Path]:
+def _copy_locally(log: StoredLog) -> AbstractContextManager[Path]:
     """Return the log as a local file."""
     return nullcontext(log.path) if log.remote is None else copied(log.remote)
 
 
-def _stored(
+def _store_log(
     log: StoredLog, key: str, rows: str, first: int, write: Callable[[Any], object]
 ) -> tuple[StoreEntry, tuple[Channel, ...]]:
     """Write the samples of a log and return its index entry."""
@@ -360,7 +360,7 @@ def _stored(
     for part in parts(assembly, PART_SAMPLES, name):
         digest.update(part.values)
         write(np.ascontiguousarray(part.values, dtype="<f4").data)
-        source, meta = part.source, _merged_meta(meta, part.meta)
+        source, meta = part.source, _merge_meta(meta, part.meta)
     _check_digest(assembly, digest.text)
     if log.machine:
         meta[MACHINE] = log.machine
@@ -380,7 +380,7 @@ def _stored(
     return entry, channels
 
 
-def _merged_meta(meta: Table, part: Any) -> Table:
+def _merge_meta(meta: Table, part: Any) -> Table:
     """Merge the metadata of a log with those of one more part; each repair occurs once."""
     repairs = list(meta.get("repairs", []))
     repairs += [repair for repair in part.get("repairs", []) if repair not in repairs]
@@ -405,14 +405,14 @@ def _records_beside(top: Path, index: StoreIndex) -> Iterator[Table]:
         with suppress(DataError):
             table = parse_json(read_text(path, BATCH_BYTES, where, DataError), where, DataError)
             record = object_with(table, ("files", "recordings"), where, DataError)
-            record = without_seal(record, where)
+            record = check_seal(record, where)
             batch = index_of(record, where)
             check_places(batch, where)
             if [(file.key, file.bytes) for file in batch.files] == [(path.stem, _size(rows_path(top, path.stem)))]:
                 yield record
 
 
-def _with_record(index: StoreIndex, record: dict[str, object], logs: dict[str, StoredLog]) -> StoreIndex:
+def _add_record(index: StoreIndex, record: dict[str, object], logs: dict[str, StoredLog]) -> StoreIndex:
     """Return the index extended by the requested recordings of a batch."""
     batch = index_of(record, "record of a batch of the store")
     lists = list(index.lists)

@@ -154,10 +154,10 @@ def read_index(folder: str | Path) -> StoreIndex:
             f"the store '{folder}' is half built: it has no {INDEX} yet; give the same `edp store build` again, it "
             "goes on where it stopped"
         )
-    return checked_index(read_text(path, INDEX_BYTES, where, DataError), where)
+    return parse_index(read_text(path, INDEX_BYTES, where, DataError), where)
 
 
-def checked_index(text: str, where: str) -> StoreIndex:
+def parse_index(text: str, where: str) -> StoreIndex:
     """Parse and check the content of an index file: every recording lies within a data file.
 
     Raises:
@@ -171,7 +171,7 @@ def checked_index(text: str, where: str) -> StoreIndex:
             f"{where}: schema {str(table['schema'])[:40]}, this version of EDP reads {UNSEALED_SCHEMA} and {SCHEMA}; "
             f"{BUILD_AGAIN}"
         )
-    index = index_of(without_seal(table, where), where)
+    index = index_of(check_seal(table, where), where)
     if index.schema == UNSEALED_SCHEMA:
         # Nothing binds its numbers, so none of its files counts as compared.
         files = tuple(replace(file, changed_ns=0) for file in index.files)
@@ -180,7 +180,7 @@ def checked_index(text: str, where: str) -> StoreIndex:
     return index
 
 
-def without_seal(table: dict[str, object], where: str) -> dict[str, object]:
+def check_seal(table: dict[str, object], where: str) -> dict[str, object]:
     """Return an index or the record of a batch without its hash, which is checked.
 
     Raises:

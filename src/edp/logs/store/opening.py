@@ -43,13 +43,13 @@ def read_store(folder: str | Path) -> list[Recording]:
     top = Path(folder)
     index = read_index(top)
     if not index.recordings:
-        raise DataError(f"the store '{folder}' holds no recording; {_refused(index)}")
-    files = {file.key: _mapped(top, file) for file in index.files}
+        raise DataError(f"the store '{folder}' holds no recording; {_describe_refused(index)}")
+    files = {file.key: _map_file(top, file) for file in index.files}
     _check_changed(top, index, files)
     recordings = [recording_of(entry, index, files[entry.rows]) for entry in index.recordings]
     logs = [Path(entry.log) for entry in index.recordings]
     names = unique_names([recording.name for recording in recordings], logs)
-    named = [replace(recording, name=name).with_digest(recording.digest) for recording, name in zip(recordings, names)]
+    named = [replace(recording, name=name).set_digest(recording.digest) for recording, name in zip(recordings, names)]
     return alike(named, logs)
 
 
@@ -60,7 +60,7 @@ def recording_of(entry: StoreEntry, index: StoreIndex, values: FloatArray) -> Re
     meta = object_with(parse_json(entry.meta, where, DataError), (), where, DataError)
     stop = entry.first + entry.samples * len(channels)
     rows = values[entry.first : stop].reshape(entry.samples, len(channels))
-    return Recording(entry.name, channels, rows, entry.rate_hz, entry.source, meta).with_digest(entry.digest)
+    return Recording(entry.name, channels, rows, entry.rate_hz, entry.source, meta).set_digest(entry.digest)
 
 
 def check_store(folder: str | Path) -> StoreIndex:
@@ -71,7 +71,7 @@ def check_store(folder: str | Path) -> StoreIndex:
     """
     top = Path(folder)
     index = read_index(top)
-    files = {file.key: _mapped(top, file) for file in index.files}
+    files = {file.key: _map_file(top, file) for file in index.files}
     _refuse_changed(top, index, files, {file.key for file in index.files})
     fresh = tuple(stamped(top, file) for file in index.files)
     if fresh != index.files:
@@ -80,7 +80,7 @@ def check_store(folder: str | Path) -> StoreIndex:
     return index
 
 
-def _mapped(folder: Path, file: RowsFile) -> FloatArray:
+def _map_file(folder: Path, file: RowsFile) -> FloatArray:
     """Memory-map a data file, shape ``(values,)``. Changes remain in this process."""
     size = _status(folder, file).st_size
     path = rows_path(folder, file.key)
@@ -149,7 +149,7 @@ def _refuse_changed(folder: Path, index: StoreIndex, files: dict[str, FloatArray
         )
 
 
-def _refused(index: StoreIndex) -> str:
+def _describe_refused(index: StoreIndex) -> str:
     kinds = Counter(refused.why for refused in index.refused)
     most = kinds.most_common(1)
     return f"{len(index.refused)} log(s) were refused: {most[0][0]}" if most else "build it from logs"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from edp.errors import DataError
 from edp.logs.buckets import BucketReader, RemoteFile, cache_folder, check_room
-from edp.logs.store.index import INDEX, INDEX_BYTES, LOCK, ROWS, StoreIndex, checked_index, rows_path
+from edp.logs.store.index import INDEX, INDEX_BYTES, LOCK, ROWS, StoreIndex, parse_index, rows_path
 from edp.logs.store.opening import check_store
 from edp.storage import hold, make_folder, write_bytes
 from edp.storage.paths import is_file_at, status_of
@@ -26,7 +26,7 @@ def local_store(address: str) -> Path:
     """
     bucket = BucketReader(address)
     text = bucket.read(f"{address}/{INDEX}", INDEX_BYTES)
-    index = checked_index(text.decode(errors="replace"), f"index of the store '{address}'")
+    index = parse_index(text.decode(errors="replace"), f"index of the store '{address}'")
     name = hashlib.blake2b(address.encode() + b"\0" + text, digest_size=16).hexdigest()
     folder = make_folder(cache_folder() / name)
     if is_file_at(folder / INDEX):

@@ -93,8 +93,8 @@ def fit_dictionary(
     draws = sorted({fault.draw for fault in faults})
     if len(draws) < 2:
         return whole
-    sessions = _left_out(summaries, classes, faults, scatter, healthy, seed)
-    whole = _chosen(sessions, whole)
+    sessions = _select_left_out(summaries, classes, faults, scatter, healthy, seed)
+    whole = _choose_dictionary(sessions, whole)
     return replace(whole, confusions=_confusions(sessions, whole))
 
 
@@ -120,7 +120,7 @@ def _dictionary(
     return Dictionary(tuple(summaries), tuple(classes), scatter, *signatures, provenance=provenance)
 
 
-def _left_out(
+def _select_left_out(
     summaries: Sequence[str],
     classes: Sequence[FaultClass],
     faults: Sequence[SimulatedFault],
@@ -157,7 +157,7 @@ def _would_be_found(change: Array, noise: Sequence[Array]) -> bool:
     return any(float(np.max(change[part] ** 2 / noise[part])) > LEAST_CHANGE**2 for part in (0, 1))
 
 
-def _chosen(judged_sessions: Sequence[_Judged], whole: Dictionary) -> Dictionary:
+def _choose_dictionary(judged_sessions: Sequence[_Judged], whole: Dictionary) -> Dictionary:
     """Choose change fraction and temperature with the least logarithmic loss, and a rarely exceeded misfit bound."""
     best, least = whole, np.inf
     for changing in CHANGING:

@@ -75,12 +75,12 @@ def match(dictionary: Dictionary, rows: Array, fresh: bool = True) -> Match:
 
 def match_directions(dictionary: Dictionary, seen: Sequence[Seen | None]) -> Match:
     """Match from the directions at the onset and later; None for a part without rows."""
-    matched = _matched(dictionary, seen, further=False)
+    matched = _match_rows(dictionary, seen, further=False)
     # Carried on, signatures are coarse: they are asked only where no size of the ladders explains the evidence.
-    return matched if matched.none <= MOST_STRANGE else _matched(dictionary, seen, further=True)
+    return matched if matched.none <= MOST_STRANGE else _match_rows(dictionary, seen, further=True)
 
 
-def _matched(dictionary: Dictionary, seen: Sequence[Seen | None], further: bool) -> Match:
+def _match_rows(dictionary: Dictionary, seen: Sequence[Seen | None], further: bool) -> Match:
     tried = _all_candidates(dictionary, further)
     return judged(tried, *likelihoods(tried, seen, dictionary.changing), dictionary)
 
@@ -110,7 +110,7 @@ def _all_candidates(dictionary: Dictionary, further: bool) -> Candidates:
 
 def candidates(dictionary: Dictionary, further: bool = True) -> Candidates:
     """Return all candidates of `match`; `further` includes sizes beyond the ladders."""
-    parts = [_of_fault(dictionary, number, fault, further) for number, fault in enumerate(dictionary.classes)]
+    parts = [_list_sizes(dictionary, number, fault, further) for number, fault in enumerate(dictionary.classes)]
     counts = np.array([len(sizes) for sizes, _ in parts])
     return Candidates(
         np.repeat(np.arange(len(parts)), counts),
@@ -151,7 +151,7 @@ def judged(tried: Candidates, logs: Array, misfits: Array, dictionary: Dictionar
     return Match((1.0 - none) * shares, tried.sizes[chosen], none, misfit)
 
 
-def _of_fault(dictionary: Dictionary, number: int, fault: FaultClass, beyond: bool) -> tuple[Array, Array]:
+def _list_sizes(dictionary: Dictionary, number: int, fault: FaultClass, beyond: bool) -> tuple[Array, Array]:
     """Sizes of a fault that are tried and their signatures, shapes (sizes,) and (2, sizes, features)."""
     rows = dictionary.rows_of(number)
     signatures = dictionary.signatures[:, rows]
@@ -190,10 +190,10 @@ def causes_of(dictionary: Dictionary, matched: Match, most: int = MOST_CAUSES) -
         parts[cause.component] = parts.get(cause.component, 0.0) + cause.probability
     causes.append(Cause(NONE_OF_THESE, "", "", "none", None, "", matched.none, UNKNOWN))
     parts[""] = matched.none
-    return tuple(_by_part(causes, parts)[:most])
+    return tuple(_sort_causes(causes, parts)[:most])
 
 
-def _by_part(causes: Sequence[Cause], parts: dict[str, float]) -> list[Cause]:
+def _sort_causes(causes: Sequence[Cause], parts: dict[str, float]) -> list[Cause]:
     """Sort causes: the most probable fault of each of the three most probable components, then the others."""
     order = sorted(causes, key=lambda cause: (-cause.probability, cause.kind, cause.site))
     first = []

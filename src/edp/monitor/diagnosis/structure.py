@@ -63,7 +63,7 @@ def confusions(
         for b in range(a + 1, len(names)):
             if min(len(rows[a]), len(rows[b])) < LEAST_SESSIONS:
                 continue
-            error = 0.5 * (_behind(logits[rows[a]], a, b) + _behind(logits[rows[b]], b, a))
+            error = 0.5 * (_measure_confusion(logits[rows[a]], a, b) + _measure_confusion(logits[rows[b]], b, a))
             if error > APART:
                 pairs.append((error, a, b))
     pairs.sort(key=lambda pair: (-pair[0], pair[1], pair[2]))
@@ -75,7 +75,7 @@ def confusions(
     return tuple(result)
 
 
-def _behind(logits: Array, right: int, wrong: int) -> float:
+def _measure_confusion(logits: Array, right: int, wrong: int) -> float:
     """Share of sessions of `right` for which `wrong` is more likely; ties count half."""
     lead = logits[:, right] - logits[:, wrong]
     return float(np.mean((lead < 0.0) + 0.5 * (lead == 0.0)))
@@ -86,13 +86,15 @@ def _best_sensor(first: Numbers, second: Numbers, sensors: Mapping[str, Array]) 
     best: tuple[str, float | None] = "", None
     for name in sorted(sensors):
         values = sensors[name]
-        error = 0.5 * (_left_out(values[first], values[second]) + _left_out(values[second], values[first]))
+        error = 0.5 * (
+            _measure_separability(values[first], values[second]) + _measure_separability(values[second], values[first])
+        )
         if best[1] is None or error < best[1]:
             best = name, error
     return best
 
 
-def _left_out(own: Array, other: Array) -> float:
+def _measure_separability(own: Array, other: Array) -> float:
     """Return the fraction of sessions nearer to the other group's mean than to their own leave-one-out mean."""
     means = (own.sum(axis=0) - own) / (len(own) - 1)
     to_own = ((own - means) ** 2).sum(axis=1)

@@ -167,7 +167,7 @@ class BalancesSpec(ResidualSpec):
         material.progress.note("balances")
         matches = [
             (level, rate, gain, max(memory, 2.0 / material.rate_hz))
-            for level, rate, gain in matched_pairs(material.channels, material.train, material.rate_hz, self.match)
+            for level, rate, gain in match_pairs(material.channels, material.train, material.rate_hz, self.match)
             for memory in (self.rate_memory_s if level.kind is Kind.VELOCITY else self.memory_s)
         ]
         matches += [
@@ -194,7 +194,7 @@ def slow_channels(channels: Sequence[Channel], sessions: Sequence[Recording]) ->
     ]
 
 
-def matched_pairs(
+def match_pairs(
     channels: Sequence[Channel], sessions: Sequence[Recording], rate_hz: float, least: float
 ) -> list[tuple[Channel, Channel, float]]:
     """Levels with the rates that belong to them: the best match of each level, with the gain of the rate."""

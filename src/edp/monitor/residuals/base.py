@@ -140,7 +140,7 @@ class ResidualSource(ABC):
         if not rows.shape[1]:
             return np.empty((*rows.shape[:2], len(self.names)), np.float32), state
         there = np.isfinite(rows)
-        filled, last = self._filled(rows, there, state)
+        filled, last = self._fill_missing(rows, there, state)
         residuals, own = self._run(filled, there, state.own)
         # A fresh array: sources may give views of what they keep.
         residuals = np.array(residuals, dtype=np.float32)
@@ -157,7 +157,7 @@ class ResidualSource(ABC):
         )
 
     @staticmethod
-    def _filled(rows: Rows, there: NDArray[np.bool_], state: SourceState) -> tuple[Rows, Rows]:
+    def _fill_missing(rows: Rows, there: NDArray[np.bool_], state: SourceState) -> tuple[Rows, Rows]:
         """Return rows with missing values replaced by the last value, and the last values."""
         if there.all():
             return rows, rows[:, -1].copy()

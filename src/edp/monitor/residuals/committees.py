@@ -69,7 +69,7 @@ class CommitteeOptions:
 
     def trained(self, task: Task, material: FitMaterial, minutes: float) -> tuple[Bundle, Prepared]:
         """Train a network for a task and return it with its training data."""
-        data = _prepared(task, material)
+        data = _prepare_data(task, material)
         lags = sorted({max(1, round(span * material.rate_hz)) for span in self.lags_s})
         backbone = CommitteeSpec(
             lags=tuple(lags), members=self.members, units=self.units, layers=2, activations=("tanh",)
@@ -90,13 +90,13 @@ def constant_channels(material: FitMaterial) -> set[str]:
     return {name for name, constant in zip(material.names, still, strict=True) if constant}
 
 
-def _prepared(task: Task, material: FitMaterial) -> Prepared:
+def _prepare_data(task: Task, material: FitMaterial) -> Prepared:
     channels = {channel.name: channel for channel in material.channels}
     inputs = tuple(channels[name] for name in task.inputs)
     return Prepared(
         task=task,
         train=[task.series(recording) for recording in material.train],
-        validation=_shortened([task.series(recording) for recording in material.validation]),
+        validation=_shorten_series([task.series(recording) for recording in material.validation]),
         test=[],
         inputs=inputs,
         feature_kinds=tuple(channel.kind for channel in inputs),
@@ -106,7 +106,7 @@ def _prepared(task: Task, material: FitMaterial) -> Prepared:
     )
 
 
-def _shortened(series: Sequence[Series]) -> list[Series]:
+def _shorten_series(series: Sequence[Series]) -> list[Series]:
     """Shorten the series in equal proportion to `VALIDATED_TICKS` samples in total."""
     share = min(1.0, VALIDATED_TICKS / max(1, sum(part.samples for part in series)))
     cut = [part.samples if share == 1.0 else max(1000, int(part.samples * share)) for part in series]

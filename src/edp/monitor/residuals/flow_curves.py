@@ -227,12 +227,12 @@ def paths_of(spots: ChamberPlaces, rows: Singles, spools: Singles) -> list[tuple
 
 def shut_of(spots: ChamberPlaces, rows: Singles) -> Singles:
     """Return the fraction of the outflow blocked by a cushion, from 0 at its beginning to 1 at the end."""
-    near = _near(spots, rows, spots.end)
+    near = _measure_end_distance(spots, rows, spots.end)
     shut: Singles = np.float32(1.0) - near * near * (np.float32(3.0) - near - near)
     return shut
 
 
-def _near(spots: ChamberPlaces, rows: Singles, end: float) -> Singles:
+def _measure_end_distance(spots: ChamberPlaces, rows: Singles, end: float) -> Singles:
     """Return the distance to an end of the stroke in cushion lengths, at most 1; 1 without a stroke."""
     if spots.stroke < 0:
         return np.ones(rows.shape[:-1], np.float32)
@@ -257,7 +257,10 @@ def doubts_of(spots: ChamberPlaces, rows: Singles, rates: Singles, through: Sing
     none, whole = np.float32(0.0), np.float32(1.0)
     soft = whole / (np.maximum(own, none) + CAVITY)
     doubts = [np.ones_like(own), rate, rate * soft, np.maximum(EMPTY - own, none)]
-    doubts += [whole - _near(spots, rows, spots.end), whole - _near(spots, rows, spots.far)]
+    doubts += [
+        whole - _measure_end_distance(spots, rows, spots.end),
+        whole - _measure_end_distance(spots, rows, spots.far),
+    ]
     return [*doubts, np.maximum(own - RELIEFS[1], none), through]
 
 

@@ -69,16 +69,16 @@ def fit_chambers(
     models, places, curves = [], [], []
     for axis in axes:
         own_places = _places(axis, names, supplies, sessions)
-        model = _searched(axis, names, own_places, sessions, material.rate_hz, trials)
+        model = _search_spools(axis, names, own_places, sessions, material.rate_hz, trials)
         for spots in own_places:
             fitted = _curves(spots, model, sessions, material.rate_hz, rows)
-            if _explained(spots, model, judging, material.rate_hz, fitted) >= least:
+            if _compute_explained(spots, model, judging, material.rate_hz, fitted) >= least:
                 models.append(model)
                 places.append(spots)
                 curves.append(fitted)
     if not places:
         return None
-    return _assembled(names, models, places, curves)
+    return _assemble_chambers(names, models, places, curves)
 
 
 def _axes_of(material: FitMaterial) -> list[Axis]:
@@ -138,7 +138,7 @@ def _model(axis: Axis, names: Sequence[str], gains: Sequence[float], numbers: Ar
     )
 
 
-def _searched(
+def _search_spools(
     axis: Axis,
     names: Sequence[str],
     places: Sequence[ChamberPlaces],
@@ -164,15 +164,15 @@ def _searched(
 
     def error(numbers: Array) -> float:
         model = _model(axis, names, gains, np.clip(numbers, low, high), rate_hz)
-        return sum(_left(spots, model, chosen, rate_hz, stride) for spots in places)
+        return sum(_compute_remaining(spots, model, chosen, rate_hz, stride) for spots in places)
 
-    simplex = np.array([start] + [_moved(start, i) for i in range(len(start))])
+    simplex = np.array([start] + [_make_corner(start, i) for i in range(len(start))])
     options = {"maxfev": trials, "initial_simplex": np.clip(simplex, low, high), "xatol": 1e-4, "fatol": 1e-5}
     best = minimize(error, start, method="Nelder-Mead", options=options).x
     return _model(axis, names, gains, np.clip(best, low, high), rate_hz)
 
 
-def _moved(start: Sequence[float], index: int) -> list[float]:
+def _make_corner(start: Sequence[float], index: int) -> list[float]:
     """Return a corner of the initial simplex: shifts of dead time, frequency or play."""
     moved = list(start)
     moved[index] += (0.015, 1.5, 0.006, 0.015, 1.5)[index]
@@ -213,7 +213,7 @@ def _columns(part: Part) -> Array:
     return np.concatenate([*curves, np.stack(lines, axis=1).astype(np.float64)], axis=1)
 
 
-def _solved(columns: Array, target: Array) -> Array:
+def _solve_robustly(columns: Array, target: Array) -> Array:
     """Least squares, with a trace of ridge for what never opens, and once more without gross ticks."""
     size = np.sqrt(np.square(columns).mean(axis=0))
     size = np.where(size > 1e-12, size, 1e-12)
@@ -228,12 +228,14 @@ def _solved(columns: Array, target: Array) -> Array:
     return factors
 
 
-def _left(spots: ChamberPlaces, model: SpoolModel, sessions: Sequence[Singles], rate_hz: float, stride: int) -> float:
+def _compute_remaining(
+    spots: ChamberPlaces, model: SpoolModel, sessions: Sequence[Singles], rate_hz: float, stride: int
+) -> float:
     """Return the mean residual of a balance on its fitting sessions, relative to the mean velocity."""
     parts = [_terms(spots, model, rows, rate_hz, lambda v: v[50::stride]) for rows in sessions]
     columns, target = np.concatenate([_columns(part) for part in parts]), np.concatenate([part[2] for part in parts])
     target = spots.sign * target.astype(np.float64)
-    off = np.abs(target - columns @ _solved(columns, target))
+    off = np.abs(target - columns @ _solve_robustly(columns, target))
     return float(off.mean() / max(float(np.abs(target).mean()), 1e-12))
 
 
@@ -248,7 +250,7 @@ def _curves(spots: ChamberPlaces, model: SpoolModel, sessions: Sequence[Singles]
     width, factors, doubts = np.ones(len(target)), np.zeros(0), np.zeros(0)
     # The second time by the widths of the first: what is uncertain counts less.
     for _ in range(2):
-        factors = _solved(columns / width[:, None], target / width)
+        factors = _solve_robustly(columns / width[:, None], target / width)
         flows = columns[:, : spots.paths * own] * factors[: spots.paths * own]
         through = np.abs(flows.reshape(len(flows), spots.paths, own).sum(axis=2)).sum(axis=1).astype(np.float32)
         terms = np.stack(doubts_of(spots, then, rates, through), axis=1).astype(np.float64)
@@ -286,7 +288,7 @@ def _doubts(columns: Array, off: Array) -> Array:
     return factors
 
 
-def _explained(
+def _compute_explained(
     spots: ChamberPlaces,
     model: SpoolModel,
     sessions: Sequence[Singles],
@@ -314,7 +316,7 @@ class _Numbered:
         return self.names.index(name)
 
 
-def _assembled(
+def _assemble_chambers(
     names: Sequence[str],
     models: Sequence[SpoolModel],
     places: Sequence[ChamberPlaces],

@@ -30,7 +30,7 @@ class Group:
     unread: tuple[str, ...] = ()
 
 
-def sensed_channels(channels: Sequence[Channel]) -> tuple[Channel, ...]:
+def select_sensed(channels: Sequence[Channel]) -> tuple[Channel, ...]:
     """Channels that sensors can give: without truth of a simulation."""
     truth = {*EXTRA_CHANNELS, *GROUND_CHANNELS, *MOTOR_CHANNELS, *FAULT_CHANNELS} - {*SENSED}
     return tuple(channel for channel in channels if channel.name not in truth)

@@ -84,7 +84,7 @@ class LookAhead(ResidualSource):
             fed, logged, measured = columns
             with torch.inference_mode():
                 x = torch.from_numpy(np.ascontiguousarray(rows[..., fed]))
-                predicted, width, state = _predicted(bundle.predictor, x, state)
+                predicted, width, state = _predict(bundle.predictor, x, state)
             remaining = []
             for index, horizon in enumerate(bundle.task.horizons):
                 now = np.stack([predicted[:, :, index][..., logged], width[:, :, index][..., logged]], axis=2)
@@ -114,7 +114,7 @@ class LookAhead(ResidualSource):
         return cls(bundles, inputs, middle)
 
 
-def _predicted(predictor: Predictor, x: torch.Tensor, state: Any) -> tuple[Rows, Rows, Any]:
+def _predict(predictor: Predictor, x: torch.Tensor, state: Any) -> tuple[Rows, Rows, Any]:
     """Return predictions, half widths of the first intervals (1 without intervals) and the next state."""
     center, bounds, state = predictor.predict_with_intervals(x, state)
     values = center.numpy()

@@ -176,7 +176,7 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
         constant = constant_channels(material)
         changing = replace(material, channels=tuple(c for c in material.channels if c.name not in constant))
         groups = tuple(replace(g, judged=tuple(n for n in g.judged if n not in constant)) for g in groups)
-        return tuple(group for group in groups if group.judged and self._fed(group, changing))
+        return tuple(group for group in groups if group.judged and self._select_inputs(group, changing))
 
     def network(self, group: Group, material: FitMaterial, networks: int) -> Bundle | None:
         """Train the network of a group with its part of the time budget; None if it explains no channel."""
@@ -184,7 +184,7 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
         changing = replace(material, channels=tuple(c for c in material.channels if c.name not in constant))
         if self.every > 1:
             changing = slower(changing, self.every)
-        return self._fitted(group, changing, 0.8 * material.minutes / networks)
+        return self._fit_group(group, changing, 0.8 * material.minutes / networks)
 
     def together(self, bundles: dict[str, Bundle], material: FitMaterial) -> VirtualSensors | None:
         """Create the source of these networks; None without any."""
@@ -194,15 +194,15 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
         inputs = tuple(name for name in material.names if name in used)
         return VirtualSensors(bundles, inputs, mean_inputs(material, inputs), self.every)
 
-    def _fed(self, group: Group, material: FitMaterial) -> tuple[Channel, ...]:
+    def _select_inputs(self, group: Group, material: FitMaterial) -> tuple[Channel, ...]:
         """Channels that the network of a group reads."""
         apart = {*group.judged, *group.unread}
         return tuple(channel for channel in material.channels if channel.name not in apart)
 
-    def _fitted(self, group: Group, material: FitMaterial, minutes: float) -> Bundle | None:
+    def _fit_group(self, group: Group, material: FitMaterial, minutes: float) -> Bundle | None:
         """Train the network of a group; None if it explains no channel."""
         bundle, data = self.trained(self._task(group, group.judged, material), material, minutes)
-        explained = _explained(bundle.predictor, data.validation or data.train)
+        explained = _compute_explained(bundle.predictor, data.validation or data.train)
         remaining = tuple(name for name, share in zip(group.judged, explained, strict=True) if share >= self.least)
         if not remaining:
             return None
@@ -212,7 +212,7 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
         return bundle
 
     def _task(self, group: Group, judged: tuple[str, ...], material: FitMaterial) -> Task:
-        features = FeatureSet("others", tuple(channel.name for channel in self._fed(group, material)))
+        features = FeatureSet("others", tuple(channel.name for channel in self._select_inputs(group, material)))
         return Task(features, judged, (0,), TargetMode.ABSOLUTE, material.rate_hz)
 
 
@@ -226,7 +226,7 @@ def slower(material: FitMaterial, every: int) -> FitMaterial:
     return replace(material, train=train, validation=validation, rate_hz=rate)
 
 
-def _explained(predictor: Predictor, series: Sequence[Series]) -> list[float]:
+def _compute_explained(predictor: Predictor, series: Sequence[Series]) -> list[float]:
     """Share of each target's variance that is explained, robust to single bad ticks."""
     predicted = stream_predictions(predictor, series)
     error = np.concatenate([p[:, 0] - part.targets for p, part in zip(predicted, series, strict=True)])

@@ -70,16 +70,16 @@ class CodedChannels(Streaming):
         return ()
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        gain, shift = self._folded(self.machine_code if self.lanes is None else self.lanes.unsqueeze(1))
+        gain, shift = self._compute_gains(self.machine_code if self.lanes is None else self.lanes.unsqueeze(1))
         return x * gain + shift, state
 
-    def _folded(self, code: Tensor) -> tuple[Tensor, Tensor]:
+    def _compute_gains(self, code: Tensor) -> tuple[Tensor, Tensor]:
         """Gain and shift of each channel ``(..., width)`` from codes ``(..., size)``."""
         each = code.unsqueeze(-2)
         return 1.0 + (self.scale_map * each).sum(dim=-1), (self.shift_map * each).sum(dim=-1)
 
     def lower(self, build: Builder, x: str) -> str:
-        gain, shift = self._folded(self.machine_code)
+        gain, shift = self._compute_gains(self.machine_code)
         return build.add(ScaleShift, "machine_code", x, gain=gain, shift=shift)
 
     def costs(self) -> list[Cost]:

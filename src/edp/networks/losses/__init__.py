@@ -1,6 +1,6 @@
 """Losses on standardised errors (thesis 3.2.2.5, 3.2.4.3): main losses, additional terms, weights; a module each."""
 
-from edp.networks.losses.base import LOSSES, LossSpec, Penalty, Prediction, masked_loss
+from edp.networks.losses.base import LOSSES, LossSpec, Penalty, Prediction, compute_masked_loss
 from edp.networks.losses.correlation import Correlation as Correlation
 from edp.networks.losses.derivative import Derivative as Derivative
 from edp.networks.losses.drift import Drift as Drift
@@ -22,7 +22,7 @@ __all__ = [
     "Penalty",
     "Prediction",
     "TermSpec",
+    "compute_masked_loss",
     "horizon_weights",
-    "masked_loss",
     "output_weights",
 ]

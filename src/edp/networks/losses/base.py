@@ -63,7 +63,7 @@ class Penalty(ABC):
 LOSSES: Registry[type] = Registry("loss")
 
 
-def masked_loss(spec: LossSpec, answer: Prediction, target: Tensor, valid: Tensor, weights: Tensor) -> Tensor:
+def compute_masked_loss(spec: LossSpec, answer: Prediction, target: Tensor, valid: Tensor, weights: Tensor) -> Tensor:
     """Mean weighted loss over the valid ticks.
 
     Args:

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from edp.networks.losses.terms import TERMS, Course, check_weight, masked_mean
+from edp.networks.losses.terms import TERMS, Course, check_weight, compute_masked_mean
 
 
 @TERMS.register("derivative")
@@ -33,4 +33,4 @@ class Derivative:
         """Mean over pairs of consecutive ticks."""
         # The level cancels in the difference of prediction and target, so absolute and delta mode agree.
         error = course.predicted - course.target
-        return masked_mean((error[:, 1:] - error[:, :-1]).square(), course.together(2))
+        return compute_masked_mean((error[:, 1:] - error[:, :-1]).square(), course.together(2))

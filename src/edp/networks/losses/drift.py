@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from edp.networks.losses.terms import TERMS, Course, check_weight, masked_mean
+from edp.networks.losses.terms import TERMS, Course, check_weight, compute_masked_mean
 
 
 @TERMS.register("drift")
@@ -38,4 +38,4 @@ class Drift:
         error = torch.where(course.valid[..., None, None], course.predicted - course.target, 0.0)
         # The sum of independent errors grows with the root of the ticks; the quotient keeps late ticks from dominating.
         ticks = course.valid.to(error.dtype).cumsum(dim=1).clamp(min=1.0)[..., None, None]
-        return masked_mean(error.cumsum(dim=1).square() / ticks, course.valid)
+        return compute_masked_mean(error.cumsum(dim=1).square() / ticks, course.valid)

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from edp.networks.losses.terms import TERMS, Course, check_weight, masked_mean
+from edp.networks.losses.terms import TERMS, Course, check_weight, compute_masked_mean
 
 
 @TERMS.register("smoothness")
@@ -36,4 +36,4 @@ class Smoothness:
         # The level is added back: in delta mode the increments alone would be smoothed, not the predicted velocity.
         value = course.predicted + course.level
         bend = value[:, 2:] - 2.0 * value[:, 1:-1] + value[:, :-2]
-        return masked_mean(bend.square(), course.together(3))
+        return compute_masked_mean(bend.square(), course.together(3))

@@ -65,7 +65,7 @@ def check_weight(name: str, weight: float) -> None:
         )
 
 
-def masked_mean(each: Tensor, valid: Tensor) -> Tensor:
+def compute_masked_mean(each: Tensor, valid: Tensor) -> Tensor:
     """Mean over horizons and outputs, then over the ticks that count; ``(stream, time, horizon, output)``."""
     mask = valid.to(each.dtype)
     return (each.mean(dim=(-1, -2)) * mask).sum() / mask.sum().clamp(min=1.0)

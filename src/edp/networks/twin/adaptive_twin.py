@@ -195,12 +195,12 @@ class AdaptiveTwin:
         self._ticks = 0
 
     def _renew(self, forces: Doubles) -> None:
-        self._runner = self._with(self.logs).runner()
+        self._runner = self._apply_factors(self.logs).runner()
         self._load = DisturbanceObserver(self._runner, self._speeds, self.spec.load_share)
         self._runner.resistance = forces.copy()
 
-    def _with(self, logs: Doubles) -> GreyTwin:
-        return self.twin.with_numbers(self.twin.numbers * np.exp(self.moves @ (self.by_oil + logs)))
+    def _apply_factors(self, logs: Doubles) -> GreyTwin:
+        return self.twin.with_parameters(self.twin.numbers * np.exp(self.moves @ (self.by_oil + logs)))
 
     @property
     def factors(self) -> dict[str, float]:
@@ -220,7 +220,7 @@ class AdaptiveTwin:
             self.interrupt()
             return
         if self._state is None:
-            if not (np.isfinite(measured).all() and self.twin.within_stops(measured[None])[0]):
+            if not (np.isfinite(measured).all() and self.twin.is_within_stops(measured[None])[0]):
                 return
             self._state = dict(self.twin.initial_state(command[None], measured[None]))
         self._take(measured)
@@ -281,7 +281,7 @@ class AdaptiveTwin:
         if self._begin is None:
             raise ValueError("no stretch has begun")
         state, row, forces = self._begin
-        runner = self._with(logs).runner()
+        runner = self._apply_factors(logs).runner()
         runner.resistance = forces
         commands = np.array(self._commands, np.float32)[None]
         answers = runner.branches(commands, state, row, np.zeros(1, np.int64))[0][:, self._speeds]

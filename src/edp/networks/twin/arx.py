@@ -13,7 +13,7 @@ from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
 from edp.ir import Builder
 from edp.ir.memory import Convolution
-from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, solved_columns
+from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, list_solved_columns
 from edp.networks.twin.scales import Array, TwinScales
 from edp.settings.bounds import MOST_TICKS, check_bounds, integer
 
@@ -42,7 +42,7 @@ class Arx:
 
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> Twin:
         """Fit by least squares; no random numbers are used."""
-        solved, commands = solved_columns(channels), len(channels.commands)
+        solved, commands = list_solved_columns(channels), len(channels.commands)
         rows = [Series(s.name, np.concatenate([s.inputs, s.targets], axis=1), s.targets[:, solved]) for s in train]
         task = LagTask((1,), tuple(commands + column for column in solved), self.lags)
         solution = ridge_solution(rows, task, penalties=(PENALTY,), histories=(self.lags,))
@@ -52,7 +52,7 @@ class Arx:
 
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
         """Return the shapes of the weights by lag, channel and output, and of the intercepts."""
-        solved = len(solved_columns(channels))
+        solved = len(list_solved_columns(channels))
         rows = self.lags * (len(channels.commands) + len(channels.answers))
         return {"weight": (rows, solved), "intercept": (solved,)}
 
@@ -86,7 +86,7 @@ class ArxTwin(Twin):
         return answers, {"answer": answer, "rows": rows}
 
     def lower(self, build: Builder, commands: str, fed: str) -> str:
-        scales, solved = self.scales, solved_columns(self.channels)
+        scales, solved = self.scales, list_solved_columns(self.channels)
         offset = np.concatenate([scales.command_offset, scales.answer_offset]).astype(np.float64)
         width = np.concatenate([scales.command_width, scales.answer_width]).astype(np.float64)
         unit = scales.answer_width[solved].astype(np.float64)

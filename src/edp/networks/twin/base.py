@@ -13,7 +13,7 @@ from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, DataError, ExportError
 from edp.ir import Builder, Graph
-from edp.networks.twin.lowering import bounded_layers, plant_graph
+from edp.networks.twin.lowering import add_bounds, plant_graph
 from edp.networks.twin.scales import Array, TwinScales
 from edp.networks.twin.windows import WindowStart
 from edp.registry import Registry
@@ -81,7 +81,7 @@ class Twin(ABC):
         with build.inside("cell"):
             proposed = self.lower(build, commands, fed)
         with build.inside("answers"):
-            return bounded_layers(build, self, fed, proposed)
+            return add_bounds(build, self, fed, proposed)
 
     def graph(self) -> Graph:
         """Return one sample as layers with a feedback edge, the basis of exported forms (see `plant_graph`).
@@ -183,13 +183,13 @@ class Twin(ABC):
         """Answers in SI units as a network reads them."""
         return np.asarray((answers - self.scales.answer_offset) / self.scales.answer_width, dtype=np.float32)
 
-    def scaled_commands(self, commands: Array) -> Array:
+    def scale_commands(self, commands: Array) -> Array:
         """Commands in SI units as a network reads them."""
         return np.asarray((commands - self.scales.command_offset) / self.scales.command_width, dtype=np.float32)
 
     def drive(self, commands: Array) -> Array:
         """Return the inputs of free-run training for commands ``(tick, command)`` in SI units, one row per sample."""
-        return self.scaled_commands(commands)
+        return self.scale_commands(commands)
 
     def bounded(self, feedback: Array, velocity: Array, pressure: Array) -> Array:
         """Return outputs ``(batch, answer)`` limited to the bounds, SI units.
@@ -228,8 +228,8 @@ class Twin(ABC):
                     f"'{channel.name}' is not measured at the first tick of the prefix; a free port starts from a "
                     "measured value: begin where all channels are measured"
                 )
-        for lane in np.flatnonzero(~self.within_stops(start)):
-            beyond = self._beyond(start[lane : lane + 1])[0]
+        for lane in np.flatnonzero(~self.is_within_stops(start)):
+            beyond = self._measure_excess(start[lane : lane + 1])[0]
             which = int(np.argmax(beyond))
             stroke = self.channels.strokes[which]
             low, high = (ends[len(self.channels.velocities) + which] for ends in (self.scales.low, self.scales.high))
@@ -241,12 +241,12 @@ class Twin(ABC):
                 "go there"
             )
 
-    def within_stops(self, start: Array) -> NDArray[np.bool_]:
+    def is_within_stops(self, start: Array) -> NDArray[np.bool_]:
         """Return whether a twin can start at ``(batch, answer)``: no stroke is far beyond an end stop."""
-        return np.asarray((self._beyond(start) <= BEYOND).all(axis=1))
+        return np.asarray((self._measure_excess(start) <= BEYOND).all(axis=1))
 
-    def _beyond(self, start: Array) -> Array:
-        return _beyond(self.channels, self.scales, start)
+    def _measure_excess(self, start: Array) -> Array:
+        return _measure_excess(self.channels, self.scales, start)
 
 
 class TwinRunner:
@@ -313,13 +313,13 @@ class TwinSpec(Protocol):
 TWINS: Registry[type] = Registry("twin")
 
 
-def solved_columns(channels: TwinChannels) -> list[int]:
+def list_solved_columns(channels: TwinChannels) -> list[int]:
     """Answers that a regression solves for: all but the strokes, which are integrals."""
     velocities, strokes = len(channels.velocities), len(channels.strokes)
     return [i for i in range(len(channels.answers)) if not velocities <= i < velocities + strokes]
 
 
-def _beyond(channels: TwinChannels, scales: TwinScales, start: Array) -> Array:
+def _measure_excess(channels: TwinChannels, scales: TwinScales, start: Array) -> Array:
     """Return the distance of strokes beyond the end stops, as a fraction of the range ``(batch, stroke)``."""
     count, strokes = len(channels.velocities), len(channels.strokes)
     ends = slice(count, count + strokes)
@@ -351,7 +351,9 @@ def starts_within(
         if part.samples >= length
         for at in np.unique(np.linspace(0, part.samples - length, each).astype(np.int64))
     ]
-    usable = [run for run in runs if (_beyond(channels, scales, run.series.targets[[run.first]]) <= BEYOND).all()]
+    usable = [
+        run for run in runs if (_measure_excess(channels, scales, run.series.targets[[run.first]]) <= BEYOND).all()
+    ]
     if not usable:
         raise DataError(
             f"all {len(runs)} starts lie beyond an end stop of the twin, and its end stops are the ends of the strokes "

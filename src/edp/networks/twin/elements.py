@@ -23,7 +23,7 @@ from edp.networks.twin.lumped.parts import (
     default_parts,
     lumped_parameters,
 )
-from edp.networks.twin.lumped.run import Values, Wiring, free_run, measured_run
+from edp.networks.twin.lumped.run import Values, Wiring, free_run, simulate_measured
 from edp.networks.twin.scales import Array, TwinScales
 from edp.settings.bounds import MOST_UPDATES, check_bounds, check_count, integer, span
 
@@ -109,7 +109,7 @@ class ElementsTwin(Twin):
         self.places = {(n.element, n.name): i for i, n in enumerate(self.table)}
         self.wiring = self._wiring()
 
-    def with_numbers(self, numbers: Doubles) -> ElementsTwin:
+    def with_parameters(self, numbers: Doubles) -> ElementsTwin:
         """Return the elements with other parameters, rounded to the stored precision."""
         rounded = numbers.astype(np.float32).astype(np.float64)
         return ElementsTwin(self.channels, self.scales, self.spec, rounded)
@@ -185,7 +185,7 @@ class ElementsTwin(Twin):
     def _run(self, commands: Array, measured: Array, state: TwinState) -> tuple[Array, TwinState]:
         answer, hidden = (np.array(state[name], np.float32, order="C") for name in ("answer", "hidden"))
         driven, read = (np.ascontiguousarray(part, np.float32) for part in (commands, measured))
-        answers = np.asarray(measured_run(self.numbers, driven, read, answer, hidden, self.wiring))
+        answers = np.asarray(simulate_measured(self.numbers, driven, read, answer, hidden, self.wiring))
         return answers, {"answer": answer, "hidden": hidden}
 
     def lower_answers(self, build: Builder, commands: str, fed: str) -> str:

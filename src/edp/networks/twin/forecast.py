@@ -122,19 +122,19 @@ def forecast(twin: Twin, commands: Array, measured: Array, horizons: Sequence[in
             ports[row] = own + np.float32(gain) * (measured[t] - own) if gain > 0.0 else np.nan
             states.append(state)
             state = runner.step(commands[t], state, ports[row])
-        answers[block] = _ahead(twin, commands[block], _stacked(states), ports, max(horizons))[:, places]
+        answers[block] = _simulate_ahead(twin, commands[block], _stack_states(states), ports, max(horizons))[:, places]
     return answers
 
 
 def _begin(twin: Twin, measured: Array) -> int:
     """First tick at which the twin can start: all measured, no stroke far beyond an end stop; the first without one."""
     there = np.asarray(np.isfinite(measured).all(axis=1))
-    possible = np.flatnonzero(there & twin.within_stops(np.where(there[:, None], measured, np.float32(0.0))))
+    possible = np.flatnonzero(there & twin.is_within_stops(np.where(there[:, None], measured, np.float32(0.0))))
     # Where there is none, the reset at the first tick says what is wrong there.
     return int(possible[0]) if len(possible) and len(measured) - possible[0] >= twin.prefix_ticks else 0
 
 
-def _ahead(twin: Twin, commands: Array, states: TwinState, ports: Array, ticks: int) -> Array:
+def _simulate_ahead(twin: Twin, commands: Array, states: TwinState, ports: Array, ticks: int) -> Array:
     """Simulate from each state with its command held constant, ``(moment, tick, answer)``."""
     constant_commands = np.repeat(commands[:, None], ticks, axis=1)
     fed = np.full((len(commands), ticks, ports.shape[1]), np.nan, np.float32)
@@ -142,7 +142,7 @@ def _ahead(twin: Twin, commands: Array, states: TwinState, ports: Array, ticks: 
     return twin.rollout(constant_commands, states, fed)[0]
 
 
-def _stacked(states: Sequence[TwinState]) -> TwinState:
+def _stack_states(states: Sequence[TwinState]) -> TwinState:
     """Join states of single machines to a batch, rounded to the twin's precision."""
     return {
         name: np.concatenate([np.asarray(state[name], np.float32) for state in states], axis=0) for name in states[0]

@@ -143,7 +143,7 @@ class GreyBox:
         # Both sides of a motor have the same displacement: only the first one is fitted.
         declared = [isinstance(one, MotorElement) or one.areas is not None for one in elements.actuators]
         values = load_start(table, train, twin.wiring.columns, twin.wiring.z_of, channels.rate_hz, declared)
-        return twin.with_numbers(values)
+        return twin.with_parameters(values)
 
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
         """Return the shapes of the parameters and of the full-scale commands of the valves."""
@@ -253,7 +253,7 @@ class GreyTwin(Twin):
         self.spec, (self.table, self.wiring) = spec, parts
         self.numbers, self.full = numbers, full
 
-    def with_numbers(self, numbers: Doubles) -> GreyTwin:
+    def with_parameters(self, numbers: Doubles) -> GreyTwin:
         """Return a twin with the given parameters, rounded to single precision as in a bundle."""
         rounded = numbers.astype(np.float32).astype(np.float64)
         return GreyTwin(self.channels, self.scales, self.spec, (self.table, self.wiring), rounded, self.full)

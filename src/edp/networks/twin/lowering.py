@@ -62,7 +62,7 @@ def _ports(build: Builder, twin: Twin, commands: int) -> tuple[str, str]:
     return build.combine("fed", ADD, *parts), last
 
 
-def bounded_layers(build: Builder, twin: Twin, fed: str, proposed: str) -> str:
+def add_bounds(build: Builder, twin: Twin, fed: str, proposed: str) -> str:
     """Answers within the bounds, scaled: `Twin.bounded` in layers."""
     scales, channels = twin.scales, twin.channels
     count, strokes = len(channels.velocities), len(channels.strokes)
@@ -72,13 +72,13 @@ def bounded_layers(build: Builder, twin: Twin, fed: str, proposed: str) -> str:
     if not strokes:
         return clipped
     velocity = build.pick("velocity", clipped, range(count))
-    velocity, stroke = stopped_strokes(build, twin, fed, velocity, list(range(count)))
+    velocity, stroke = add_stroke_stops(build, twin, fed, velocity, list(range(count)))
     pressures = build.width(clipped) - count
     rest = [build.pick("pressure", clipped, range(count, count + pressures))] if pressures else []
     return build.join("together", velocity, stroke, *rest)
 
 
-def stopped_strokes(build: Builder, twin: Twin, fed: str, velocity: str, columns: list[int]) -> tuple[str, str]:
+def add_stroke_stops(build: Builder, twin: Twin, fed: str, velocity: str, columns: list[int]) -> tuple[str, str]:
     """Add velocities of these columns without motion into an end stop, and the resulting strokes; all scaled."""
     scales, count = twin.scales, len(twin.channels.velocities)
     low, high = ((end - scales.answer_offset) / scales.answer_width for end in (scales.low, scales.high))
@@ -87,12 +87,12 @@ def stopped_strokes(build: Builder, twin: Twin, fed: str, velocity: str, columns
     moved = build.add(ScaleShift, "moved", both, gain=gain, shift=zero)
     ends = [count + column for column in columns]
     stroke = build.combine("stroke", ADD, build.pick("stroke_before", fed, ends), moved)
-    velocity = _stopped(build, "open", stroke, velocity, high[ends], high[columns], 1.0)
-    velocity = _stopped(build, "closed", stroke, velocity, low[ends], low[columns], -1.0)
+    velocity = _stop_at_ends(build, "open", stroke, velocity, high[ends], high[columns], 1.0)
+    velocity = _stop_at_ends(build, "closed", stroke, velocity, low[ends], low[columns], -1.0)
     return velocity, build.add(Clip, "held", stroke, low=low[ends], high=high[ends])
 
 
-def _stopped(build: Builder, name: str, stroke: str, velocity: str, stop: Array, most: Array, side: float) -> str:
+def _stop_at_ends(build: Builder, name: str, stroke: str, velocity: str, stop: Array, most: Array, side: float) -> str:
     """Velocities that do not go into an end stop: their bound is zero where a stroke is beyond it."""
     one = np.ones(len(stop))
     past = build.add(ScaleShift, f"past_{name}", stroke, gain=side * one, shift=-side * stop)

@@ -22,7 +22,7 @@ from edp.errors import DataError
 from edp.ir import Builder
 from edp.ir.layers import BinaryOperation, Clip, Dense
 from edp.ir.memory import Feed, Feedback
-from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, even_starts, solved_columns
+from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, even_starts, list_solved_columns
 from edp.networks.twin.scales import Array, TwinScales
 from edp.networks.twin.windows import MeasuredWindows
 from edp.settings.bounds import check_bounds, check_count, integer
@@ -85,17 +85,17 @@ class N4sid:
         Raises:
             DataError: recordings that are too short for `horizon`.
         """
-        most = len(solved_columns(channels)) * (self.horizon - 1)
+        most = len(list_solved_columns(channels)) * (self.horizon - 1)
         orders = sorted({min(order, most) for order in self.orders})
-        chosen = orders[0] if len(orders) == 1 else self._chosen(channels, scales, train, orders)
-        solution = _Projections.of(_scaled(channels, scales, train), self.horizon)
+        chosen = orders[0] if len(orders) == 1 else self._choose_order(channels, scales, train, orders)
+        solution = _Projections.of(_scale_series(channels, scales, train), self.horizon)
         return self._twin(channels, scales, solution, chosen)
 
-    def _chosen(
+    def _choose_order(
         self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], orders: Sequence[int]
     ) -> int:
-        fitted, judged = _divided(train, self.prefix_ticks + 2 * self.horizon + 2)
-        solution = _Projections.of(_scaled(channels, scales, fitted), self.horizon)
+        fitted, judged = _divide(train, self.prefix_ticks + 2 * self.horizon + 2)
+        solution = _Projections.of(_scale_series(channels, scales, fitted), self.horizon)
         return min(orders, key=lambda order: _free_error(self._twin(channels, scales, solution, order), judged))
 
     def _twin(self, channels: TwinChannels, scales: TwinScales, solution: _Projections, order: int) -> Twin:
@@ -108,7 +108,7 @@ class N4sid:
 
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
         """Order, A, B, C and K, with room for the largest order."""
-        most, solved = max(self.orders), len(solved_columns(channels))
+        most, solved = max(self.orders), len(list_solved_columns(channels))
         sizes = {"a": (most, most), "b": (most, len(channels.commands) + 1), "c": (solved, most), "k": (most, solved)}
         return {"order": (1,), **sizes}
 
@@ -135,7 +135,7 @@ class N4sidTwin(Twin):
         n, doubles = self.order, {name: values.astype(np.float64) for name, values in numbers.items()}
         self.a, self.b = doubles["a"][:n, :n], doubles["b"][:n]
         self.c, self.k = doubles["c"][:, :n], doubles["k"][:n]
-        solved = solved_columns(channels)
+        solved = list_solved_columns(channels)
         self._solved = solved
         self._offset, self._width = scales.answer_offset[solved], scales.answer_width[solved]
 
@@ -144,7 +144,7 @@ class N4sidTwin(Twin):
         return {"answer": measured, "states": np.zeros((len(measured), self.order), np.float32)}
 
     def _commands(self, commands: Array) -> Doubles:
-        return _with_one((commands - self.scales.command_offset) / self.scales.command_width)
+        return _append_ones((commands - self.scales.command_offset) / self.scales.command_width)
 
     def _read(self, answers: Array) -> Doubles:
         return np.asarray((answers[..., self._solved] - self._offset) / self._width, dtype=np.float64)
@@ -182,7 +182,7 @@ Pair = tuple[Doubles, Doubles]
 """Commands, behind them a one, and solved answers of a stretch, scaled ``(tick, command + 1)``, ``(tick, answer)``."""
 
 
-def _with_one(commands: Array) -> Doubles:
+def _append_ones(commands: Array) -> Doubles:
     """Scaled commands ``(..., command)`` and a column of ones: the mean of a velocity is not zero."""
     wide = np.ones((*commands.shape[:-1], commands.shape[-1] + 1))
     wide[..., :-1] = commands
@@ -231,7 +231,7 @@ class _Projections:
             )
         # Windows repeat the constant and, where a lever is held, its command: dependent columns leave directions in the
         # triangle that are rounding errors only, so each block is reduced to the directions above `SMALL`.
-        without_future = _without(triangle[:, future:], _directions(triangle[:, :future]))
+        without_future = _project_out(triangle[:, future:], _directions(triangle[:, :future]))
         own, across = without_future[:, :past], without_future[:, past:]
         left, sizes, _ = np.linalg.svd((_directions(own).T @ across).T, full_matrices=False)
         by_past = np.asarray(np.linalg.lstsq(own, across, rcond=SMALL)[0].T, dtype=np.float64)
@@ -257,7 +257,7 @@ def _directions(columns: Doubles) -> Doubles:
     return np.asarray(left[:, sizes > SMALL * sizes[0]])
 
 
-def _without(columns: Doubles, directions: Doubles) -> Doubles:
+def _project_out(columns: Doubles, directions: Doubles) -> Doubles:
     return columns - directions @ (directions.T @ columns)
 
 
@@ -338,19 +338,19 @@ def _gain(a: Doubles, c: Doubles, process: Doubles, output: Doubles) -> Doubles:
     return np.asarray(np.linalg.solve(c @ p @ c.T + r, (a @ p @ c.T + s).T).T)
 
 
-def _scaled(channels: TwinChannels, scales: TwinScales, series: Sequence[Series]) -> list[Pair]:
-    solved = solved_columns(channels)
+def _scale_series(channels: TwinChannels, scales: TwinScales, series: Sequence[Series]) -> list[Pair]:
+    solved = list_solved_columns(channels)
     offset, width = scales.answer_offset[solved], scales.answer_width[solved]
     return [
         (
-            _with_one((part.inputs - scales.command_offset) / scales.command_width),
+            _append_ones((part.inputs - scales.command_offset) / scales.command_width),
             ((part.targets[:, solved] - offset) / width).astype(np.float64),
         )
         for part in series
     ]
 
 
-def _divided(train: Sequence[Series], least: int) -> tuple[list[Series], list[Series]]:
+def _divide(train: Sequence[Series], least: int) -> tuple[list[Series], list[Series]]:
     """Hold out every fifth recording; for a single recording its last fifth."""
     if len(train) >= KEPT_BACK:
         judged = [part for i, part in enumerate(train) if i % KEPT_BACK == KEPT_BACK - 1 and part.samples >= least]
@@ -372,4 +372,4 @@ def _free_error(twin: Twin, judged: Sequence[Series]) -> float:
     state = twin.reset(runs.commands[:, :prefix], runs.outputs[:, :prefix])
     answers, _ = twin.rollout(runs.commands[:, prefix:], state)
     error = np.abs(answers - runs.outputs[:, prefix + 1 :]) / twin.scales.answer_width
-    return float(error[..., solved_columns(twin.channels)].mean())
+    return float(error[..., list_solved_columns(twin.channels)].mean())

@@ -16,7 +16,7 @@ from edp.errors import ConfigError
 from edp.ir import Builder
 from edp.ir.layers import BinaryOperation, Dense, ScaleShift
 from edp.ir.memory import Gru
-from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinRunner, TwinState, solved_columns
+from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinRunner, TwinState, list_solved_columns
 from edp.networks.twin.recurrent_cell import Bounds, TwinNetwork, buffers
 from edp.networks.twin.scales import Array, TwinScales
 from edp.networks.twin.static_map import StaticMap, StaticTwin
@@ -105,7 +105,7 @@ class Recurrent:
         return RecurrentTwin(channels, scales, self.prefix_ticks, network, static, self.members)
 
     def _network(self, channels: TwinChannels) -> TwinNetwork:
-        pulled = len(solved_columns(channels)) if self.valve_map else 0
+        pulled = len(list_solved_columns(channels)) if self.valve_map else 0
         return TwinNetwork(len(channels.commands), len(channels.answers), self.units, pulled)
 
     @property
@@ -152,8 +152,8 @@ class RecurrentTwin(Twin):
     def drive(self, commands: Array) -> Array:
         """Return the scaled commands; with a static map, followed by its scaled outputs."""
         if self.static is None:
-            return self.scaled_commands(commands)
-        return np.concatenate([self.scaled_commands(commands), self._scaled_map(self.static.along(commands))], axis=1)
+            return self.scale_commands(commands)
+        return np.concatenate([self.scale_commands(commands), self._scale_map(self.static.along(commands))], axis=1)
 
     def free_run(self, commands: Tensor, measured: Tensor, port: Tensor) -> Tensor:
         """Simulate scaled outputs ``(time, batch, answer)`` from measured starts, with gradients by the weights.
@@ -180,12 +180,12 @@ class RecurrentTwin(Twin):
             port = np.isfinite(read).astype(np.float32)
             saved = buffers(len(read), batch, read.shape[2], network.units)
             # A product a tick, so that a chunk and its single ticks round alike.
-            rows = self.scaled_commands(piece).swapaxes(0, 1)
+            rows = self.scale_commands(piece).swapaxes(0, 1)
             projected = np.stack([row @ command_weight.T for row in rows]) + bias
             mapped = np.zeros((0, 0, 0), np.float32)
             if self.static is not None:
                 solved, after["commands"] = self.static.mapped(piece, after["commands"])
-                mapped = np.ascontiguousarray(self._scaled_map(solved).swapaxes(0, 1))
+                mapped = np.ascontiguousarray(self._scale_map(solved).swapaxes(0, 1))
             inputs = (projected, np.nan_to_num(read), port, mapped)
             run_forward(inputs, weights, bounds.arrays, bounds.velocities, (after["answer"], after["h"]), saved)
             pieces.append(saved[0].swapaxes(0, 1))
@@ -210,20 +210,20 @@ class RecurrentTwin(Twin):
             return np.zeros((0, 0, 0), np.float32), np.zeros((0, 0, 0), np.float32)
         lanes = np.ascontiguousarray(commands.swapaxes(0, 1))
         solved, memory = self.static.mapped(lanes, np.repeat(state["commands"], len(lanes), axis=0))
-        return np.ascontiguousarray(self._scaled_map(solved).swapaxes(0, 1)), memory[:1]
+        return np.ascontiguousarray(self._scale_map(solved).swapaxes(0, 1)), memory[:1]
 
-    def _scaled_map(self, solved: Array) -> Array:
+    def _scale_map(self, solved: Array) -> Array:
         """Scale map outputs ``(..., all but strokes)`` to ``(..., answer)``, zero for strokes."""
-        columns, scales = solved_columns(self.channels), self.scales
+        columns, scales = list_solved_columns(self.channels), self.scales
         answers = np.zeros((*solved.shape[:-1], len(self.channels.answers)), np.float32)
         answers[..., columns] = (solved - scales.answer_offset[columns]) / scales.answer_width[columns]
         return answers
 
     def lower(self, build: Builder, commands: str, fed: str) -> str:
-        network, solved = self.network, solved_columns(self.channels)
+        network, solved = self.network, list_solved_columns(self.channels)
         arrays = {name: weight.detach().numpy() for name, weight in network.named_parameters()}
         read = build.join("read", commands, fed)
-        h = build.join("memories", *(self._lowered(build, read, rows) for rows in self.member_rows()))
+        h = build.join("memories", *(self._add_memory(build, read, rows) for rows in self.member_rows()))
         unit = self.bounds.change[solved]
         weight, bias = unit[:, None] * arrays["out_weight"].T[solved], unit * arrays["out_bias"][solved]
         change = build.add(Dense, "change", h, weight=weight, bias=bias)
@@ -238,7 +238,7 @@ class RecurrentTwin(Twin):
             before = build.combine("pulled_before", BinaryOperation.ADD, rest, near)
         return build.combine("proposed", BinaryOperation.ADD, before, change)
 
-    def _lowered(self, build: Builder, read: str, rows: slice) -> str:
+    def _add_memory(self, build: Builder, read: str, rows: slice) -> str:
         """Add the memory of a member with these rows of h."""
         network = self.network
         arrays = {name: weight.detach().numpy() for name, weight in network.named_parameters()}

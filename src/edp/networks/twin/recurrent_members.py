@@ -97,9 +97,9 @@ def _visits(there: np.ndarray, apart: int) -> int:
     return int(len(ticks) > 0) + int((np.diff(ticks) > apart).sum())
 
 
-def with_scales(twin: RecurrentTwin, scales: TwinScales) -> RecurrentTwin:
+def replace_scales(twin: RecurrentTwin, scales: TwinScales) -> RecurrentTwin:
     """Return a copy of the twin with other bounds."""
-    network = _copied(twin.network)
+    network = _copy_network(twin.network)
     static = twin.static and StaticTwin(twin.channels, scales, twin.prefix_ticks, twin.static.numbers)
     return RecurrentTwin(twin.channels, scales, twin.prefix_ticks, network, static, twin.members)
 
@@ -110,7 +110,7 @@ def separated(twin: RecurrentTwin) -> list[RecurrentTwin]:
     What the average keeps of all members alone (constants of the answers, pulls, the map) each of them has.
     """
     if len(twin.member_rows()) < twin.members or twin.members == 1:
-        return [with_scales(twin, twin.scales)]
+        return [replace_scales(twin, twin.scales)]
     return [_member(twin, rows) for rows in twin.member_rows()]
 
 
@@ -133,7 +133,7 @@ def _member(twin: RecurrentTwin, rows: slice) -> RecurrentTwin:
     return RecurrentTwin(twin.channels, twin.scales, twin.prefix_ticks, network, static)
 
 
-def _copied(network: TwinNetwork) -> TwinNetwork:
+def _copy_network(network: TwinNetwork) -> TwinNetwork:
     """Return a copy of a network."""
     pulled = 0 if network.pull is None else len(network.pull)
     answers = network.out_bias.shape[0]

@@ -16,7 +16,7 @@ from edp.errors import ConfigError
 from edp.ir import Builder
 from edp.ir.layers import BinaryOperation, Dense, ScaleShift
 from edp.ir.memory import Gru
-from edp.networks.twin.base import TWINS, TwinRunner, TwinState, solved_columns
+from edp.networks.twin.base import TWINS, TwinRunner, TwinState, list_solved_columns
 from edp.networks.twin.grey.correction import Cell, RunTrace, run_back
 from edp.networks.twin.greybox import Doubles, GreyBox, GreyTwin
 from edp.networks.twin.recurrent_cell import CellWeights, weight_gradients
@@ -88,7 +88,7 @@ class Residual(GreyBox):
 
 def _network(channels: TwinChannels, units: int) -> CellWeights:
     """Return the network, which reads ports and the changes of all outputs except strokes, which are integrals."""
-    solved = len(solved_columns(channels))
+    solved = len(list_solved_columns(channels))
     return CellWeights(len(channels.commands), len(channels.answers) + solved, solved, units)
 
 
@@ -100,15 +100,15 @@ class ResidualTwin(GreyTwin):
         super().__init__(grey.channels, grey.scales, grey.spec, parts, grey.numbers, grey.full)
         self.network = network
 
-    def with_numbers(self, numbers: Doubles) -> ResidualTwin:
+    def with_parameters(self, numbers: Doubles) -> ResidualTwin:
         """Return the elements and network with other grey-box parameters, rounded to the stored precision."""
-        return ResidualTwin(super().with_numbers(numbers), self.network)
+        return ResidualTwin(super().with_parameters(numbers), self.network)
 
     def with_stretches(self, stretches: int) -> ResidualTwin:
         """Return the machine and network with subdivided opening curves."""
         return ResidualTwin(super().with_stretches(stretches), self.network)
 
-    def without_network(self) -> ResidualTwin:
+    def drop_network(self) -> ResidualTwin:
         """Return the grey box with a network whose output is zero."""
         network = _network(self.channels, self.network.units)
         network.load_state_dict(self.network.state_dict())
@@ -128,7 +128,7 @@ class ResidualTwin(GreyTwin):
             projected: the commands' part of the gates ``(tick, lane, 3 units)``.
             h: ``(lane, units)``; a run moves it.
         """
-        solved = np.array(solved_columns(self.channels), dtype=np.int64)
+        solved = np.array(list_solved_columns(self.channels), dtype=np.int64)
         read, state, inner_bias, out, out_bias = (weight.detach().numpy() for weight in self.network.looped)
         scales, units = self.scales, self.units
         offset, per_width = scales.answer_offset / units, units / scales.answer_width
@@ -140,7 +140,7 @@ class ResidualTwin(GreyTwin):
     def _run(self, commands: Array, measured: Array, state: TwinState) -> tuple[Array, TwinState]:
         command_weight, bias = (w.detach().numpy() for w in (self.network.command_weight, self.network.bias))
         # A product a tick, so that a chunk and its single ticks round alike.
-        projected = np.stack([row @ command_weight.T for row in self.scaled_commands(commands).swapaxes(0, 1)]) + bias
+        projected = np.stack([row @ command_weight.T for row in self.scale_commands(commands).swapaxes(0, 1)]) + bias
         h = state["h"].copy()
         answers, after = self.answered(commands, measured, state, self.cell(projected, h))
         return answers, after | {"h": h}
@@ -166,7 +166,7 @@ class ResidualTwin(GreyTwin):
         return TwinRunner(self)
 
     def lower(self, build: Builder, commands: str, fed: str) -> str:
-        solved, scales = solved_columns(self.channels), self.scales
+        solved, scales = list_solved_columns(self.channels), self.scales
         arrays = {name: weight.detach().numpy() for name, weight in self.network.named_parameters()}
         grey, before = super().lower(build, commands, fed), build.pick("before", fed, solved)
         unit = (scales.change_width / scales.answer_width)[solved]
@@ -200,7 +200,7 @@ class _Corrected(torch.autograd.Function):
         lanes, ticks, answers = fed.shape
         units, sizes = twin.network.units, twin.sizes
         h = np.zeros((lanes, units), np.float32)
-        solved = len(solved_columns(twin.channels))
+        solved = len(list_solved_columns(twin.channels))
         trace = RunTrace(
             read=np.zeros((ticks, lanes, answers + solved), np.float32),
             free=np.zeros((ticks, lanes, answers), np.float32),

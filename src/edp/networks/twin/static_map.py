@@ -14,7 +14,7 @@ from edp.data.twin_channels import TwinChannels
 from edp.ir import Builder
 from edp.ir.layers import Clip, Dense, ScaleShift
 from edp.ir.memory import Convolution
-from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, solved_columns
+from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, list_solved_columns
 from edp.networks.twin.scales import Array, TwinScales
 from edp.settings.bounds import MOST_TICKS, check_bounds, check_count, integer
 from edp.wording import typed
@@ -54,7 +54,7 @@ class StaticMap:
         high = np.max([series.inputs.max(axis=0) for series in train], axis=0)
         # A command that never moved has no range; its polygon is flat.
         corners = np.linspace(low, np.where(high > low, high, low + 1), self.knots + 1, dtype=np.float32)[:-1]
-        solved = solved_columns(channels)
+        solved = list_solved_columns(channels)
         rows = [Series(s.name, polygon(s.inputs, corners), s.targets[:, solved]) for s in train]
         longest = max(s.samples for s in train)
         delays = tuple(sorted({delay for delay in self.delays if delay + 1 < longest} or {min(self.delays)}))
@@ -64,11 +64,11 @@ class StaticMap:
         judged = [s for s in rows if s.samples > delays[-1] + 1]
         best = int(np.argmin([_error(solution, judged, i, delay) for i, delay in enumerate(delays)]))
         arrays = {"corners": corners, "delay": np.array([delays[best]], dtype=np.float32)}
-        return self.build(channels, scales, arrays | _solved(solution, best))
+        return self.build(channels, scales, arrays | _solve_delay(solution, best))
 
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
         """Return the shapes of corners, rises of each output between corners, intercepts, and the delay."""
-        commands, solved = len(channels.commands), len(solved_columns(channels))
+        commands, solved = len(channels.commands), len(list_solved_columns(channels))
         corners = (self.knots, commands)
         return {"corners": corners, "rise": (self.knots * commands, solved), "intercept": (solved,), "delay": (1,)}
 
@@ -95,11 +95,11 @@ class StaticTwin(Twin):
 
     def refitted(self, train: Sequence[Series]) -> StaticTwin:
         """Return the map fitted to other segments, with the corners and the delay of this map."""
-        solved = solved_columns(self.channels)
+        solved = list_solved_columns(self.channels)
         corners = self.numbers["corners"]
         rows = [Series(s.name, polygon(s.inputs, corners), s.targets[:, solved]) for s in train]
         solution = ridge_solution(rows, LagTask((self.delay + 1,), (None,) * len(solved), 1), penalties=(PENALTY,))
-        numbers = self.numbers | _solved(solution, 0)
+        numbers = self.numbers | _solve_delay(solution, 0)
         return StaticTwin(self.channels, self.scales, self.prefix_ticks, numbers)
 
     @staticmethod
@@ -157,7 +157,7 @@ class StaticTwin(Twin):
         return np.asarray(solved, dtype=np.float32)
 
     def lower(self, build: Builder, commands: str, fed: str) -> str:
-        scales, solved, count = self.scales, solved_columns(self.channels), len(self.channels.commands)
+        scales, solved, count = self.scales, list_solved_columns(self.channels), len(self.channels.commands)
         if self.delay:
             # Two taps: nothing of the present, all of the tick at the end of the delay.
             taps = np.stack([np.eye(count), np.zeros((count, count))], axis=1)
@@ -196,7 +196,7 @@ def polygon(commands: Array, corners: Array) -> Array:
     return np.asarray(past.reshape(len(commands), -1), dtype=np.float32)
 
 
-def _solved(solution: RidgeSolution, which: int) -> dict[str, Array]:
+def _solve_delay(solution: RidgeSolution, which: int) -> dict[str, Array]:
     """Rises and intercepts of one delay."""
     rise = np.ascontiguousarray(solution.weights[0, :, which], dtype=np.float32)
     return {"rise": rise, "intercept": solution.intercept[which].astype(np.float32)}

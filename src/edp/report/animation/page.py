@@ -122,7 +122,7 @@ def scene_of(
     if shown.has("CylVels_1", "CylVels_2", "CylVels_3"):
         velocity = shown.take("CylVels_1", "CylVels_2", "CylVels_3")
     else:
-        whole = np.stack([_filled(recording.column(f"CylStroke_{i}")) for i in (1, 2, 3)], axis=1)
+        whole = np.stack([_fill_gaps(recording.column(f"CylStroke_{i}")) for i in (1, 2, 3)], axis=1)
         velocity = np.gradient(whole, axis=0)[rows] * strokes_per_s
     pressures = [f"CylPressures_{k}" for i in (1, 2, 3) for k in (i, i + 4)]
     ground = [f"Ground_{k:02d}" for k in range(GROUND_POINTS)]
@@ -143,11 +143,11 @@ def scene_of(
         ground=shown.take(*ground) if soil else np.zeros((len(rows), 0)),
         ground_x=np.asarray(index * SPACING_M, dtype=np.float64),
         readings=readings,
-        forecasts=tuple(_at_rows(line, rows) for line in forecasts),
+        forecasts=tuple(_select_rows(line, rows) for line in forecasts),
     )
 
 
-def _at_rows(line: ForecastLine, rows: NDArray[np.int_]) -> ForecastLine:
+def _select_rows(line: ForecastLine, rows: NDArray[np.int_]) -> ForecastLine:
     def of(values: Array | None) -> Array | None:
         return None if values is None else values[rows]
 
@@ -166,10 +166,10 @@ class _Columns:
         return set(names) <= set(self.recording.channel_names)
 
     def take(self, *names: str) -> Array:
-        return np.stack([_filled(self.recording.column(name))[self._rows] for name in names], axis=1)
+        return np.stack([_fill_gaps(self.recording.column(name))[self._rows] for name in names], axis=1)
 
 
-def _filled(values: Any) -> Array:
+def _fill_gaps(values: Any) -> Array:
     """Return values with gaps filled by straight lines between their neighbours; all zeros without any value."""
     samples = np.asarray(values, dtype=float)
     finite = np.isfinite(samples)

@@ -28,11 +28,11 @@ class Image:
 
     def polygon(self, points: Points, colour: Colour) -> None:
         """Fill a polygon, shape (corner, 2)."""
-        self._draw.polygon(_scaled(points), fill=colour)
+        self._draw.polygon(_scale_points(points), fill=colour)
 
     def line(self, points: Points, colour: Colour, thick: float) -> None:
         """Draw a line through points, shape (point, 2), `thick` pixels wide."""
-        self._draw.line(_scaled(points), fill=colour, width=max(1, round(thick * FINE)), joint="curve")
+        self._draw.line(_scale_points(points), fill=colour, width=max(1, round(thick * FINE)), joint="curve")
 
     def text(self, x: int, y: int, words: str, colour: Colour, size: int) -> None:
         """Draw a label with its upper left corner at `x`, `y`; its capitals are five times `size` pixels high."""
@@ -43,7 +43,7 @@ class Image:
         return np.asarray(self._fine.reduce(FINE), dtype=np.uint8)
 
 
-def _scaled(points: Points) -> list[tuple[float, float]]:
+def _scale_points(points: Points) -> list[tuple[float, float]]:
     # Pillow counts from the centre of the first sample, pictures from its corner.
     return [(float(x) * FINE - 0.5, float(y) * FINE - 0.5) for x, y in np.asarray(points, dtype=float)]
 

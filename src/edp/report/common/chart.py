@@ -307,7 +307,7 @@ class Chart:
         for options in itertools.product(*(control.options for control in chosen_by)):
             texts = {control.key: text for control, (_, text) in zip(chosen_by, options)}
             chosen = {control.key: key for control, (key, _) in zip(chosen_by, options)}
-            panels = [_titled(panel.of(chosen), texts) for panel in self.panels]
+            panels = [_set_title(panel.of(chosen), texts) for panel in self.panels]
             width, height = self.inches
             if across is not None:
                 parts = [(text, panel.of({across.key: key})) for key, text in across.options for panel in panels]
@@ -315,7 +315,7 @@ class Chart:
                 width = max(width * len(panels), 7.0)  # one panel alone still has room for a title
             if any(panel.marks for panel in panels):
                 yield replace(
-                    self, name=_filled(self.file, chosen), title=_filled(self.title, texts), panels=tuple(panels),
+                    self, name=_fill_text(self.file, chosen), title=_fill_text(self.title, texts), panels=tuple(panels),
                     columns=len(panels) if across else self.columns, choices=(), inches=(width, height),
                 )  # fmt: skip
 
@@ -325,7 +325,7 @@ def fits(mark: Mark, chosen: Mapping[str, str]) -> bool:
     return all(mark.when.get(key, option) == option for key, option in chosen.items())
 
 
-def with_unit(text: str, unit: str) -> str:
+def append_unit(text: str, unit: str) -> str:
     """Return an axis title with its unit in brackets."""
     shown = unit_text(unit)
     return f"{text} [{shown}]" if shown else text
@@ -336,12 +336,12 @@ def finite(value: float, digits: int = 5) -> float | None:
     return float(f"{value:.{digits}g}") if math.isfinite(value) else None
 
 
-def _titled(panel: Panel, texts: Mapping[str, str]) -> Panel:
+def _set_title(panel: Panel, texts: Mapping[str, str]) -> Panel:
     x = panel.x
     return replace(panel, x=replace(x, title=texts[x.titled_by])) if x.titled_by in texts else panel
 
 
-def _filled(text: str, values: Mapping[str, str]) -> str:
+def _fill_text(text: str, values: Mapping[str, str]) -> str:
     for key, value in values.items():
         text = text.replace(f"{{{key}}}", value)
     return text

@@ -218,7 +218,7 @@ def _traces(mark: Mark) -> list[Trace]:
 def _(mark: DataSeries) -> list[Trace]:
     mode = "+".join(["lines"] * (mark.width > 0) + ["markers"] * bool(mark.symbol)) or "none"
     trace: Trace = {
-        "type": "scatter", **_along(mark.x), "y": _escaped(mark.y), "mode": mode, "line": {"color": mark.colour},
+        "type": "scatter", **_axis_values(mark.x), "y": _escape_names(mark.y), "mode": mode, "line": {"color": mark.colour},
         "opacity": mark.opacity, "legendrank": mark.rank, "cliponaxis": mark.clipped, **_hover(mark),
     }  # fmt: skip
     if mark.width:
@@ -237,7 +237,7 @@ def _(mark: DataSeries) -> list[Trace]:
 @_traces.register(Range)
 def _(mark: Range) -> list[Trace]:
     line = {"color": _tint(mark.colour), "width": 0.5}
-    shared: Trace = {"type": "scatter", **_along(mark.x), "mode": "lines", "line": line, **_hover(mark)}
+    shared: Trace = {"type": "scatter", **_axis_values(mark.x), "mode": "lines", "line": line, **_hover(mark)}
     lower = shared | {"y": mark.low, "showlegend": False}
     return [lower, shared | {"y": mark.high, "fill": "tonexty", "fillcolor": _tint(mark.colour)}]
 
@@ -246,7 +246,7 @@ def _(mark: Range) -> list[Trace]:
 def _(mark: Bars) -> list[Trace]:
     along, reach = ("y", "x") if mark.horizontal else ("x", "y")
     trace: Trace = {
-        "type": "bar", along: _escaped(mark.positions), reach: mark.values,
+        "type": "bar", along: _escape_names(mark.positions), reach: mark.values,
         "orientation": "h" if mark.horizontal else "v",
         "marker": {"color": mark.colours[0] if len(set(mark.colours)) == 1 else list(mark.colours)}, **_hover(mark),
     }  # fmt: skip
@@ -272,7 +272,7 @@ def _(mark: Cells) -> list[Trace]:
         bar |= {"tickvals": [at for at, _ in mark.ticks], "ticktext": [text for _, text in mark.ticks]}
     gap = 1 if mark.gap else 0
     trace: Trace = {
-        "type": "heatmap", "x": _escaped(mark.x), "y": _escaped(mark.y), "z": rounded,
+        "type": "heatmap", "x": _escape_names(mark.x), "y": _escape_names(mark.y), "z": rounded,
         "colorscale": [[*pair] for pair in zip(steps, mark.scale)], "zmin": mark.ends[0], "zmax": mark.ends[1],
         "xgap": gap, "ygap": gap, "colorbar": bar, "showscale": mark.barred, **_hover(mark),
     }  # fmt: skip
@@ -286,7 +286,7 @@ def _(mark: Cells) -> list[Trace]:
 @_traces.register(Texts)
 def _(mark: Texts) -> list[Trace]:
     return [{
-        "type": "scatter", "x": _escaped(mark.x), "y": _escaped(mark.y), "mode": "text",
+        "type": "scatter", "x": _escape_names(mark.x), "y": _escape_names(mark.y), "mode": "text",
         "text": [f"\u00a0{_text(text)}" for text in mark.texts], "cliponaxis": False, "hoverinfo": "skip",
         "textposition": "top right" if mark.raised else "middle right",
         "textfont": {"size": 12, "color": mark.colour},
@@ -324,11 +324,11 @@ def finite_or_none(value: float) -> float | None:
     return round(value, 4) if math.isfinite(value) else None
 
 
-def _along(x: Positions | Evenly) -> dict[str, object]:
-    return {"x0": x.start, "dx": x.step} if isinstance(x, Evenly) else {"x": _escaped(x)}
+def _axis_values(x: Positions | Evenly) -> dict[str, object]:
+    return {"x0": x.start, "dx": x.step} if isinstance(x, Evenly) else {"x": _escape_names(x)}
 
 
-def _escaped(positions: Any) -> Any:
+def _escape_names(positions: Any) -> Any:
     """Return positions with names escaped and numbers unchanged."""
     return (
         [_text(at) if isinstance(at, str) else at for at in positions]

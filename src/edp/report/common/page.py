@@ -142,7 +142,7 @@ class Page:
             drawn = plots(charts)
         return template("page.html.jinja").render(
             page=self,
-            shown=_shown,
+            shown=_render_parts,
             headline=unbroken(self.headline),
             sections=sections,
             plots=drawn,
@@ -173,7 +173,7 @@ def has_content(part: Part | Section | None) -> bool:
     return part is not None and type(part) is not str and not (isinstance(part, Paragraph) and part.kind == "aid")
 
 
-def _shown(parts: Sequence[Part | None]) -> list[Part]:
+def _render_parts(parts: Sequence[Part | None]) -> list[Part]:
     return [part for part in parts if part is not None and (isinstance(part, str | Paragraph) or has_content(part))]
 
 

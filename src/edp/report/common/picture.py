@@ -195,7 +195,7 @@ def _names(panel: Panel, way: str) -> dict[str, int]:
     return names
 
 
-def _at(positions: Any, names: Mapping[str, int], count: int) -> NDArray[np.float64]:
+def _axis_positions(positions: Any, names: Mapping[str, int], count: int) -> NDArray[np.float64]:
     if isinstance(positions, Evenly):
         return np.asarray(positions.start + positions.step * np.arange(count), dtype=np.float64)
     return np.array(
@@ -249,8 +249,8 @@ def _draw(mark: Mark, axes: Axes, names: Mapping[str, Mapping[str, int]], layer:
 
 @_draw.register(DataSeries)
 def _(mark: DataSeries, axes: Axes, names: Mapping[str, Mapping[str, int]], layer: int, bars: Sequence[Bars]) -> Any:
-    y = _at(mark.y, names["y"], 0)
-    x = _at(mark.x, names["x"], len(y))
+    y = _axis_positions(mark.y, names["y"], 0)
+    x = _axis_positions(mark.x, names["x"], len(y))
     width = mark.width * POINTS
     if len(mark.low):
         ends = np.array([mark.low, mark.high], dtype=float)  # None becomes NaN, which draws nothing
@@ -272,7 +272,7 @@ def _(mark: DataSeries, axes: Axes, names: Mapping[str, Mapping[str, int]], laye
 
 @_draw.register(Range)
 def _(mark: Range, axes: Axes, names: Mapping[str, Mapping[str, int]], layer: int, bars: Sequence[Bars]) -> Any:
-    x = _at(mark.x, names["x"], len(mark.low))
+    x = _axis_positions(mark.x, names["x"], len(mark.low))
     return axes.fill_between(x, mark.low, mark.high, color=mark.colour, alpha=0.16, linewidth=0, zorder=layer)
 
 
@@ -281,7 +281,10 @@ def _(mark: Bars, axes: Axes, names: Mapping[str, Mapping[str, int]], layer: int
     values = np.array(mark.values, dtype=float)
     width = mark.width / len(bars)
     order = [other is mark for other in bars].index(True)
-    positions = _at(mark.positions, names["y" if mark.horizontal else "x"], 0) + (order - (len(bars) - 1) / 2) * width
+    positions = (
+        _axis_positions(mark.positions, names["y" if mark.horizontal else "x"], 0)
+        + (order - (len(bars) - 1) / 2) * width
+    )
     ends = np.array([mark.low, mark.high], dtype=float)
     reach = np.nan_to_num(np.maximum(np.stack((values - ends[0], ends[1] - values)), 0.0)) if len(mark.low) else None
     lines: Any = {
@@ -301,7 +304,7 @@ def _(mark: Cells, axes: Axes, names: Mapping[str, Mapping[str, int]], layer: in
     from matplotlib.colors import LinearSegmentedColormap
 
     colours = LinearSegmentedColormap.from_list("edp", mark.scale)
-    x, y = _at(mark.x, names["x"], 0), _at(mark.y, names["y"], 0)
+    x, y = _axis_positions(mark.x, names["x"], 0), _axis_positions(mark.y, names["y"], 0)
     values = np.ma.masked_invalid(mark.values)
     frame: Any = {"edgecolors": "white", "linewidth": 0.6} if mark.gap else {}
     drawn = axes.pcolormesh(x, y, values, cmap=colours, vmin=mark.ends[0], vmax=mark.ends[1], rasterized=True, **frame)
@@ -326,7 +329,9 @@ def _(mark: Cells, axes: Axes, names: Mapping[str, Mapping[str, int]], layer: in
 
 @_draw.register(Texts)
 def _(mark: Texts, axes: Axes, names: Mapping[str, Mapping[str, int]], layer: int, bars: Sequence[Bars]) -> Any:
-    for x, y, text in zip(_at(mark.x, names["x"], 0), _at(mark.y, names["y"], 0), mark.texts, strict=True):
+    for x, y, text in zip(
+        _axis_positions(mark.x, names["x"], 0), _axis_positions(mark.y, names["y"], 0), mark.texts, strict=True
+    ):
         axes.annotate(
             text, (x, y), (4, 4 if mark.raised else 0), textcoords="offset points", fontsize=8, color=mark.colour,
             va="bottom" if mark.raised else "center",

@@ -18,7 +18,7 @@ from edp.report.common.chart import (
     Mark,
     Panel,
     Texts,
-    with_unit,
+    append_unit,
 )  # fmt: skip
 from edp.report.compare.paired import Comparison
 from edp.report.compare.runs import FREE, ComparedRun, Measure
@@ -97,7 +97,7 @@ def horizon_chart(comparison: Comparison) -> Chart | None:
         return None
     unit = next(m.unit for m in comparison.measures)
     across = ChartAxis("After the start [s]" if free else "Ahead [ms]", kind="log" if free else "linear")
-    up = ChartAxis("Stroke error" if free else with_unit("Mean absolute error", unit), from_zero=True)
+    up = ChartAxis("Stroke error" if free else append_unit("Mean absolute error", unit), from_zero=True)
     choice = Control("output", "Output", tuple((output, output) for output in shown))
     return Chart("horizon", (Panel(tuple(marks), across, up),), choices=(choice,), height=360, together=True)
 
@@ -124,7 +124,7 @@ def recording_chart(comparison: Comparison) -> Chart | None:
             errors = [run.errors[measure].get(name) for name in order]
             marks.append(DataSeries(x=errors, y=list(labels.values()), size=9, when=when, labels=order,
                                     hover="{label}: {x:.4g}", **look))  # fmt: skip
-    across = ChartAxis(with_unit("Error", comparison.measures[0].unit), from_zero=True, grid=True)
+    across = ChartAxis(append_unit("Error", comparison.measures[0].unit), from_zero=True, grid=True)
     panel = Panel(tuple(marks), across, ChartAxis(kind="names", upside_down=True, grid=True))
     return Chart("recordings", (panel,), choices=(_choice(measures),), height=110 + 24 * len(order))
 
@@ -172,5 +172,5 @@ def cost_chart(comparison: Comparison) -> Chart | None:
             marks.append(Texts(x=at, y=error, texts=[str(look["name"])], raised=True, when=when))
     choice = Control("cost", "Cost", tuple((str(position), cost) for position, cost in enumerate(costs)), alone=True)
     across = ChartAxis("Cost", kind="log", ticks=ROUND_TICKS)
-    up = ChartAxis(with_unit("Error", measure.unit), from_zero=True)
+    up = ChartAxis(append_unit("Error", measure.unit), from_zero=True)
     return Chart("cost", (Panel(tuple(marks), across, up),), choices=(choice,), height=360, legend="none")

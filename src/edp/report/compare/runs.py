@@ -20,7 +20,7 @@ from edp.settings.provenance import Provenance
 from edp.storage import read_object
 from edp.storage.paths import full_path, is_file_at
 from edp.storage.reading import Table
-from edp.storage.runs import unfinished_text
+from edp.storage.runs import describe_unfinished
 from edp.wording import figure, unit_text
 
 MOST_RUNS = 12
@@ -150,7 +150,7 @@ def _read(path: Path, name: str) -> ComparedRun:
 def _network(path: Path, name: str) -> ComparedRun:
     facts = read_facts(path)
     if facts.scores is None or NETWORK not in facts.models:
-        raise DataError(unfinished_text(path) or f"'{path}' was not judged; run edp evaluate {path}")
+        raise DataError(describe_unfinished(path) or f"'{path}' was not judged; run edp evaluate {path}")
     # What edp evaluate --data writes is a folder in the run, which has the rest.
     whole = facts
     if facts.provenance is None and is_file_at(full_path(path).parent / "provenance.json"):

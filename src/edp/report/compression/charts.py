@@ -19,7 +19,7 @@ from edp.report.common.chart import (
     Mark,
     Panel,
     Symbol,
-    with_unit,
+    append_unit,
 )  # fmt: skip
 from edp.report.compression.facts import COSTS, cost_of, smallest
 
@@ -54,10 +54,10 @@ def profile_chart(facts: CompressionResult) -> Chart:
             colours=[BLUE if index in front else DROPPED for index in indices],
         ))  # fmt: skip
     across = ChartAxis(kind="names", slant=60)
-    error = ChartAxis(with_unit("Mean absolute error", unit), kind="log", ticks=_ticks(facts), grid=False)
+    error = ChartAxis(append_unit("Mean absolute error", unit), kind="log", ticks=_ticks(facts), grid=False)
     panels = (
         Panel(tuple(left), across, ChartAxis("Parameters", kind="log", ticks=ROUND_TICKS), second=error),
-        Panel(tuple(right), across, ChartAxis(with_unit("Composite score, the front in blue", unit))),
+        Panel(tuple(right), across, ChartAxis(append_unit("Composite score, the front in blue", unit))),
     )
     choice = Control(AHEAD, "Horizon", tuple((horizon, facts.ahead(horizon)) for horizon in facts.horizons))
     return Chart(

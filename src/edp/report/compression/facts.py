@@ -66,7 +66,7 @@ def front_table(facts: CompressionResult, horizon: str) -> Table:
     return Table(caption, columns, tuple(rows), frozenset(facts.front), name=f"k{horizon}")
 
 
-def held_out_table(facts: CompressionResult) -> Table | None:
+def tabulate_held_out(facts: CompressionResult) -> Table | None:
     """Teacher and chosen on the sealed test set."""
     scores = facts.held_out_test.scores
     if not scores:

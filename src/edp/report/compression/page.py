@@ -22,7 +22,7 @@ def write_compression_page(folder: str | Path, pictures: bool = True) -> Path:
     """
     facts = read_compression(folder)
     tables = [words.front_table(facts, horizon) for horizon in reversed(facts.horizons)]
-    held_out = words.held_out_table(facts)
+    held_out = words.tabulate_held_out(facts)
     charts = [profile_chart(facts), front_chart(facts)]
     page = Page(
         title=full_path(Path(folder)).name,

@@ -22,7 +22,7 @@ from edp.report.common.chart import (
     Mark,
     Panel,
     Texts,
-    with_unit,
+    append_unit,
 )  # fmt: skip
 from edp.wording import figure, label_by_name
 
@@ -134,8 +134,8 @@ def joint_chart(coverage: Coverage, group: str) -> Chart | None:
         x, y = _middles(joint.x_range, share.shape[1]), _middles(joint.y_range, share.shape[0])
         cells = _cells(x, y, share, top, "% of the samples", "{x:.4g}, {y:.4g}: {label:.3f} %")
         panels.append(Panel(
-            (replace(cells, barred=len(panels) == 0),), ChartAxis(with_unit(names[joint.x], joint.x_unit)),
-            ChartAxis(with_unit(names[joint.y], joint.y_unit), grid=False), _title(joint),
+            (replace(cells, barred=len(panels) == 0),), ChartAxis(append_unit(names[joint.x], joint.x_unit)),
+            ChartAxis(append_unit(names[joint.y], joint.y_unit), grid=False), _title(joint),
         ))  # fmt: skip
     height = 60 + 270 * -(-len(joints) // columns)
     return Chart(GROUPS[group], tuple(panels), columns=columns, height=height, legend="none")

@@ -73,7 +73,7 @@ def build_coverage_page(coverage: Coverage, title: str, quality: DataQuality | N
         verdict=verdict(coverage),
         tiles=tiles(coverage),
         sections=[
-            Section("wanted", "What is wanted", [wanted_table(coverage)], "Wanted"),
+            Section("wanted", "What is wanted", [tabulate_targets(coverage)], "Wanted"),
             Section("commands", "How rich the commands are", commands, "Commands"),
             Section("poses", "Where the machine has been", [_pose_text(coverage), charts.get("occupancy")], "Poses"),
             Section(
@@ -192,7 +192,7 @@ def tiles(coverage: Coverage) -> list[tuple[str, str, str]]:
     return tiles
 
 
-def wanted_table(coverage: Coverage) -> Table:
+def tabulate_targets(coverage: Coverage) -> Table:
     """Return figures with their required values."""
     rows = tuple(
         (

@@ -231,6 +231,6 @@ def machine_table(facts: FleetFacts) -> Table:
     return Table("All machines, the largest error first", columns, tuple(rows), marked, name="machines")
 
 
-def failed_table(facts: FleetFacts) -> Table:
+def tabulate_failures(facts: FleetFacts) -> Table:
     """Return the machines without a judgement, with the reasons."""
     return Table("Machines that could not be judged", (Column("Machine"), Column("Why", is_text=True)), facts.failed)

@@ -6,7 +6,7 @@ import numpy as np
 
 from edp.report.common.chart import BLUE, MUTED, Bars, Chart, ChartAxis, DataSeries, GuideLine, Mark, Panel
 from edp.report.common.page import Page, Section
-from edp.report.fleet.facts import FleetFacts, failed_table, headline, machine_table, tiles, verdict, worst_table
+from edp.report.fleet.facts import FleetFacts, headline, machine_table, tabulate_failures, tiles, verdict, worst_table
 
 BINS = 24
 
@@ -59,7 +59,7 @@ def build_fleet_page(facts: FleetFacts) -> Page:
                     machine_table(facts),
                 ],
             ),
-            Section("failed", "Not judged", [failed_table(facts)]),
+            Section("failed", "Not judged", [tabulate_failures(facts)]),
         ],
         provenance=[
             ("Network", f"{network.path} ({network.weights})"),

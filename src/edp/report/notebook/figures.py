@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edp.errors import ConfigError, closest
 from edp.evaluation.study import StudyFile
 from edp.recording import Recording
-from edp.report.common.chart import BLUE, GREY, Chart, ChartAxis, DataSeries, Mark, Panel, Range, with_unit
+from edp.report.common.chart import BLUE, GREY, Chart, ChartAxis, DataSeries, Mark, Panel, Range, append_unit
 from edp.report.run.charts import horizon_chart
 from edp.report.run.facts import Facts
 from edp.report.run.figures import downsample
@@ -64,7 +64,7 @@ def prediction_figure(lines: Sequence[BandLine], rate_hz: float, title: str) -> 
         if line.lower is not None and line.upper is not None:
             # Both bounds at the same places, or the area between them would not close.
             shown = np.union1d(downsample(line.lower, POINTS // 2), downsample(line.upper, POINTS // 2))
-            low, high = (_in_report_unit(bound, line.channel)[shown] for bound in (line.lower, line.upper))
+            low, high = (_convert_to_report_unit(bound, line.channel)[shown] for bound in (line.lower, line.upper))
             marks.append(Range(x=_seconds(shown, rate_hz), low=_small(low), high=_small(high), name="Interval"))
         if line.measured is not None:
             marks.append(_line(line.channel, line.measured, rate_hz, "Measured", GREY, 2.6))
@@ -103,12 +103,12 @@ def _rows(name: str, panels: Sequence[Panel]) -> Chart:
 
 
 def _row(channel: Channel, label: str, marks: Sequence[Mark]) -> Panel:
-    return Panel(tuple(marks), ChartAxis("Time [s]"), title=with_unit(label, KINDS[channel.kind].report_unit))
+    return Panel(tuple(marks), ChartAxis("Time [s]"), title=append_unit(label, KINDS[channel.kind].report_unit))
 
 
 def _line(channel: Channel, values: Array, rate_hz: float, name: str, colour: str, width: float) -> DataSeries:
     shown = downsample(values, POINTS)
-    y = _small(_in_report_unit(values, channel)[shown])
+    y = _small(_convert_to_report_unit(values, channel)[shown])
     return DataSeries(x=_seconds(shown, rate_hz), y=y, name=name, colour=colour, width=width)
 
 
@@ -120,7 +120,7 @@ def _small(values: Array) -> NDArray[np.float32]:
     return values.astype(np.float32)
 
 
-def _in_report_unit(values: Array, channel: Channel) -> Array:
+def _convert_to_report_unit(values: Array, channel: Channel) -> Array:
     return np.asarray(KINDS[channel.kind].to_report(values.astype(np.float64)), dtype=np.float64)
 
 

@@ -59,15 +59,15 @@ def text_of(table: Table, width: int = TERMINAL) -> str:
 
 def _lines(columns: Sequence[Sequence[list[str]]], widths: Sequence[int], chosen: Sequence[int]) -> list[str]:
     """Return the lines of some columns: headings, which end on the same line, followed by cells."""
-    heads = [_broken(columns[i][0], widths[i]) for i in chosen]
+    heads = [_break_words(columns[i][0], widths[i]) for i in chosen]
     tall = max(map(len, heads)) if any(any(head) for head in heads) else 0
     rows = [[head[len(head) - tall + row] if len(head) - tall + row >= 0 else "" for head in heads]
             for row in range(tall)]  # fmt: skip
     rows += [list(row) for row in zip(*(columns[i][1] for i in chosen), strict=True)]
-    return [_aligned(row, [widths[i] for i in chosen]) for row in rows]
+    return [_align_cells(row, [widths[i] for i in chosen]) for row in rows]
 
 
-def _broken(words: Sequence[str], width: int) -> list[str]:
+def _break_words(words: Sequence[str], width: int) -> list[str]:
     """Break words into lines of at most a width; the width is at least that of the longest word."""
     lines = [words[0]]
     for word in words[1:]:
@@ -90,7 +90,7 @@ def study_html(study: StudyFile) -> str:
     return f"<div><p>{_safe(sentences)}</p>{html_of([phases] if phases is not None else [])}</div>"
 
 
-def _aligned(cells: Sequence[str], widths: Sequence[int]) -> str:
+def _align_cells(cells: Sequence[str], widths: Sequence[int]) -> str:
     first, *others = (
         cell.ljust(width) if column_index == 0 else cell.rjust(width)
         for column_index, (cell, width) in enumerate(zip(cells, widths, strict=True))

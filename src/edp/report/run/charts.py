@@ -26,7 +26,7 @@ from edp.report.common.chart import (
     Mark,
     Panel,
     Range,
-    with_unit,
+    append_unit,
 )  # fmt: skip
 from edp.report.run import figures
 from edp.report.run.facts import INPUTS, NETWORK, TRUTH, Facts, horizon_text, label_of, main_horizon
@@ -90,7 +90,7 @@ def _look(facts: Facts, model: str) -> Table:
 
 
 def _error_axis(facts: Facts, of: str = MEASURE_NAME) -> ChartAxis:
-    return ChartAxis(with_unit(of, facts.unit), from_zero=True)
+    return ChartAxis(append_unit(of, facts.unit), from_zero=True)
 
 
 def _horizons(facts: Facts, horizons: Sequence[int], keeps_zoom: bool = False) -> Control:
@@ -125,7 +125,7 @@ def prediction_chart(facts: Facts) -> Chart | None:
             opacity=1.0 if line.model == NETWORK else 0.75, rank={TRUTH: 1, NETWORK: 2}.get(line.model, 3), when=when,
         ))  # fmt: skip
     time = ChartAxis("Time [s]" if facts.rate_hz else "Sample")
-    titles = [with_unit(target.description, target.unit) for target in facts.targets]
+    titles = [append_unit(target.description, target.unit) for target in facts.targets]
     panels = [Panel(tuple(row), time, title=title) for title, row in zip(titles, marks, strict=True)]
     recordings = list(dict.fromkeys(line.recording for line in lines))
     longest = max(len(facts.predictions[name][TRUTH]) for name in recordings) / (facts.rate_hz or 1.0)
@@ -165,7 +165,7 @@ def residual_chart(facts: Facts) -> Chart | None:
     panels = []
     for index, (target, row) in enumerate(zip(facts.targets, marks, strict=True)):
         up = ChartAxis("" if index % columns else "Share of samples [%]", from_zero=True)
-        panels.append(Panel(tuple(row), ChartAxis(with_unit("Residual", target.unit)), up, target.description))
+        panels.append(Panel(tuple(row), ChartAxis(append_unit("Residual", target.unit)), up, target.description))
     height = 60 + 260 * -(-len(panels) // columns)
     choices = (_horizons(facts, figures.headline_first(facts)),)
     return Chart("residuals", tuple(panels), columns=columns, choices=choices, height=height)
@@ -219,7 +219,7 @@ def speed_chart(facts: Facts) -> Chart | None:
             positions=[_band(row) for row in rows], colours=["#d3dae1"] * len(rows), when=when,
             values=[100 * row.count / total for row in rows], hover="{y:.3g} % of the samples", remark="",
         ))  # fmt: skip
-    across = ChartAxis(with_unit("Speed band", facts.unit), kind="names")
+    across = ChartAxis(append_unit("Speed band", facts.unit), kind="names")
     panels = (
         Panel(tuple(errors), across, _error_axis(facts, "Mean absolute error")),
         Panel(tuple(counts), across, ChartAxis("Samples [%]")),
@@ -278,7 +278,7 @@ def learning_chart(facts: Facts) -> Chart | None:
     up = ChartAxis(kind="log" if ticks else "linear", ticks=tuple((tick, figure(tick)) for tick in ticks))
     panels = (
         Panel((*best_epoch, *loss), ChartAxis("Epoch"), up, "Loss"),
-        Panel((*best_epoch, error), ChartAxis("Epoch"), title=with_unit("Validation error", facts.unit)),
+        Panel((*best_epoch, error), ChartAxis("Epoch"), title=append_unit("Validation error", facts.unit)),
     )
     return Chart("learning", panels, columns=2, height=340)
 
@@ -305,7 +305,7 @@ def signal_chart(facts: Facts) -> Chart | None:
             x = (selected / rate).astype(np.float32)
             marks.append(DataSeries(x=x, y=y[selected], name=label, colour=colour, width=1.2))
         more = f", {len(columns) - MOST_SERIES} more not drawn" if len(columns) > MOST_SERIES else ""
-        title = labels[0] if unit == "1" else with_unit("", unit).strip() + more
+        title = labels[0] if unit == "1" else append_unit("", unit).strip() + more
         panels.append(Panel(tuple(marks), ChartAxis("Time [s]" if facts.rate_hz else "Sample"), title=title))
     return Chart("signals", tuple(panels), height=100 + 150 * len(panels), together=True)
 

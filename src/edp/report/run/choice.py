@@ -187,10 +187,10 @@ def model_tables(facts: Facts, choice: AutoChoice) -> list[Table]:
     A candidate's error on left-out data is its cross-validated promise, a baseline's is that on the validation part,
     which also chose its sizes. Only the model that is kept has met the test recordings.
     """
-    return [table for table in (_of_output(facts, choice, target) for target in facts.targets) if table.rows]
+    return [table for table in (_tabulate_output(facts, choice, target) for target in facts.targets) if table.rows]
 
 
-def _of_output(facts: Facts, choice: AutoChoice, target: ScoredTarget) -> Table:
+def _tabulate_output(facts: Facts, choice: AutoChoice, target: ScoredTarget) -> Table:
     horizons, chosen = horizons_shown(facts), choice.chosen
 
     def tested(name: str, k: int) -> float | None:
@@ -233,26 +233,26 @@ def promise_table(facts: Facts, choice: AutoChoice) -> Table | None:
     rows = []
     for target in facts.targets:
         for k in facts.horizons:
-            expected = _at(promised, k, target.name)
+            expected = _read_score(promised, k, target.name)
             test = score(facts.models.get(NETWORK), k, "rmse", target.name)
             if expected is None or test is None:
                 continue
-            bounds = [_at(side, k, target.name) for side in (interval.low, interval.high)]
-            still = _at(choice.persistence, k, target.name)
+            bounds = [_read_score(side, k, target.name) for side in (interval.low, interval.high)]
+            still = _read_score(choice.persistence, k, target.name)
             places = decimals_for([expected, test])
             rows.append(
                 (
                     f"{target.description}, {horizon_text(facts, k)} ahead",
                     target.unit,
-                    _with_bounds(expected, bounds, places),
+                    _add_bounds(expected, bounds, places),
                     number(test, places),
                     percent(test / expected - 1, signed=True) if expected > 0 else MISSING,
-                    _with_bounds(
-                        _at(skill.promise, k, target.name),
-                        [_at(side, k, target.name) for side in (skill.interval.low, skill.interval.high)],
+                    _add_bounds(
+                        _read_score(skill.promise, k, target.name),
+                        [_read_score(side, k, target.name) for side in (skill.interval.low, skill.interval.high)],
                         2,
                     ),
-                    number(_at(skill.test, k, target.name), 2),
+                    number(_read_score(skill.test, k, target.name), 2),
                     number(still, places),
                 )
             )
@@ -278,7 +278,7 @@ def promise_line(choice: AutoChoice) -> str:
     skill = choice.skill
     if choice.interval is None or not tested:
         return ""
-    inside, count = _within(tested, choice.interval)
+    inside, count = _count_within(tested, choice.interval)
     cases = count_of(count, "pair")
     line = f"The promised error held on {inside} of {cases} of output and horizon (within its 90 % interval)"
     pairs = [
@@ -295,7 +295,7 @@ def promise_line(choice: AutoChoice) -> str:
     return f"{line}; relative to {beside} it was promised as {promised:.2f} and is {measured:.2f}."
 
 
-def _within(tested: Errors, interval: ErrorBounds) -> tuple[int, int]:
+def _count_within(tested: Errors, interval: ErrorBounds) -> tuple[int, int]:
     """How many test errors lie within their bounds, and how many have some."""
     within = [
         low <= tested[k][name] <= interval.high[k][name]
@@ -306,11 +306,11 @@ def _within(tested: Errors, interval: ErrorBounds) -> tuple[int, int]:
     return sum(within), len(within)
 
 
-def _at(errors: Errors, k: int, name: str) -> float | None:
+def _read_score(errors: Errors, k: int, name: str) -> float | None:
     return errors.get(str(k), {}).get(name)
 
 
-def _with_bounds(value: float | None, bounds: list[float | None], places: int) -> str:
+def _add_bounds(value: float | None, bounds: list[float | None], places: int) -> str:
     """Return a number with its interval, if it has one."""
     if value is None or None in bounds:
         return number(value, places)

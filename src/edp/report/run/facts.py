@@ -15,7 +15,7 @@ from edp.evaluation.footprint_file import FootprintFile
 from edp.evaluation.foundation_file import FoundationFile
 from edp.evaluation.guard import MEASURE, MEASURE_NAME, network_verdict
 from edp.evaluation.scores_file import MEAN, ModelScores, ScoredTarget, ScoresFile, error_at
-from edp.report.run.outputs import by_output, judged_line, losses_line, minutes_of, situation_line
+from edp.report.run.outputs import by_output, describe_evaluation, losses_line, minutes_of, situation_line
 from edp.settings.provenance import DataOrigin, Provenance
 from edp.sim.limit_file import LimitFile
 from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, parse_toml, read_text
@@ -23,7 +23,7 @@ from edp.storage.headers import check_files
 from edp.storage.paths import is_file_at, is_folder_at
 from edp.storage.provenance import PROVENANCE
 from edp.storage.reading import Table
-from edp.storage.runs import unfinished_text
+from edp.storage.runs import describe_unfinished
 from edp.storage.seals import HASH, check_sealed_line, is_sealed_line
 from edp.wording import decimals_for, figure, interval, interval_decimals, listed, number, percent, unit_text
 
@@ -130,7 +130,7 @@ def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts
     absent = tuple(name for name in MAKERS if not is_file_at(folder / name))
     if len(absent) == len(MAKERS):
         missing = f"'{folder}' is not a run folder: it holds none of {listed(MAKERS)}"
-        raise StorageError(unfinished_text(folder) or missing)
+        raise StorageError(describe_unfinished(folder) or missing)
 
     provenance = None if PROVENANCE in absent else Provenance.read(folder)
     facts = Facts(
@@ -342,7 +342,7 @@ def headline(facts: Facts) -> str:
     rows = comparison_rows(facts)
     if samples is None or not any(row.is_network for row in rows):
         missing = f"This run has no scores yet; `edp evaluate {facts.folder}` makes them"
-        return f"{unfinished_text(facts.folder) or missing}."
+        return f"{describe_unfinished(facts.folder) or missing}."
     judged = network_verdict(facts.scores, minutes_of(facts.folder)) if facts.scores else None
     figures = _figures(facts, rows, samples)
     return figures if judged is None else judged.headline(figures)
@@ -398,7 +398,7 @@ def verdict_lines(facts: Facts) -> list[str]:
         if both:
             lines.append(f"It is the better of the two on {won} of {count_of(both, 'test recording')}.")
     lines += [line for line in (losses_line(facts.scores) if facts.scores else "",) if line]
-    judged = judged_line(facts.scores, facts.provenance) if facts.scores else ""
+    judged = describe_evaluation(facts.scores, facts.provenance) if facts.scores else ""
     beyond = situation_line(facts.scores) if facts.scores else ""
     limit = limit_line(facts, main_horizon(facts))
     lines += [line for line in (judged, beyond, limit) if line]

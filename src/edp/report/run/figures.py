@@ -114,10 +114,10 @@ def prediction_lines(facts: Facts, budget: int = POINT_BUDGET) -> list[Line]:
     """
     recordings = sorted(facts.predictions)[:RECORDINGS_SHOWN]
     horizons = horizons_shown(facts)
-    each = len(facts.targets) * (1 + len(horizons) * max((_drawn(facts, name) for name in recordings), default=0))
+    each = len(facts.targets) * (1 + len(horizons) * max((_count_lines(facts, name) for name in recordings), default=0))
     # Many outputs: fewer recordings, so that what is drawn keeps its shape and the page its size.
     recordings = recordings[: max(1, budget // (2 * LEAST_POINTS * max(each, 1)))]
-    models = sum(_drawn(facts, name) for name in recordings)
+    models = sum(_count_lines(facts, name) for name in recordings)
     traces = len(facts.targets) * (len(recordings) + models * len(horizons))
     if traces == 0 or not horizons:
         return []
@@ -143,7 +143,7 @@ def prediction_lines(facts: Facts, budget: int = POINT_BUDGET) -> list[Line]:
     return lines
 
 
-def _drawn(facts: Facts, recording: str) -> int:
+def _count_lines(facts: Facts, recording: str) -> int:
     """Count the lines of a recording next to its truth, for each horizon and output."""
     return len(facts.predictions[recording].keys() - {TRUTH, INPUTS})
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from edp.data.splits import kind_of_name
 from edp.errors import count_of
-from edp.evaluation.guard import MEASURE, MEASURE_NAME, NETWORK, lost_outputs
+from edp.evaluation.guard import MEASURE, MEASURE_NAME, NETWORK, find_lost_outputs
 from edp.evaluation.scores_file import DataSituation, ScoresFile, TargetChange, error_at
 from edp.settings.provenance import Provenance
 from edp.storage import read_object
@@ -25,7 +25,7 @@ FEW = 3
 
 def losses_line(scores: ScoresFile) -> str:
     """Name the outputs on which a baseline has less error at some horizon, worst first; empty without any."""
-    losses = lost_outputs(scores)
+    losses = find_lost_outputs(scores)
     if not losses:
         return ""
     several = len(scores.task.horizons) > 1
@@ -39,7 +39,7 @@ def losses_line(scores: ScoresFile) -> str:
     return f"At some time ahead a baseline has less error on {len(losses)} of {outputs}: {listed(parts)}{more}."
 
 
-def judged_line(scores: ScoresFile, provenance: Provenance | None) -> str:
+def describe_evaluation(scores: ScoresFile, provenance: Provenance | None) -> str:
     """Name the judged logs, with a warning if they are few or of one kind; empty if the scores name none.
 
     Args:
@@ -77,7 +77,7 @@ def situation_line(scores: ScoresFile) -> str:
         f"{row.channel} is outside of its range in training in {percent(row.share)} of the ticks"
         for row in situation.outside
     ]
-    parts += [_changed(row) for row in changes.values()]
+    parts += [_describe_change(row) for row in changes.values()]
     if not parts:
         return ""
     more = f" and {len(parts) - SHOWN} more" if len(parts) > SHOWN else ""
@@ -87,7 +87,7 @@ def situation_line(scores: ScoresFile) -> str:
     )
 
 
-def _changed(row: TargetChange) -> str:
+def _describe_change(row: TargetChange) -> str:
     """Describe a target whose changes differ from those in training."""
     ahead = f"{row.target} in {count_of(row.horizon, 'tick')}"
     if 1 / NOTED <= row.ratio <= NOTED:

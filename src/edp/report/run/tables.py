@@ -48,7 +48,7 @@ def comparison_tables(facts: Facts) -> list[Table]:
     """
     order = sorted(facts.horizons, key=lambda k: (k != main_horizon(facts), k))
     if not facts.averaged:
-        return [table for horizon in order if (table := _by_output(facts, horizon)) is not None]
+        return [table for horizon in order if (table := _tabulate_outputs(facts, horizon)) is not None]
     return [table for table in (_comparison(facts, horizon) for horizon in order) if table.rows]
 
 
@@ -80,10 +80,10 @@ def _any(rows: Sequence[ComparisonRow], key: str) -> bool:
 
 def output_table(facts: Facts) -> Table | None:
     """Error by output at the longest horizon; None where `comparison_tables` shows it already."""
-    return _by_output(facts, main_horizon(facts)) if facts.averaged else None
+    return _tabulate_outputs(facts, main_horizon(facts)) if facts.averaged else None
 
 
-def _by_output(facts: Facts, horizon: int | None) -> Table | None:
+def _tabulate_outputs(facts: Facts, horizon: int | None) -> Table | None:
     rows = comparison_rows(facts, horizon)
     if horizon is None or not rows or len(facts.targets) < 2:
         return None
@@ -157,7 +157,7 @@ def budget_table(facts: Facts) -> Table:
         Column("Allowed"),
         Column("Unit", is_text=True),
         Column("Share used", show=_meter),
-        Column("Verdict", show=_coloured, is_text=True),
+        Column("Verdict", show=_colour_verdict, is_text=True),
         Column("Note", is_text=True),
     )
     return Table("Budget", columns, tuple(rows))
@@ -172,7 +172,7 @@ def _meter(share: Value) -> Markup:
     return bar.format(" over" if share > 1.0 else "", round(min(100.0 * share, 100.0), 1), text)
 
 
-def _coloured(verdict: Value) -> Markup:
+def _colour_verdict(verdict: Value) -> Markup:
     return Markup('<span class="fits{}">{}</span>').format(" over" if verdict == EXCEEDS else "", verdict)
 
 

@@ -26,8 +26,8 @@ from edp.report.common.chart import (
     GuideLine,
     Mark,
     Panel,
+    append_unit,
     finite,
-    with_unit,
 )
 from edp.report.screening.views import (
     METRICS,
@@ -150,7 +150,7 @@ def bar_chart(name: str, views: Sequence[BarView]) -> Chart | None:
                 name="chance", when=when, hover="{y}, by chance: {x:.3g}", remark="",
             ))  # fmt: skip
     metrics = dict.fromkeys(view.key for view in views)
-    titles = tuple((key, with_unit(METRICS[key], UNITS.get(key, ""))) for key in metrics if key in METRICS)
+    titles = tuple((key, append_unit(METRICS[key], UNITS.get(key, ""))) for key in metrics if key in METRICS)
     panel = Panel(tuple(marks), ChartAxis(grid=True, zero=FRAME), ChartAxis(kind="names", upside_down=True, grid=False))
     metric = (Control("metric", "Metric", titles),) if titles else ()
     most = max(len(view.bars) for view in views)

@@ -47,7 +47,7 @@ def build_screening_page(
     charts = {chart.name: chart for chart in screening_charts(screening)}
     hours = screening.samples / screening.rate_hz / 3600
     ahead = f"{screening.horizon} samples ({figure(1e3 * screening.horizon / screening.rate_hz)} ms)"
-    dropped = tables.dropped_table(screening)
+    dropped = tables.tabulate_dropped(screening)
     left_out = f"{count_of(len(dropped.rows), 'channel')} to leave out, and why"
     options = sorted((key.replace("_", " "), setting_text(value)) for key, value in screening.options.items())
     return Page(
@@ -68,7 +68,7 @@ def build_screening_page(
                 [
                     f"For predicting {', '.join(screening.targets)}, {ahead} ahead. "
                     f"{sentence(screening.proposal.window_reason)} A lag in brackets is not certain.",
-                    tables.kept_table(screening),
+                    tables.tabulate_kept(screening),
                     Fold(left_out, [dropped], is_printed=False),
                     *(Paragraph(note, "quiet") for note in notes),
                 ],

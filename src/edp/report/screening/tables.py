@@ -25,12 +25,12 @@ FLAG_WORDS = {
 }
 
 
-def kept_table(screening: ScreeningResult) -> Table:
+def tabulate_kept(screening: ScreeningResult) -> Table:
     """Return the proposed channels by rank."""
     return _choices(screening, "Keep", True)
 
 
-def dropped_table(screening: ScreeningResult) -> Table:
+def tabulate_dropped(screening: ScreeningResult) -> Table:
     """Return the other channels by rank."""
     return _choices(screening, "Drop", False)
 

@@ -202,10 +202,10 @@ def _stability(
         )
         for e in ranked[:MOST_BARS]
     )
-    return BarView(metric, target, title, _told_apart(bars), max(0, len(ranked) - MOST_BARS))
+    return BarView(metric, target, title, _make_labels_unique(bars), max(0, len(ranked) - MOST_BARS))
 
 
-def _told_apart(bars: Sequence[Bar]) -> tuple[Bar, ...]:
+def _make_labels_unique(bars: Sequence[Bar]) -> tuple[Bar, ...]:
     """Bars under short labels, each its own."""
     labels = short_labels(bar.label for bar in bars)
     return tuple(replace(bar, label=label) for bar, label in zip(bars, labels, strict=True))
@@ -225,7 +225,11 @@ def importance_views(screening: ScreeningResult) -> tuple[BarView, ...]:
         if bars:
             views.append(
                 BarView(
-                    "importance", target, "Permutation importance", _told_apart(bars), max(0, len(ranked) - MOST_BARS)
+                    "importance",
+                    target,
+                    "Permutation importance",
+                    _make_labels_unique(bars),
+                    max(0, len(ranked) - MOST_BARS),
                 )
             )
     return tuple(views)
@@ -240,7 +244,9 @@ def value_views(screening: ScreeningResult) -> tuple[BarView, ...]:
         ranked = sorted(entries, key=lambda entry: -entry.gain)
         bars = tuple(Bar(e.channel, e.gain, e.low, e.high, proposed=e.channel in proposed) for e in ranked[:MOST_BARS])
         if bars:
-            views.append(BarView("value", target, "Linear value", _told_apart(bars), max(0, len(ranked) - MOST_BARS)))
+            views.append(
+                BarView("value", target, "Linear value", _make_labels_unique(bars), max(0, len(ranked) - MOST_BARS))
+            )
     return tuple(views)
 
 

@@ -27,7 +27,7 @@ from edp.report.common.chart import (
     Panel,
     Symbol,
     Texts,
-    with_unit,
+    append_unit,
 )
 from edp.report.search.views import (
     COSTS,
@@ -95,7 +95,7 @@ def _arm_text(arm: ArmView) -> str:
 
 
 def _score_axis(unit: str, limits: tuple[float, float] | None = None) -> ChartAxis:
-    return ChartAxis(with_unit("Composite score", unit), limits=limits)
+    return ChartAxis(append_unit("Composite score", unit), limits=limits)
 
 
 def pareto_chart(points: Sequence[PointView], unit: str) -> Chart | None:

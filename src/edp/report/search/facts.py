@@ -15,7 +15,7 @@ Made = TypeVar("Made")
 Absent = TypeVar("Absent")
 
 
-def of_phase(
+def require_phase(
     kind: type[Facts], absent: Absent
 ) -> Callable[[Callable[[StudyFile, Facts], Made]], Callable[[StudyFile], Made | Absent]]:
     """Make a function of a study from one of a study and a phase's facts; it returns `absent` before the decision."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from edp.errors import count_of
 from edp.evaluation.study import StudyFile
 from edp.evaluation.study_facts import SoundConfirmation, SoundScreening, ThesisConfirmation, ThesisScreening
-from edp.report.search.facts import finite, of_phase
+from edp.report.search.facts import finite, require_phase
 from edp.stats.confirm import ModuleEvidence
 from edp.stats.thesis_confirm import ThesisEvidence
 from edp.table import Column, Table, chance, figures
@@ -38,7 +38,7 @@ def ordered(names: Sequence[str]) -> list[tuple[str, str]]:
     return [*known_ones, *((OTHER, name) for name in names if name not in listed)]
 
 
-@of_phase(SoundScreening, ())
+@require_phase(SoundScreening, ())
 def _modules_sound(study: StudyFile, facts: SoundScreening) -> tuple[Table | None, ...]:
     confirmation = study.facts(SoundConfirmation)
     evidence = {} if confirmation is None else {entry.module: entry for entry in confirmation.evidence}
@@ -77,7 +77,7 @@ def _modules_sound(study: StudyFile, facts: SoundScreening) -> tuple[Table | Non
     return Table(caption, columns, tuple(rows), frozenset(marked), name="modules"), _tests(study), _effects(study)
 
 
-@of_phase(SoundScreening, None)
+@require_phase(SoundScreening, None)
 def _effects(study: StudyFile, facts: SoundScreening) -> Table | None:
     """Return the main effects of the two-level design."""
     rows = []
@@ -106,7 +106,7 @@ def _verdict(study: StudyFile, entry: ModuleEvidence | None, passed: bool) -> st
     return "confirmed" if entry.confirmed else "not confirmed"
 
 
-@of_phase(SoundConfirmation, None)
+@require_phase(SoundConfirmation, None)
 def _tests(study: StudyFile, facts: SoundConfirmation) -> Table | None:
     """Return the results of other tests for the modules that phase 3 tested."""
     rows = []
@@ -136,7 +136,7 @@ def _tests(study: StudyFile, facts: SoundConfirmation) -> Table | None:
     return Table("Other tests on the same trainings; all one-sided, not adjusted", columns, tuple(rows), name="tests")
 
 
-@of_phase(ThesisScreening, ())
+@require_phase(ThesisScreening, ())
 def _modules_thesis(study: StudyFile, facts: ThesisScreening) -> tuple[Table | None, ...]:
     confirmation = study.facts(ThesisConfirmation) or ThesisConfirmation(confirmed=(), evidence=())
     metrics = list(dict.fromkeys(entry.metric for entry in confirmation.evidence))

@@ -16,7 +16,7 @@ from edp.report.search.facts import reading
 from edp.report.search.tables import study_tables
 from edp.storage import make_folder, write_bytes
 from edp.table import Table
-from edp.wording import in_markdown, number
+from edp.wording import escape_markdown, number
 
 MOST_IN_A_LINE = 4
 """Sentences of a decision that are shown as text; more are a list."""
@@ -122,7 +122,7 @@ def build_study_page(study: StudyFile, tables: Mapping[str, Table]) -> Page:
     return Page(
         title=study.title,
         kind="model search",
-        about=["model search", _about(study)],
+        about=["model search", _describe_study(study)],
         headline=words.headline(study),
         verdict=words.verdict(study),
         tiles=words.tiles(study),
@@ -235,19 +235,19 @@ def _settings(study: StudyFile) -> list[tuple[str, str]]:
     ]
 
 
-def _about(study: StudyFile) -> str:
+def _describe_study(study: StudyFile) -> str:
     hours = number(study.data.hours, 1)
     return f"{study.mode} mode · preset {study.preset} · {study.data.sessions} sessions, {hours} h · {study.state}"
 
 
 def study_text(study: StudyFile, tables: Mapping[str, Table]) -> str:
     """Return the report as Markdown: result, decisions with reasons, limits of the evidence, tables."""
-    lines = [f"# Model search on {in_markdown(study.title)}", "", f"{in_markdown(_about(study))}.", ""]
-    lines += [in_markdown(words.headline(study)), "", in_markdown(" ".join(words.verdict(study))), ""]
+    lines = [f"# Model search on {escape_markdown(study.title)}", "", f"{escape_markdown(_describe_study(study))}.", ""]
+    lines += [escape_markdown(words.headline(study)), "", escape_markdown(" ".join(words.verdict(study))), ""]
     lines += ["## What was decided, and why", ""]
     for heading, sentences in words.decided(study):
-        lines += [f"**{heading}.** {in_markdown(' '.join(sentences))}", ""]
-    caveats = [f"- {in_markdown(line)}" for line in words.caveats(study)]
+        lines += [f"**{heading}.** {escape_markdown(' '.join(sentences))}", ""]
+    caveats = [f"- {escape_markdown(line)}" for line in words.caveats(study)]
     lines += ["## What it can and cannot show", "", *caveats, ""]
     lines += ["## Tables", "", SCORE, ""]
     for table in tables.values():

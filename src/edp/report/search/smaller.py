@@ -5,12 +5,12 @@ from __future__ import annotations
 from edp.evaluation.compression import Scores
 from edp.evaluation.study import StudyFile
 from edp.evaluation.study_facts import SmallerFacts
-from edp.report.search.facts import of_phase
+from edp.report.search.facts import require_phase
 from edp.table import Column, Table, figures
 from edp.wording import number, percent
 
 
-@of_phase(SmallerFacts, None)
+@require_phase(SmallerFacts, None)
 def smaller_table(study: StudyFile, facts: SmallerFacts) -> Table | None:
     """Return every network in every number format: cost, error, and whether it fits; the front is marked."""
     rows = tuple(
@@ -49,8 +49,8 @@ def _mean(scores: Scores, name: str) -> float:
     return sum(by_score[name] for by_score in scores.values()) / len(scores)
 
 
-@of_phase(SmallerFacts, "")
-def chosen_words(study: StudyFile, facts: SmallerFacts) -> str:
+@require_phase(SmallerFacts, "")
+def describe_choice(study: StudyFile, facts: SmallerFacts) -> str:
     """State the choice for the controller, and its error on the second sealed test set."""
     if not facts.on or facts.budget is None:
         return ""

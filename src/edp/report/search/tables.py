@@ -9,8 +9,8 @@ import numpy as np
 from edp.errors import count_of
 from edp.evaluation.study import PhaseRow, StudyFile
 from edp.evaluation.study_facts import CalibrationFacts, ExplorationFacts, IsolationFacts, SynthesisFacts
-from edp.report.common.chart import with_unit
-from edp.report.search.facts import of_phase
+from edp.report.common.chart import append_unit
+from edp.report.search.facts import require_phase
 from edp.report.search.modules import modules_tables, ordered, span
 from edp.report.search.smaller import smaller_table
 from edp.report.search.views import arm_views, titled
@@ -35,7 +35,7 @@ def study_tables(study: StudyFile) -> dict[str, Table]:
     return {table.name: table for table in tables if table is not None and table.rows}
 
 
-@of_phase(IsolationFacts, None)
+@require_phase(IsolationFacts, None)
 def variance_table(study: StudyFile, facts: IsolationFacts) -> Table | None:
     """Table 4.3: mean error and its standard deviations, of MAE and of the composite score."""
     rows = []
@@ -55,7 +55,7 @@ def _numbers(heads: Sequence[tuple[str, str]], rows: Sequence[Sequence[Value]]) 
     return tuple(Column(*head, figures(values)) for head, values in zip(heads, zip(*rows), strict=True))
 
 
-@of_phase(IsolationFacts, None)
+@require_phase(IsolationFacts, None)
 def features_table(study: StudyFile, facts: IsolationFacts) -> Table | None:
     """Return the chosen feature set against the next best by backbone, and the best backbone against the others."""
     rows: tuple[tuple[Value, ...], ...] = tuple(
@@ -89,7 +89,7 @@ def features_table(study: StudyFile, facts: IsolationFacts) -> Table | None:
     return Table("Feature sets and architectures on the same folds with the same seeds", columns, rows, name="features")
 
 
-@of_phase(CalibrationFacts, None)
+@require_phase(CalibrationFacts, None)
 def calibration_table(study: StudyFile, facts: CalibrationFacts) -> Table | None:
     """Return Table 4.4: scores of all questions of each architecture, and the choice of the efficiency rule."""
     rows = []
@@ -167,7 +167,7 @@ def identifiers_table(study: StudyFile) -> Table | None:
     return Table("Module identifiers", columns, rows, name="identifiers") if "synthesis" in study.decided else None
 
 
-@of_phase(SynthesisFacts, None)
+@require_phase(SynthesisFacts, None)
 def holdout_table(study: StudyFile, facts: SynthesisFacts) -> Table | None:
     """Table 4.8: baseline and winners; in brackets the change against the baseline."""
     calibrated, free = study.facts(CalibrationFacts), study.facts(ExplorationFacts)
@@ -180,18 +180,18 @@ def holdout_table(study: StudyFile, facts: SynthesisFacts) -> Table | None:
     sizes, work = ([one[name] for one in costs] for name in ("parameters", "macs_tick"))
     rows: list[tuple[Value, ...]] = [
         ("Active modules", *(", ".join(short.get(name, name) for name in own) or "none" for own in modules)),
-        ("Parameters", *(_against(size, sizes[0], count_text) for size in sizes)),
+        ("Parameters", *(_compare_with(size, sizes[0], count_text) for size in sizes)),
         ("FP32 (MB)", *(number(4e-6 * size, 4) for size in sizes)),
-        ("MACs per tick", *(_against(value, work[0], count_text) for value in work)),
+        ("MACs per tick", *(_compare_with(value, work[0], count_text) for value in work)),
     ]
     for key, name in {"composite": "Composite", "mae": "MAE", "rmse": "RMSE", "p95": "P95", "p99": "P99"}.items():
         values = [facts.test[arm][key] for arm in ("baseline", "synthesis")]
-        cells = [None if v is None else _against(v, values[0], lambda x: number(x, 3)) for v in values]
-        rows.append((with_unit(f"{name} on test sessions", study.unit), *cells, *([None] * (free is not None))))
+        cells = [None if v is None else _compare_with(v, values[0], lambda x: number(x, 3)) for v in values]
+        rows.append((append_unit(f"{name} on test sessions", study.unit), *cells, *([None] * (free is not None))))
     if free is not None:
         fresh = [free.fresh[arm] for arm in ("synthesis", "exploration")]
         cells = [number(fresh[0], 3), f"{number(fresh[1], 3)} ({percent(fresh[1] / fresh[0] - 1, True)} to phase 4)"]
-        rows.append((with_unit("Composite on fresh folds", study.unit), None, *cells))
+        rows.append((append_unit("Composite on fresh folds", study.unit), None, *cells))
     names = ("Baseline", "Winner of phase 4", "Winner of phase 5")[: len(costs)]
     seeds = study.spec.get("run_seeds", "–")
     caption = f"Baseline and winners; test scores are means of {seeds} seeds, in brackets the change to the baseline"
@@ -200,7 +200,7 @@ def holdout_table(study: StudyFile, facts: SynthesisFacts) -> Table | None:
     )
 
 
-def _against(value: float, reference: float | None, show: Callable[[float], str]) -> str:
+def _compare_with(value: float, reference: float | None, show: Callable[[float], str]) -> str:
     """Return a value with its change against a different reference."""
     if reference is None or value == reference or reference == 0:
         return show(value)

@@ -24,8 +24,8 @@ from edp.evaluation.study_facts import (
     ThesisPlanning,
     ThesisScreening,
 )
-from edp.report.common.chart import with_unit
-from edp.report.search.facts import finite, of_phase
+from edp.report.common.chart import append_unit
+from edp.report.search.facts import finite, require_phase
 from edp.stats.effects import effect_interval
 from edp.stats.variance import SplitVariance
 
@@ -54,7 +54,7 @@ class ArmView:
     mae: SplitVariance
 
 
-@of_phase(IsolationFacts, ())
+@require_phase(IsolationFacts, ())
 def arm_views(study: StudyFile, facts: IsolationFacts) -> tuple[ArmView, ...]:
     """Return the arms of phase 0 in their order."""
     views = []
@@ -93,7 +93,7 @@ class PointView:
 
 def point_views(study: StudyFile) -> tuple[PointView, ...]:
     """Return every network with a score and a cost; for an undecided phase, those of the history."""
-    points = [*_calibrated(study)]
+    points = [*_view_calibration(study)]
     for kind, number in ((SynthesisFacts, 4), (ExplorationFacts, 5)):
         facts = study.facts(kind)
         points += [] if facts is None else _joint(study, facts, number)
@@ -103,20 +103,20 @@ def point_views(study: StudyFile) -> tuple[PointView, ...]:
                 PointView(f"Phase {NUMBERS[name]}, so far", row.score, costs, row.label)
                 for row in study.ended
                 if row.phase == name and row.score is not None
-                if (costs := _above_zero({"parameters": row.parameters, "macs_tick": row.macs_tick}))
+                if (costs := _select_positive({"parameters": row.parameters, "macs_tick": row.macs_tick}))
             ]
     return tuple(points)
 
 
-@of_phase(CalibrationFacts, ())
-def _calibrated(study: StudyFile, facts: CalibrationFacts) -> tuple[PointView, ...]:
+@require_phase(CalibrationFacts, ())
+def _view_calibration(study: StudyFile, facts: CalibrationFacts) -> tuple[PointView, ...]:
     points = []
     for backbone, calibration in facts.backbones.items():
         for trial in calibration.trials:
             if trial.score is not None:
                 what = "baseline" if backbone == facts.backbone else f"taken of {titled(backbone)}"
                 picked = what if trial.number == calibration.number else ""
-                group, costs = f"Phase 1, {titled(backbone)}", _above_zero(trial.costs)
+                group, costs = f"Phase 1, {titled(backbone)}", _select_positive(trial.costs)
                 points.append(PointView(group, trial.score, costs, valued(trial.values), picked))
     return tuple(points)
 
@@ -130,11 +130,11 @@ def _joint(study: StudyFile, facts: JointFacts, number: int) -> list[PointView]:
             modules = ", ".join(study.module(name) for name in trial.modules or ()) or "no module"
             label = f"{modules}; {valued(trial.values)}"
             picked = f"winner of phase {number}" if trial.number == best else ""
-            points.append(PointView(f"Phase {number}", trial.score, _above_zero(trial.costs), label, picked))
+            points.append(PointView(f"Phase {number}", trial.score, _select_positive(trial.costs), label, picked))
     return points
 
 
-def _above_zero(costs: Mapping[str, float | None]) -> dict[str, float]:
+def _select_positive(costs: Mapping[str, float | None]) -> dict[str, float]:
     return {name: value for name, value in costs.items() if value is not None and value > 0}
 
 
@@ -200,18 +200,18 @@ class Forest:
 
 def forests(study: StudyFile) -> tuple[Forest, ...]:
     """Return the decided effects of phases 3 and 2; in the thesis's mode phase 3 by metric."""
-    candidates = (*_confirmed(study), *_screened(study))
+    candidates = (*_view_confirmation(study), *_view_screening(study))
     return tuple(forest for forest in candidates if forest.effects)
 
 
 CHANGE = "Change of the baseline's mean score [%]; left is better"
 
 
-def _confirmed(study: StudyFile) -> tuple[Forest, ...]:
+def _view_confirmation(study: StudyFile) -> tuple[Forest, ...]:
     return (*_sound(study), *_thesis(study))
 
 
-@of_phase(SoundConfirmation, ())
+@require_phase(SoundConfirmation, ())
 def _sound(study: StudyFile, facts: SoundConfirmation) -> tuple[Forest, ...]:
     effects = []
     for entry in facts.evidence:
@@ -224,10 +224,10 @@ def _sound(study: StudyFile, facts: SoundConfirmation) -> tuple[Forest, ...]:
             tests = (entry.p, entry.adjusted, entry.confirmed, remark)
             effects.append(EffectView(study.module(entry.module), value, low, high, *tests))
     gate = -100.0 * float(study.spec["least_gain"])
-    return (Forest("confirmation", "Phase 3: confirmation", "", CHANGE, _ranked(effects), gate),)
+    return (Forest("confirmation", "Phase 3: confirmation", "", CHANGE, _sort_effects(effects), gate),)
 
 
-@of_phase(ThesisConfirmation, ())
+@require_phase(ThesisConfirmation, ())
 def _thesis(study: StudyFile, facts: ThesisConfirmation) -> tuple[Forest, ...]:
     planning = study.facts(ThesisPlanning)
     views: dict[str, list[EffectView]] = {}
@@ -246,15 +246,15 @@ def _thesis(study: StudyFile, facts: ThesisConfirmation) -> tuple[Forest, ...]:
             f"Phase 3: confirmation, {METRICS.get(metric, metric)}",
             METRICS.get(metric, metric),
             "Cohen's d_z of the splits; left is better",
-            _ranked(own),
+            _sort_effects(own),
             -0.5,
         )
         for metric, own in views.items()
     )
 
 
-@of_phase(ScreeningFacts, ())
-def _screened(study: StudyFile, facts: ScreeningFacts) -> tuple[Forest, ...]:
+@require_phase(ScreeningFacts, ())
+def _view_screening(study: StudyFile, facts: ScreeningFacts) -> tuple[Forest, ...]:
     axis, effects = CHANGE, []
     if isinstance(facts, SoundScreening):
         for name, effect in facts.modules.items():
@@ -264,16 +264,16 @@ def _screened(study: StudyFile, facts: ScreeningFacts) -> tuple[Forest, ...]:
             tests = (effect.p, None, name in facts.passed, "goes on" if name in facts.passed else "stops")
             effects.append(EffectView(study.module(name), 100.0 * value, low, high, *tests))
     if isinstance(facts, ThesisScreening):
-        axis = with_unit("Best question less the baseline's median, left is better", study.unit)
+        axis = append_unit("Best question less the baseline's median, left is better", study.unit)
         for name, row in facts.modules.items():
             if row.gain is not None:
                 verdict = "goes on" if name in facts.passed else "stops"
                 view = EffectView(study.module(name), -row.gain, None, None, None, None, name in facts.passed, verdict)
                 effects.append(view)
-    return (Forest("screening", "Phase 2: screening", "", axis, _ranked(effects)),)
+    return (Forest("screening", "Phase 2: screening", "", axis, _sort_effects(effects)),)
 
 
-def _ranked(effects: Iterable[EffectView]) -> tuple[EffectView, ...]:
+def _sort_effects(effects: Iterable[EffectView]) -> tuple[EffectView, ...]:
     return tuple(sorted(effects, key=lambda view: (view.value, view.module)))
 
 

@@ -18,8 +18,8 @@ from edp.evaluation.study_facts import (
     SynthesisFacts,
     ThesisPlanning,
 )
-from edp.report.search.facts import of_phase
-from edp.report.search.smaller import chosen_words
+from edp.report.search.facts import require_phase
+from edp.report.search.smaller import describe_choice
 from edp.report.search.views import titled
 from edp.wording import behind, count_text, duration, listed, number, percent, setting_text
 
@@ -34,7 +34,7 @@ def headline(study: StudyFile) -> str:
     return f"The search {how}: {decided} of {len(study.all_phases)} phases are decided, {done} done."
 
 
-@of_phase(SynthesisFacts, "")
+@require_phase(SynthesisFacts, "")
 def _result(study: StudyFile, facts: SynthesisFacts) -> str:
     ours, base = (facts.test[arm]["composite"] for arm in ("synthesis", "baseline"))
     own = [study.module(name) for name in facts.modules]
@@ -63,9 +63,9 @@ def verdict(study: StudyFile) -> list[str]:
         _how_sure(study),
         _features(study),
         _baseline(study),
-        _confirmed(study),
+        _describe_confirmed(study),
         _teacher(study),
-        chosen_words(study),
+        describe_choice(study),
     ]
     if study.state != "finished":
         where = next((phase for phase in study.all_phases if phase.name not in study.decided), None)
@@ -75,7 +75,7 @@ def verdict(study: StudyFile) -> list[str]:
     return [line for line in lines if line]
 
 
-@of_phase(SynthesisFacts, "")
+@require_phase(SynthesisFacts, "")
 def _how_sure(study: StudyFile, facts: SynthesisFacts) -> str:
     gain = facts.test_gain
     if gain is None:
@@ -85,7 +85,7 @@ def _how_sure(study: StudyFile, facts: SynthesisFacts) -> str:
     return f"The 95 % interval of the change is {low} to {high}{unsure}."
 
 
-@of_phase(IsolationFacts, "")
+@require_phase(IsolationFacts, "")
 def _features(study: StudyFile, facts: IsolationFacts) -> str:
     if len(facts.mean_scores) < 2:
         return ""
@@ -95,28 +95,28 @@ def _features(study: StudyFile, facts: IsolationFacts) -> str:
     )
 
 
-@of_phase(CalibrationFacts, "")
+@require_phase(CalibrationFacts, "")
 def _baseline(study: StudyFile, facts: CalibrationFacts) -> str:
     parameters = facts.backbones[facts.backbone].costs["parameters"]
     return f"The baseline is {titled(facts.backbone)} with {count_text(parameters)} parameters."
 
 
-@of_phase(ConfirmationFacts, "")
-def _confirmed(study: StudyFile, facts: ConfirmationFacts) -> str:
+@require_phase(ConfirmationFacts, "")
+def _describe_confirmed(study: StudyFile, facts: ConfirmationFacts) -> str:
     names = [study.module(name) for name in facts.confirmed]
-    registered = len(_registered(study))
+    registered = len(_list_registered(study))
     if not names:
         return f"None of {registered} modules is confirmed."
     which = f": {listed(names)}" if len(names) <= 6 else ""
     return f"{len(names)} of {registered} modules {'is' if len(names) == 1 else 'are'} confirmed{which}."
 
 
-@of_phase(ScreeningFacts, ())
-def _registered(study: StudyFile, facts: ScreeningFacts) -> tuple[str, ...]:
+@require_phase(ScreeningFacts, ())
+def _list_registered(study: StudyFile, facts: ScreeningFacts) -> tuple[str, ...]:
     return facts.registered
 
 
-@of_phase(ExplorationFacts, "")
+@require_phase(ExplorationFacts, "")
 def _teacher(study: StudyFile, facts: ExplorationFacts) -> str:
     change = percent(facts.change, signed=True)
     if facts.teacher == "exploration":
@@ -138,7 +138,7 @@ def tiles(study: StudyFile) -> list[tuple[str, str, str]]:
     confirmation = study.facts(ConfirmationFacts)
     if confirmation is not None:
         confirmed = count_text(len(confirmation.confirmed))
-        tiles.append((confirmed, "", f"of {len(_registered(study))} modules confirmed"))
+        tiles.append((confirmed, "", f"of {len(_list_registered(study))} modules confirmed"))
     openings = len(study.openings)
     sealed = count_of(len(study.sessions.test) + len(study.sessions.second), "session")
     tiles.append((count_text(openings), "", f"opening{'s' * (openings != 1)} of {sealed} set apart"))
@@ -191,7 +191,7 @@ def _power(study: StudyFile) -> tuple[str, ...]:
     return (_sound_power if study.mode == "sound" else _thesis_power)(study)
 
 
-@of_phase(SoundPlanning, ())
+@require_phase(SoundPlanning, ())
 def _sound_power(study: StudyFile, facts: SoundPlanning) -> tuple[str, ...]:
     effect = percent(float(study.spec["least_effect"]))
     text = (
@@ -204,7 +204,7 @@ def _sound_power(study: StudyFile, facts: SoundPlanning) -> tuple[str, ...]:
     return (text,)
 
 
-@of_phase(ThesisPlanning, ())
+@require_phase(ThesisPlanning, ())
 def _thesis_power(study: StudyFile, facts: ThesisPlanning) -> tuple[str, ...]:
     effect = percent(float(study.spec["least_effect"]))
     return (
@@ -221,11 +221,11 @@ def decided(study: StudyFile) -> list[tuple[str, tuple[str, ...]]]:
         if lines is None:
             count = sum(training.phase == phase.name for training in study.ended)
             lines = (f"Under way: {count_of(count, 'training')} done." if phase.began else "Has not begun.",)
-        decisions.append((phase.heading, _grouped(lines)))
+        decisions.append((phase.heading, _merge_sentences(lines)))
     return decisions
 
 
-def _grouped(lines: Sequence[str]) -> tuple[str, ...]:
+def _merge_sentences(lines: Sequence[str]) -> tuple[str, ...]:
     """Merge sentences that say the same of several names; minus signs become true ones."""
     names: dict[str, list[str]] = {}
     for line in lines:

@@ -22,7 +22,7 @@ from edp.report.common.chart import (
     Mark,
     Panel,
     Texts,
-    with_unit,
+    append_unit,
 )  # fmt: skip
 from edp.report.transfer.facts import Transfer
 from edp.signals import display_offset
@@ -75,7 +75,7 @@ def prediction_chart(facts: Transfer, methods: Sequence[str]) -> Chart:
                     values = (values + display_offset(target.unit)).round(3)
                     when = {RECORDING: name, AHEAD: horizon}
                     marks.append(DataSeries(x=time_s, y=values, name=label, colour=colour, width=width, when=when))
-        title = with_unit(_label(facts, target), target.unit)
+        title = append_unit(_label(facts, target), target.unit)
         panels.append(Panel(tuple(marks), ChartAxis("Time in the test part [s]"), title=title))
     choice = Control(RECORDING, "Recording", tuple((name, name) for name in names), alone=True)
     return Chart(
@@ -108,7 +108,7 @@ def error_chart(facts: Transfer, methods: Sequence[str]) -> Chart:
                 if len(methods) == 1:
                     words = f"bias {bias:.2f}\nskew {skew:.2f}"
                     marks.append(Texts(x=[edges[0]], y=[0.92 * shares.max()], texts=[words], when=when))
-        across = ChartAxis(with_unit("Error", target.unit))
+        across = ChartAxis(append_unit("Error", target.unit))
         up = ChartAxis("" if panels else "Share of samples [%]", from_zero=True)
         panels.append(Panel(tuple(marks), across, up, _label(facts, target)))
     return Chart(
@@ -131,6 +131,6 @@ def method_chart(facts: Transfer) -> Chart:
                     positions=labels, values=values, colours=[MUTED[index % len(MUTED)]] * len(values),
                     name=_label(facts, target), when={AHEAD: horizon},
                 ))  # fmt: skip
-        up = ChartAxis(with_unit("Mean absolute error", facts.unit))
+        up = ChartAxis(append_unit("Mean absolute error", facts.unit))
         panels.append(Panel(tuple(marks), ChartAxis(kind="names"), up, DOMAINS[domain]))
     return Chart("methods", tuple(panels), choices=(_horizons(facts),), height=120 + 240 * len(panels))

@@ -22,8 +22,8 @@ from edp.report.common.chart import (
     Mark,
     Panel,
     Range,
+    append_unit,
     finite,
-    with_unit,
 )  # fmt: skip
 from edp.report.common.picture import write_pictures
 from edp.report.twin.facts import FreeRunFacts
@@ -74,7 +74,7 @@ def runs_chart(facts: FreeRunFacts, part: str) -> Chart:
             marks.append(DataSeries(x=time_s, y=_short(truth), name="Measured", colour=GREY, width=2.6, when=when))
             label = "Twin, on commands alone"
             marks.append(DataSeries(x=time_s, y=_short(answers), name=label, width=1.4, when=when))
-        title = with_unit(labels[channel.name], channel.unit)
+        title = append_unit(labels[channel.name], channel.unit)
         panels.append(Panel(tuple(marks), ChartAxis("Time since the last measured tick [s]"), title=title))
     choice = Control(RECORDING, "Recording", tuple((name, name) for name in facts.names))
     return Chart(f"runs_{part}", tuple(panels), choices=(choice,), height=90 + 190 * len(panels), together=True)
@@ -109,7 +109,7 @@ def horizon_chart(facts: FreeRunFacts) -> Chart:
                     ))  # fmt: skip
         across = ChartAxis("Time since the last measured tick [s]", kind="log")
         up = ChartAxis("" if panels else "Mean absolute error", from_zero=True)
-        title = with_unit(part.capitalize(), facts.twin.by_horizon.part(part).unit or "")
+        title = append_unit(part.capitalize(), facts.twin.by_horizon.part(part).unit or "")
         panels.append(Panel(tuple(marks), across, up, title))
     options = tuple((model, "The twin" if model == TWIN else f"Floor: {model}") for model in facts.models)
     choice = Control(MODEL, "Model", options)
@@ -129,7 +129,7 @@ def steps_chart(steps: StepResponses) -> Chart | None:
             low, high = np.array(answer.low), np.array(answer.high)
             marks.append(Range(x=seconds, low=low, high=high, name="Middle 80 % of the moments", hover=None, when=when))
             marks.append(DataSeries(x=seconds, y=answer.median, name="Median", width=1.8, when=when))
-        title = with_unit(labels[first.name], first.unit)
+        title = append_unit(labels[first.name], first.unit)
         panels.append(Panel(tuple(marks), ChartAxis("Time since the step [s]"), title=title))
     options = tuple((step.command, f"{step.command}, step of {figure(step.size)} {step.unit}") for step in steps.steps)
     return Chart(
@@ -180,7 +180,7 @@ def _rollout_chart(name: str, rollout: Recording, columns: list[str], suffix: st
             marks.append(Range(x=time_s, low=drawn[2], high=drawn[3], name="interval"))
         marks.append(DataSeries(x=time_s, y=drawn[0], name="measured", colour=DROPPED, width=3.6))
         marks.append(DataSeries(x=time_s, y=drawn[1], name="answered by the twin", colour=BLUE, width=1.4))
-        vertical = ChartAxis(with_unit(f"{labels[column]}\n", facts.report_unit))
+        vertical = ChartAxis(append_unit(f"{labels[column]}\n", facts.report_unit))
         panels.append(Panel(tuple(marks), ChartAxis("Time in the log [s]"), vertical))
     size = (8.0, 1.3 * len(columns) + 0.9)
     return Chart(name, tuple(panels), file=name, inches=size, height=90 + 130 * len(columns), together=True)

@@ -207,7 +207,7 @@ def tiles(facts: FreeRunFacts) -> list[tuple[str, str, str]]:
     """Return key figures: value, unit, description."""
     twin = facts.twin
     velocity = twin.velocity_mae
-    if mixed_units(twin):
+    if has_mixed_units(twin):
         rows = actuator_tiles(twin)
     else:
         rows = [(number(velocity.mean), velocity.unit or "", "mean absolute error of the velocities")]
@@ -230,15 +230,15 @@ def free_run_tables(facts: FreeRunFacts) -> dict[str, Table]:
     """Return all tables with content, by name."""
     twin = facts.twin
     tables = [
-        *([actuator_table(facts.models)] if mixed_units(twin) else []),
+        *([actuator_table(facts.models)] if has_mixed_units(twin) else []),
         _summary_table("models", "The twin and its floors", "Model", facts.models, frozenset({0})),
         _summary_table("recordings", "By recording, the worst first", "Recording", _worst(twin.by_recording)),
         _summary_table("driving", "By way of driving", "Way of driving", twin.by_driving),
         _situation_table(twin),
         *([candidate_table(facts.candidates)] if facts.candidates else []),
         *([] if twin.intervals is None else [_coverage_table(twin.intervals)]),
-        *([] if twin.ahead is None else [_ahead_table(facts, twin.ahead)]),
-        *([] if twin.beside is None else [_beside_table(twin.beside)]),
+        *([] if twin.ahead is None else [_tabulate_ahead(facts, twin.ahead)]),
+        *([] if twin.beside is None else [_tabulate_comparison(twin.beside)]),
     ]
     return {table.name: table for table in tables if table.rows}
 
@@ -313,10 +313,10 @@ def _coverage_table(intervals: IntervalCoverage) -> Table:
     return Table(caption, tuple(heads), tuple(rows), name="intervals")
 
 
-def _ahead_table(facts: FreeRunFacts, first: AheadErrors) -> Table:
+def _tabulate_ahead(facts: FreeRunFacts, first: AheadErrors) -> Table:
     caption = f"{figure(first.seconds)} s ahead of measured ports, told the commands in between"
-    if mixed_units(facts.twin):
-        return ahead_by_actuator(facts.models, caption)
+    if has_mixed_units(facts.twin):
+        return tabulate_ahead_by_actuator(facts.models, caption)
     rows: list[tuple[Value, ...]] = []
     for name, scores in facts.models.items():
         ahead = scores.ahead
@@ -328,7 +328,7 @@ def _ahead_table(facts: FreeRunFacts, first: AheadErrors) -> Table:
     return Table(caption, (Column("Model"), *shown), tuple(rows), frozenset({0}), name="ahead")
 
 
-def _beside_table(beside: PredictorComparison) -> Table:
+def _tabulate_comparison(beside: PredictorComparison) -> Table:
     rows: list[tuple[Value, ...]] = [
         (part, row.twin.unit, row.twin.mean, row.predictor.mean) for part, row in beside.errors.items()
     ]
@@ -343,7 +343,7 @@ def _beside_table(beside: PredictorComparison) -> Table:
     return Table(caption, heads, tuple(rows), name="beside")
 
 
-def mixed_units(scores: FreeRunScores) -> bool:
+def has_mixed_units(scores: FreeRunScores) -> bool:
     """Whether velocities of a twin have more than one unit."""
     return bool(scores.velocity_mae.units)
 
@@ -357,20 +357,20 @@ def actuator_table(models: Mapping[str, FreeRunScores]) -> Table:
         ]
         for name, one in models.items()
     }
-    return _by_actuator("actuators", "The twin and its floors, each actuator in its units", columns)
+    return _tabulate_actuators("actuators", "The twin and its floors, each actuator in its units", columns)
 
 
-def ahead_by_actuator(models: Mapping[str, FreeRunScores], caption: str) -> Table:
+def tabulate_ahead_by_actuator(models: Mapping[str, FreeRunScores], caption: str) -> Table:
     """Return the errors a few ticks ahead of measured ports, one row for each actuator and model."""
     columns = {
         name: [("Velocity MAE", one.ahead.velocity_mae), ("Stroke error", one.ahead.stroke_error)]
         for name, one in models.items()
         if one.ahead is not None
     }
-    return _by_actuator("ahead", caption, columns)
+    return _tabulate_actuators("ahead", caption, columns)
 
 
-def _by_actuator(name: str, caption: str, columns: Mapping[str, Sequence[tuple[str, ChannelErrors]]]) -> Table:
+def _tabulate_actuators(name: str, caption: str, columns: Mapping[str, Sequence[tuple[str, ChannelErrors]]]) -> Table:
     """Rows by actuator, then model; of each model titles and rows of errors, each by channel."""
     first = next(iter(columns.values()))
     rows: list[tuple[Value, ...]] = []

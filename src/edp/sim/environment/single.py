@@ -12,7 +12,7 @@ from edp.signals import KINDS, Channel
 from edp.sim.environment.library import gymnasium
 from edp.sim.environment.model import NominalMachine
 from edp.sim.environment.spec import EnvironmentSpec, settings_of
-from edp.sim.environment.start import MOST_SEED, checked_seed, episode_start
+from edp.sim.environment.start import MOST_SEED, check_seed, episode_start
 from edp.sim.environment.truth import Truth
 from edp.sim.episodes.episodes import Episodes, EpisodeStart, Moment
 from edp.sim.machine import layout as at
@@ -74,7 +74,7 @@ class ExcavatorEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             ConfigError: an option is unknown or out of range.
         """
-        seed = checked_seed(seed)
+        seed = check_seed(seed)
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(MOST_SEED))

@@ -15,7 +15,7 @@ from edp.sim.episodes.episodes import EpisodeStart
 from edp.sim.faults import fault_text
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import check_machine
-from edp.sim.machine.machine_files import family_member, known_mass
+from edp.sim.machine.machine_files import family_member, look_up_mass
 from edp.storage.reading import Table
 
 OF_SPEC = (
@@ -51,20 +51,20 @@ def episode_start(spec: EnvironmentSpec, seed: int, options: Table | None) -> tu
     if overrides:
         spec = replace(spec, **overrides)
     scenario = spec.scenario(seed)
-    machine = _drawn(spec, seed) if spec.randomise is not False else scenario.load()
+    machine = _draw_machine(spec, seed) if spec.randomise is not False else scenario.load()
     if "oil_temperature" in options:
-        machine = _warmed(machine, options["oil_temperature"])
+        machine = _set_oil_temperature(machine, options["oil_temperature"])
     start = EpisodeStart(
         scenario, machine, spec.hand, spec.loop_latency, spec.lost_frames, _strokes(options.get("strokes"))
     )
     facts: dict[str, object] = {"seed": seed, "machine": machine.name, "material": spec.material}
     if spec.faults:
         facts["faults"] = "; ".join(map(fault_text, spec.faults))
-    mass_t = known_mass(machine.name)
+    mass_t = look_up_mass(machine.name)
     return start, facts if mass_t is None else {**facts, "mass_t": mass_t}
 
 
-def checked_mask(lanes: int, mask: Any) -> NDArray[np.bool_]:
+def check_mask(lanes: int, mask: Any) -> NDArray[np.bool_]:
     """Return the mask of environments that restart, shape ``(lanes,)``; all of them without a mask.
 
     Raises:
@@ -81,7 +81,7 @@ def checked_mask(lanes: int, mask: Any) -> NDArray[np.bool_]:
     return array
 
 
-def checked_seed(seed: Any) -> int | None:
+def check_seed(seed: Any) -> int | None:
     """Return a seed checked for Gymnasium.
 
     Raises:
@@ -94,7 +94,7 @@ def checked_seed(seed: Any) -> int | None:
     return int(seed)
 
 
-def _drawn(spec: EnvironmentSpec, seed: int) -> Machine:
+def _draw_machine(spec: EnvironmentSpec, seed: int) -> Machine:
     """Return the random machine of the family for this seed."""
     low, high = spec.masses_t
     # A family of its own for each seed, so that its first member has any mass.
@@ -102,7 +102,7 @@ def _drawn(spec: EnvironmentSpec, seed: int) -> Machine:
     return family_member(family, 0, low, high, spec.spread)
 
 
-def _warmed(machine: Machine, celsius: Any) -> Machine:
+def _set_oil_temperature(machine: Machine, celsius: Any) -> Machine:
     try:
         warmed = replace(machine, oil=replace(machine.oil, temperature=float(celsius)))
     except (TypeError, ValueError) as error:

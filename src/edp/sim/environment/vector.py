@@ -15,7 +15,7 @@ from edp.sim.environment.library import gymnasium
 from edp.sim.environment.model import NominalMachine
 from edp.sim.environment.single import spaces
 from edp.sim.environment.spec import EnvironmentSpec, settings_of
-from edp.sim.environment.start import MOST_SEED, checked_mask, checked_seed, episode_start
+from edp.sim.environment.start import MOST_SEED, check_mask, check_seed, episode_start
 from edp.sim.environment.truth import Truth
 from edp.sim.episodes.episodes import Episodes, Moment
 from edp.sim.machine import layout as at
@@ -100,7 +100,7 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
             ConfigError: an option or the number of seeds is not possible.
         """
         options = dict(options or {})
-        mask = checked_mask(self.num_envs, options.pop("reset_mask", None))
+        mask = check_mask(self.num_envs, options.pop("reset_mask", None))
         seeds = [None] * self.num_envs if seed is None else seed
         if isinstance(seeds, int | np.integer):
             seeds = [int(seeds) + i for i in range(self.num_envs)]
@@ -166,7 +166,7 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
         """Begin the masked episodes; returns what began."""
         infos: dict[str, object] = {}
         for index in np.flatnonzero(mask).tolist():
-            seed = checked_seed(seeds[index])
+            seed = check_seed(seeds[index])
             if seed is not None:
                 self._generators[index] = gymnasium.utils.seeding.np_random(seed)[0]
             else:

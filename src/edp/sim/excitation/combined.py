@@ -21,9 +21,9 @@ class Combined(Excitation):
 
     def block(self, view: View) -> Array:
         """Return the levers up to the next change of any lever."""
-        return self.until_a_change(view.strokes)
+        return self.samples_until_change(view.strokes)
 
-    def until_a_change(self, strokes: Sequence[float] | Array) -> Array:
+    def samples_until_change(self, strokes: Sequence[float] | Array) -> Array:
         """Return the levers up to the next change, given each lever's position between its ends as a fraction."""
         for stream, stroke in zip(self._streams, strokes, strict=True):
             if stream.hold.left == 0:

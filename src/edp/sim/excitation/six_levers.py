@@ -30,4 +30,4 @@ class SixLevers(Combined):
 
     def block(self, view: View) -> Array:
         """Return the levers up to the next change of any lever."""
-        return self.until_a_change([*view.strokes, *[self.MID_STROKE] * MOTORS])
+        return self.samples_until_change([*view.strokes, *[self.MID_STROKE] * MOTORS])

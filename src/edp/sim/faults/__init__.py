@@ -2,7 +2,7 @@
 
 from edp.sim.faults import machine_faults as machine_faults
 from edp.sim.faults import sensor_faults as sensor_faults
-from edp.sim.faults.base import FAULTS, FaultKind, FaultSpec, MachineFault, SensorFault, at_site, ladder
+from edp.sim.faults.base import FAULTS, FaultKind, FaultSpec, MachineFault, SensorFault, insert_site, ladder
 from edp.sim.faults.notation import fault_text, faults_of, parse_fault
 
 __all__ = [
@@ -11,9 +11,9 @@ __all__ = [
     "FaultSpec",
     "MachineFault",
     "SensorFault",
-    "at_site",
     "fault_text",
     "faults_of",
+    "insert_site",
     "ladder",
     "parse_fault",
 ]

@@ -118,7 +118,7 @@ class FaultKind:
 
     def component(self, site: str) -> str:
         """Return the faulty component, such as ``boom valve``; kinds of one component share it."""
-        return at_site(self.part, site)
+        return insert_site(self.part, site)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,7 +222,7 @@ class FaultSpec:
         )
 
 
-def at_site(text: str, site: str) -> str:
+def insert_site(text: str, site: str) -> str:
     """Return a text with the words of a site inserted."""
     axis, _, side = site.partition("_")
     whole = "both pumps" if site == "both" else site.replace("_", " ")

@@ -16,7 +16,7 @@ _DRAWN = (
 )
 
 
-def falsified_channels(kind: str, site: str) -> tuple[str, ...]:
+def list_falsified(kind: str, site: str) -> tuple[str, ...]:
     """Return the channels whose readings a fault changes; empty for machine faults.
 
     Args:

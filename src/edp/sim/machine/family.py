@@ -80,11 +80,11 @@ def member_name(seed: int, index: int, masses_t: tuple[float, float] = MASSES_T,
     """
     name = f"family-{seed}-{index}"
     if tuple(masses_t) != MASSES_T:
-        name += "".join(f"-{_written(mass)}" for mass in masses_t)
-    return name if scatter == 1.0 else f"{name}-x{_written(scatter)}"
+        name += "".join(f"-{_format_value(mass)}" for mass in masses_t)
+    return name if scatter == 1.0 else f"{name}-x{_format_value(scatter)}"
 
 
-def _written(value: float) -> str:
+def _format_value(value: float) -> str:
     return f"{value:.3f}".rstrip("0").rstrip(".").replace(".", "p")
 
 
@@ -105,7 +105,7 @@ def member_mass(seed: int, index: int, low_t: float = MASSES_T[0], high_t: float
     return float(low_t * (high_t / low_t) ** share)
 
 
-def scaled_machine(
+def scale_machine(
     base: Machine, mass_t: float, draws: Draws, name: str = "", base_mass_t: float = BASE_MASS_T
 ) -> Machine:
     """Scale a machine to another mass by the laws above.

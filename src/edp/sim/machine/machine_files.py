@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from edp.errors import ConfigError, closest
-from edp.sim.machine.family import MASSES_T, WIDEST, Draws, member_mass, member_name, scaled_machine
+from edp.sim.machine.family import MASSES_T, WIDEST, Draws, member_mass, member_name, scale_machine
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import MACHINE_FILE, check_machine
 from edp.storage import SETTINGS_BYTES, parse_toml, read_text
@@ -48,7 +48,7 @@ def load_machine(name: str) -> Machine:
             ) from error
         # Resolved, since a relative name means another file once the current folder has changed.
         return _from_file(full_path(path), changed)
-    return _built_in(name.upper())
+    return _load_built_in(name.upper())
 
 
 @cache
@@ -58,7 +58,7 @@ def _from_file(path: Path, changed: int) -> Machine:
 
 
 @cache
-def _built_in(name: str) -> Machine:
+def _load_built_in(name: str) -> Machine:
     member = _member(name)
     if member is not None:
         return family_member(*member)
@@ -82,7 +82,7 @@ def _member(name: str) -> tuple[int, int, float, float, float] | None:
     return int(match[1]), int(match[2]), low, high, scatter
 
 
-def known_mass(name: str) -> float | None:
+def look_up_mass(name: str) -> float | None:
     """Return the operating weight (t) of a machine of a family.
 
     None for other machines, whose file does not state it.
@@ -106,7 +106,7 @@ def family_member(
     draws = Draws(np.random.default_rng([seed, 1 + index]), scatter)
     mass = member_mass(seed, index, low_t, high_t)
     name = member_name(seed, index, (low_t, high_t), scatter)
-    machine = scaled_machine(_built_in("M22"), mass, draws, name)
+    machine = scale_machine(_load_built_in("M22"), mass, draws, name)
     check_machine(machine, name)
     return machine
 

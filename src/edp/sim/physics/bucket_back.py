@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.sim.machine import layout as at
-from edp.sim.physics.ground_profile import DEEPEST, GRAVITY, SPACING, height_at, pressed_at
+from edp.sim.physics.ground_profile import DEEPEST, GRAVITY, SPACING, height_at, rut_depth
 from edp.sim.physics.jit import compiled
 
 if TYPE_CHECKING:
@@ -72,12 +72,12 @@ def pressure(depth: float, grown: float, back: Array) -> float:
 
 
 @compiled
-def before_it(points: Array, heights: Array, memory: Array, back: Array) -> tuple[float, float]:
+def measure_soil_ahead(points: Array, heights: Array, memory: Array, back: Array) -> tuple[float, float]:
     """Depth (m) of the lower of tip and heel, `points`, in the soil ahead of both, and that soil's force (N)."""
     low, front = min(points[1], points[3]), max(points[0], points[2])
     # 1.5 cells ahead: the cell of the front itself is cleared already.
     ahead = front + 1.5 * SPACING
-    depth = min(height_at(ahead, heights) - pressed_at(ahead, heights, memory) - low, DEEPEST)
+    depth = min(height_at(ahead, heights) - rut_depth(ahead, heights, memory) - low, DEEPEST)
     if depth <= 0.0:
         return 0.0, 0.0
     return depth, pressure(depth, height_at(front + FURTHER_M, heights) - low, back)
@@ -132,7 +132,7 @@ def shove_aside(x: float, depth: float, heights: Array, memory: Array) -> None:
     end = heights.shape[0] - 1
     middle = min(max(int(x / SPACING + 0.5), 0), end)
     bottom = height_at(x, heights) - depth
-    flowed = depth - pressed_at(x, heights, memory)
+    flowed = depth - rut_depth(x, heights, memory)
     if flowed <= 0.0:
         return
     first, last, cut = max(middle - HEEL_CELLS, 0), min(middle + HEEL_CELLS, end), 0.0

@@ -118,7 +118,7 @@ def solve(g: float, axes: Array, long: bool, work: tuple[Array, ...], out: Array
     gc_1, gc_2 = g * e[PUMP_ROW, C_PUMP_1], g * e[PUMP_ROW, C_PUMP_1 + 1]
     for i in range(at.AXES):
         if long:
-            head, rod = line_step.known_lines(i, g, r, e)
+            head, rod = line_step.compute_line_terms(i, g, r, e)
             seen_head, seen_rod = e[i, PORT_HEAD_K], e[i, PORT_ROD_K]
         else:
             head = e[i, T_HH] * r[at.HEAD + i] + e[i, T_HR] * r[at.ROD + i]

@@ -29,7 +29,7 @@ def height_at(x: float, heights: Array) -> float:
 
 
 @inlined
-def pressed_at(x: float, heights: Array, memory: Array) -> float:
+def rut_depth(x: float, heights: Array, memory: Array) -> float:
     """Return the rut depth (m) at `x`: compaction by the heel below the profile, whose heights count mass."""
     return height_at(x, memory[at.MEMORY : at.MEMORY + heights.shape[0]])
 

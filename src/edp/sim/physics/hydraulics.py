@@ -132,7 +132,7 @@ def cylinder_flows(
 @inlined
 def highest_load(m: int, state: Array, opened: Array, plant: Array) -> float:
     """Return the largest pressure (Pa) among the chambers connected to pump `m`; a very low value without any."""
-    most, port = -1e9, lines.at_valve(plant)
+    most, port = -1e9, lines.first_valve_pressure(plant)
     for i in range(at.AXES):
         if opened[i, at.HEAD_IN_1 + m] > 0.0:
             most = max(most, state[port + i])

@@ -130,7 +130,7 @@ def rates(w: Array, axes: Array, plant: Array, work: tuple[Array, ...], jacobian
         loads = section_loads(w, opened, plant, jacobian, motors)
     if plant[at.COMPENSATED] > 0.0:
         highest = loads
-    long, port = plant[at.LINES] > 0.0, lines.at_valve(plant)
+    long, port = plant[at.LINES] > 0.0, lines.first_valve_pressure(plant)
     drawn_1 = drawn_2 = 0.0
     if motors is not None:
         drawn_1, drawn_2 = places.rates((w1, w2, w3), (pump_1, pump_2, *highest), motors, plant, jacobian, out)

@@ -12,14 +12,14 @@ from edp.storage.machine_code import Compiler, files_with
 OPTIONS = {"_nrt": False}
 
 
-def fingerprinted() -> tuple[Path, ...]:
+def list_sources() -> tuple[Path, ...]:
     """Return the source files that compiled code depends on: importers of this module, layout modules, this file."""
     room = Path(__file__).parents[1]
     places = room / "machine" / "layout.py", room / "physics" / "scratch.py"
     return (*files_with(room, "from edp.sim.physics.jit import"), *places, Path(__file__))
 
 
-compiler = Compiler("sim", fingerprinted, str(GROUND_POINTS), OPTIONS)
+compiler = Compiler("sim", list_sources, str(GROUND_POINTS), OPTIONS)
 compiled, inlined = compiler.compiled, compiler.inlined
 # Pasted into callers before these are compiled: without reference counts, no others may return parts of arrays.
-pasted = Compiler("sim", fingerprinted, str(GROUND_POINTS), {**OPTIONS, "inline": "always"}).compiled
+pasted = Compiler("sim", list_sources, str(GROUND_POINTS), {**OPTIONS, "inline": "always"}).compiled

@@ -113,7 +113,7 @@ def eliminate_lines(g: float, axes: Array, s: Array, e: Array) -> None:
 
 
 @inlined
-def known_lines(i: int, g: float, r: Array, e: Array) -> tuple[float, float]:
+def compute_line_terms(i: int, g: float, r: Array, e: Array) -> tuple[float, float]:
     """Return the chamber terms of cylinder `i` from the right-hand sides `r`.
 
     The valve-side terms are written to `e`.

@@ -66,7 +66,7 @@ def drop(flow: float, i: int, axes: Array, plant: Array) -> tuple[float, float]:
 
 
 @inlined
-def at_valve(plant: Array) -> int:
+def first_valve_pressure(plant: Array) -> int:
     """First state of the pressures (heads, then rods) that the valve's sections see."""
     return at.PORT_HEAD if plant[at.LINES] > 0.0 else at.HEAD
 

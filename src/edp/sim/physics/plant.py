@@ -31,7 +31,7 @@ Clock = tuple[int, float, float, Array]
 
 
 @compiled
-def near_end(row: Array, axes: Array) -> bool:
+def is_near_end(row: Array, axes: Array) -> bool:
     """Whether any cylinder of a logged sample runs into a cushion, or moves at a stop."""
     for i in range(at.AXES):
         v, stroke = row[at.LOG_VELOCITY + i], row[at.LOG_STROKE + i]
@@ -68,7 +68,7 @@ def run_sample(
     thermal.warm(row, axes, plant, time_s, motors)
     # Once a sample, too: governor and inertia make tens of milliseconds.
     engine.turn(row, plant, time_s)
-    near, fine = False, near_end(row, axes)
+    near, fine = False, is_near_end(row, axes)
     if ground[0][terramechanics.ACTIVE] > 0.0:
         near, touching = terrain.look(row, time_s, axes, ground)
         fine = fine or touching
@@ -249,7 +249,7 @@ class Plant:
         every = np.concatenate([self._demands, demands])
         # In place, since a snapshot restores arrays in place.
         self._demands[:] = every[len(every) - self._past :]
-        return self._moved(every)
+        return self._advance_samples(every)
 
     def rest_at(self, demands: Array) -> None:
         """Set pilots and spools to the steady state of these demands, shape (6,)."""
@@ -291,12 +291,12 @@ class Plant:
         front = np.ascontiguousarray(levers[:, : at.AXES])
         shape_commands(front, self.hand, hand_s, self._demands, setup, demands, self._held)
         if self.motors is None:
-            return self._moved(demands)
+            return self._advance_samples(demands)
         others = np.zeros((len(levers), at.MOTORS))
         others[:, : levers.shape[1] - at.AXES] = levers[:, at.AXES :]
-        return self._moved(demands, self.motors.demands_of(others, hand_s))
+        return self._advance_samples(demands, self.motors.demands_of(others, hand_s))
 
-    def _moved(self, demands: Array, motor_demands: Array | None = None) -> Array:
+    def _advance_samples(self, demands: Array, motor_demands: Array | None = None) -> Array:
         """Run with demands appended to the past ones; without motor demands swing and travel stand still."""
         setup = (self.axes, self.plant, self.work, self._ground)
         samples = len(demands) - self._past

@@ -67,12 +67,12 @@ def demand(valves: Array, axes: Array, plant: Array, motors: Motors | None = Non
 
 
 @inlined
-def sensed_loads(
+def find_highest_loads(
     state: Array, valves: Array, axes: Array, plant: Array, motors: Motors | None = None
 ) -> tuple[float, float]:
     """Return the highest chamber pressure (Pa) open to each pump's spools; the tank pressure if there is none."""
     first = second = plant[at.TANK]
-    port = lines.at_valve(plant)
+    port = lines.first_valve_pressure(plant)
     for j in range(at.SPOOLS):
         i, spool = j % at.AXES, valves[j, at.SPOOL]
         if j < at.AXES:
@@ -101,7 +101,7 @@ def asked(state: Array, valves: Array, axes: Array, plant: Array, motors: Motors
     margin, least = plant[at.LOAD_MARGIN], plant[at.MIN_DISPLACEMENT]
     if margin <= 0.0:
         return demand(valves, axes, plant, motors)
-    first, second = sensed_loads(state, valves, axes, plant, motors)
+    first, second = find_highest_loads(state, valves, axes, plant, motors)
     per_band = 1.0 / (DROOP * margin)
     first = (min(first + margin, plant[at.PUMP_RELIEF]) - state[at.PUMP]) * per_band
     second = (min(second + margin, plant[at.PUMP_RELIEF]) - state[at.PUMP + 1]) * per_band

@@ -148,7 +148,7 @@ def restored(current: Any, plain: Any, arrays: tuple[NDArray[Any], ...]) -> Any:
     if kind == "scalar":
         return arrays[content][()]
     if kind == "array":
-        return _restored_array(current, arrays[content])
+        return _restore_array(current, arrays[content])
     if kind == "rng":
         current.bit_generator.state = content
         return current
@@ -169,7 +169,7 @@ def restored(current: Any, plain: Any, arrays: tuple[NDArray[Any], ...]) -> Any:
     return current
 
 
-def _restored_array(current: Any, saved: NDArray[Any]) -> NDArray[Any]:
+def _restore_array(current: Any, saved: NDArray[Any]) -> NDArray[Any]:
     # In place where it fits: other parts may hold the same array.
     if isinstance(current, np.ndarray) and current.shape == saved.shape and current.dtype == saved.dtype:
         current[...] = saved

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from edp.sim.machine import layout as at
 from edp.sim.physics import bucket_back
-from edp.sim.physics.ground_profile import DEEPEST, GRAVITY, press, pressed_at
+from edp.sim.physics.ground_profile import DEEPEST, GRAVITY, press, rut_depth
 from edp.sim.physics.ground_profile import SPACING as SPACING
 from edp.sim.physics.ground_profile import height_at as height_at
 from edp.sim.physics.jit import compiled, inlined
@@ -235,7 +235,7 @@ def engage_heel(numbers: Array, heights: Array, memory: Array, c: Array) -> None
     """Compute normal force and sliding friction of the floor plate's heel in `c`, from its depth below the profile."""
     depth, borne = c[HEEL_DEPTH], memory[at.HEEL_SET]
     if numbers[COMPACTION] > 0.0:
-        borne = max(borne, pressed_at(c[POINTS + 2], heights, memory))
+        borne = max(borne, rut_depth(c[POINTS + 2], heights, memory))
     bearing = min(numbers[BEKKER] * depth ** numbers[EXPONENT], numbers[BEARING_LIMIT])
     elastic = numbers[UNLOADING] * (depth - borne)
     if elastic > bearing:
@@ -284,10 +284,10 @@ def engage(state: Array, angles: Array, axes: Array, ground: Ground, c: Array) -
     uncut += (1.0 - inward) * height_at(c[POINTS] + 1.5 * SPACING, heights)
     c[HEEL_DEPTH] = height_at(c[POINTS + 2], heights) - c[POINTS + 3]
     if numbers[COMPACTION] > 0.0:
-        uncut -= inward * pressed_at(c[POINTS] - 1.5 * SPACING, heights, memory)
-        uncut -= (1.0 - inward) * pressed_at(c[POINTS] + 1.5 * SPACING, heights, memory)
+        uncut -= inward * rut_depth(c[POINTS] - 1.5 * SPACING, heights, memory)
+        uncut -= (1.0 - inward) * rut_depth(c[POINTS] + 1.5 * SPACING, heights, memory)
         # Within its rut the heel touches nothing.
-        if c[HEEL_DEPTH] <= pressed_at(c[POINTS + 2], heights, memory):
+        if c[HEEL_DEPTH] <= rut_depth(c[POINTS + 2], heights, memory):
             c[HEEL_DEPTH] = 0.0
     c[DEPTH] = min(uncut - c[POINTS + 1], DEEPEST)
     if c[DEPTH] > 0.0:
@@ -319,7 +319,7 @@ def engage_back(w1: float, w2: float, w3: float, ground: Ground, c: Array) -> No
     v = velocities(c, w1, w2, w3)
     back, tip_lower = ground[0][BACK:], c[POINTS + 1] <= c[POINTS + 3]
     outward = min(max(0.5 + 0.5 * (v[0] if tip_lower else v[2]) / TURNING, 0.0), 1.0)
-    c[PUSH_DEPTH], push = bucket_back.before_it(c[POINTS : POINTS + 4], ground[3], ground[4], back)
+    c[PUSH_DEPTH], push = bucket_back.measure_soil_ahead(c[POINTS : POINTS + 4], ground[3], ground[4], back)
     if outward > 0.0 and c[PUSH_DEPTH] > 0.0:
         c[ON] = 1.0
         push *= outward * strength(ground[0], ground[2], ground[4])[0]

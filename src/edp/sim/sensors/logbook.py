@@ -29,7 +29,7 @@ def write_events(
 ) -> None:
     """Write the flags 0 or 1: relief, cavitation, regeneration, power limit, soil contact."""
     relief = cavitation = regeneration = limited = 0.0
-    port = lines.at_valve(plant)
+    port = lines.first_valve_pressure(plant)
     for i in range(at.AXES):
         head, rod, spool = state[port + i], state[port + at.AXES + i], valves[i, at.SPOOL]
         if head > axes[i, at.RELIEF_HEAD] or rod > axes[i, at.RELIEF_ROD]:
@@ -83,7 +83,7 @@ def write_log(
     heights, memory = ground[3], ground[4]
     for n in range(at.LOGGED_STATES):
         row[n] = state[n]
-    port = lines.at_valve(plant)
+    port = lines.first_valve_pressure(plant)
     for n in range(2 * at.AXES):
         row[at.LOG_PORT + n] = state[port + n]
     for j in range(at.SPOOLS):

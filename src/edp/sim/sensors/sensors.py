@@ -15,7 +15,7 @@ KELVIN = 273.15
 """0 degC: logs of the plant have degC, recordings K."""
 
 
-def measured_signals(
+def measure_signals(
     log: Array,
     machine: Machine,
     rate_hz: float,
@@ -36,10 +36,10 @@ def measured_signals(
     if oil_temperature is None:
         oil_temperature = np.full(len(log), machine.oil.temperature + 273.15)
     drawn = draws.draw(machine, len(log), rate_hz, rng)
-    return shown_signals(log, machine, rate_hz, rng is not None, drawn, oil_temperature)[:, : chain.MEASURED]
+    return observe_signals(log, machine, rate_hz, rng is not None, drawn, oil_temperature)[:, : chain.MEASURED]
 
 
-def shown_signals(
+def observe_signals(
     log: Array,
     machine: Machine,
     rate_hz: float,
@@ -114,6 +114,6 @@ def truth_signals(log: Array) -> dict[str, Array]:
 
 
 def shown_names() -> dict[str, int]:
-    """Return the positions of noise-free observed values in `shown_signals`, by the names of `EXTRA_CHANNELS`."""
+    """Return the positions of noise-free observed values in `observe_signals`, by the names of `EXTRA_CHANNELS`."""
     strokes = {f"CylStroke_{i + 1}": chain.STROKES + i for i in range(at.AXES)}
     return {**strokes, "PumpPressure_1": chain.PUMPS, "PumpPressure_2": chain.PUMPS + 1, OIL: chain.OIL}

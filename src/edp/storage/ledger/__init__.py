@@ -14,7 +14,7 @@ from edp.storage.ledger.record import (
     code_version,
     digest_of,
 )
-from edp.storage.ledger.states import WithState, leave_state, left_state, read_state
+from edp.storage.ledger.states import WithState, leave_state, read_state, state_path
 from edp.storage.ledger.store import Damage, Ledger, Opening, check_uncoordinated, read_records
 
 __all__ = [
@@ -35,7 +35,7 @@ __all__ = [
     "known",
     "leave_arrival",
     "leave_state",
-    "left_state",
     "read_records",
     "read_state",
+    "state_path",
 ]

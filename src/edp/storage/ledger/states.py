@@ -37,10 +37,10 @@ def leave_state(folder: str | Path, key: str, state: bytes) -> None:
     Raises:
         StorageError: the disk is full or the folder cannot be written.
     """
-    write_bytes(left_state(folder, key), _head(key, state) + state)
+    write_bytes(state_path(folder, key), _head(key, state) + state)
 
 
-def left_state(folder: str | Path, key: str) -> Path:
+def state_path(folder: str | Path, key: str) -> Path:
     """Return the path of the file written by `leave_state`."""
     return Path(folder, "arrived", f"{key}{SUFFIX}")
 

@@ -13,8 +13,8 @@ from typing import Any
 from edp.errors import BusyError, ConfigError, StorageError
 from edp.storage.ledger.claims import free_dead_claims, whole
 from edp.storage.ledger.record import FINAL, RECORD_BYTES, SCHEMA, Record, TrainingStatus, body_of, canonical, digest_of
-from edp.storage.ledger.states import SUFFIX, left_state, read_state
-from edp.storage.locks import check_held, held_by, hold
+from edp.storage.ledger.states import SUFFIX, read_state, state_path
+from edp.storage.locks import check_held, find_holder, hold
 from edp.storage.paths import entries_of, is_entry_at, is_file_at, is_there
 from edp.storage.reading import object_with, read_bytes, read_object
 from edp.storage.writing import make_folder, remove_unfinished, storage_error, write_bytes, write_json
@@ -31,10 +31,10 @@ class Damage:
 def read_records(folder: str | Path) -> tuple[dict[str, Record], list[Damage]]:
     """Return all records of a ledger and the damaged files, regardless of its holder. Nothing is changed."""
     whole, damaged = _read(Path(folder, "records"))
-    return {key: _taken_apart(Path(folder, "records", f"{key}.json"), whole[key]) for key in whole}, damaged
+    return {key: _parse_record(Path(folder, "records", f"{key}.json"), whole[key]) for key in whole}, damaged
 
 
-def _taken_apart(file: Path, data: bytes) -> Record:
+def _parse_record(file: Path, data: bytes) -> Record:
     try:
         return Record.from_bytes(data)
     except (ValueError, StorageError) as error:
@@ -100,7 +100,7 @@ def check_uncoordinated(folder: str | Path) -> None:
     Raises:
         BusyError: another process holds it.
     """
-    holder = held_by(Path(folder) / ".lock")
+    holder = find_holder(Path(folder) / ".lock")
     if holder is not None:
         raise _busy(Path(folder), holder)
 
@@ -172,7 +172,7 @@ class Ledger:
     def get(self, key: str) -> Record | None:
         """Return the record of a training, including lost ones."""
         if key in self._unread:
-            self._records[key] = _taken_apart(self.path / "records" / f"{key}.json", self._unread.pop(key))
+            self._records[key] = _parse_record(self.path / "records" / f"{key}.json", self._unread.pop(key))
         return self._records.get(key)
 
     def finished(self, key: str) -> Record | None:
@@ -303,7 +303,7 @@ class Ledger:
                 self._take_state(file.stem)
 
     def _take_state(self, key: str) -> None:
-        file = left_state(self.path, key)
+        file = state_path(self.path, key)
         try:
             if is_there(file):
                 file.replace(self.path / "states" / file.name)

@@ -25,7 +25,7 @@ from edp.networks.trees import Trees
 from edp.training.bagging.learner import FoldFit, HeadPart
 from edp.training.bagging.table import committee_of
 from edp.training.outcome import TrainingProgress
-from edp.training.tree_tables import Tables, complete_tables, stacked_tables
+from edp.training.tree_tables import Tables, complete_tables, stack_tables
 
 GRID = 2.0**-12
 """Of the columns that trees are grown on, in spreads. Values that are equal but for rounding fall together, so that no
@@ -75,7 +75,7 @@ class TreeLearner:
         rng = np.random.default_rng(work.spec.seed)
         most, folds = work.bagging.tree_rows, work.table.folds
         self.parts = [
-            (part, _sample(_trained_by_all(folds, part), most, rng))
+            (part, _sample(_find_common_rows(folds, part), most, rng))
             for part in np.array_split(np.arange(folds.count), min(work.bagging.tree_folds, folds.count))
         ]
         self.every = _sample(np.arange(len(work.table.columns)), most, rng)
@@ -104,7 +104,7 @@ class TreeLearner:
                 truth[own] = self._target(own, fold, kind.direct)[:, output]
             judged = np.flatnonzero(np.isin(table.folds.owner, part))
             target = self._target(rows, int(part[0]), kind.direct)[:, output]
-            stages = self._grown(rows, target, kind.columns, judged)
+            stages = self._grow_trees(rows, target, kind.columns, judged)
             for number, predicted in enumerate(stages):
                 staged[number, judged] = predicted
                 squared[number] += np.square(predicted - truth[judged]).sum()
@@ -112,11 +112,11 @@ class TreeLearner:
         if squared[count - 1] >= np.square(truth).sum():
             return _Boosted(0, np.zeros(len(truth)), None)
         target = self._target(self.every, None, kind.direct)[:, output]
-        model = self._regressor(count).fit(self._on_grid(self.every, kind.columns), target)
+        model = self._regressor(count).fit(self._round_to_grid(self.every, kind.columns), target)
         feature, threshold, leaf = complete_tables(model, self.trees.depth)
         return _Boosted(count, staged[count - 1].astype(np.float64), (kind.columns[feature], threshold, leaf))
 
-    def _on_grid(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float32]:
+    def _round_to_grid(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float32]:
         """Return columns of some rows, rounded to `GRID`."""
         part = self.work.table.columns[rows][:, columns]
         return np.asarray(np.round(part / np.float32(GRID)) * np.float32(GRID))
@@ -131,11 +131,11 @@ class TreeLearner:
         weight, intercept = self.work.linear.mean()
         return np.asarray(targets - self.work.table.columns[rows] @ weight - intercept)
 
-    def _grown(
+    def _grow_trees(
         self, rows: NDArray[np.int64], target: DoubleArray, columns: NDArray[np.int64], judged: NDArray[np.int64]
     ) -> Iterator[DoubleArray]:
         """Yield the predictions of the evaluation rows after each tree."""
-        model = self._regressor(self.rounds).fit(self._on_grid(rows, columns), target)
+        model = self._regressor(self.rounds).fit(self._round_to_grid(rows, columns), target)
         return iter(model.staged_predict(self.work.table.columns[judged][:, columns]))
 
     def _regressor(self, rounds: int):  # type: ignore[no-untyped-def]  # scikit-learn has no types
@@ -164,13 +164,16 @@ class TreeLearner:
         """Write the weighted trees to the network; the head passes their sums through."""
         outputs = self.work.table.targets.shape[1]
         tables = [
-            [_weighted(models[output].tables, share[output]) for models, share in zip(self.models, shares, strict=True)]
+            [
+                _scale_trees(models[output].tables, share[output])
+                for models, share in zip(self.models, shares, strict=True)
+            ]
             for output in range(outputs)
         ]
         grown = [[one for one in each if one is not None] for each in tables]
         empty = self._empty()
         joined = [tuple(np.concatenate(part) for part in zip(*each, strict=True)) if each else empty for each in grown]
-        self.trees.set_tables(*stacked_tables(joined, self.trees.trees))  # type: ignore[arg-type]
+        self.trees.set_tables(*stack_tables(joined, self.trees.trees))  # type: ignore[arg-type]
         taken_away = sum((own for kind, own in zip(self.kinds, shares, strict=True) if kind.direct), np.zeros(outputs))
         return HeadPart(np.eye(outputs), np.zeros(outputs), np.asarray(taken_away))
 
@@ -192,12 +195,12 @@ def _kinds(bank: LagBank) -> list[_Kind]:
     return kinds if len(sparse) < len(every) else kinds[:2]
 
 
-def _trained_by_all(folds: Folds, part: NDArray[np.int64]) -> NDArray[np.int64]:
+def _find_common_rows(folds: Folds, part: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the training rows common to all folds of a part."""
     return reduce(np.intersect1d, [folds.training[fold] for fold in part.tolist()])
 
 
-def _weighted(tables: Tables | None, share: float) -> Tables | None:
+def _scale_trees(tables: Tables | None, share: float) -> Tables | None:
     """Return tables with leaves multiplied by a weight; None for zero weight."""
     if tables is None or share <= 0:
         return None

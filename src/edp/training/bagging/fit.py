@@ -51,13 +51,13 @@ class Bagged:
     linear: DoubleArray
     table: BaggingTable
 
-    def at_every_tick(self, truth: Sequence[DoubleArray]) -> list[DoubleArray]:
+    def predict_all(self, truth: Sequence[DoubleArray]) -> list[DoubleArray]:
         """Return left-out predictions of each segment at every sample, standardised ``(tick, output)``.
 
         Args:
             truth: what was to be predicted, of each stretch of the training part, then of the validation part.
         """
-        return self.table.at_every_tick(self.left_out - self.table.targets, truth)
+        return self.table.predict_all(self.left_out - self.table.targets, truth)
 
 
 def fit_bagged(data: Prepared, model: ModelSpec, spec: TrainingSpec, on_event: Event | None = None) -> Bagged:

@@ -100,11 +100,11 @@ class RadialLearner:
 
     def left_out(self) -> Sequence[DoubleArray]:
         """Return the predictions of the single model."""
-        return [self._fitted().ridge.left_out]
+        return [self._require_fit().ridge.left_out]
 
     def write(self, shares: DoubleArray) -> HeadPart:
         """Centres and length into the network; the mean of the folds' models into the head."""
-        kernel = self._fitted()
+        kernel = self._require_fit()
         weight, intercept = kernel.ridge.mean()
         full = np.zeros((self.features.count, weight.shape[1]))
         full[: len(self.centres)] = kernel.basis @ weight * shares[0]
@@ -118,7 +118,7 @@ class RadialLearner:
             self.features.set_limits(*(torch.from_numpy(limit) for limit in limits))
         return HeadPart(full, intercept * shares[0], np.zeros(len(intercept)))
 
-    def _fitted(self) -> _Kernel:
+    def _require_fit(self) -> _Kernel:
         if self.best is None:
             raise RuntimeError("the radial learner was asked for its predictions before it was fitted")
         return self.best

@@ -37,8 +37,8 @@ def stacking_weights(
         columns, truth = np.stack([model[:, output] for model in models], axis=1), residual[:, output]
         chosen = np.arange(len(models))
         if len(usual) < len(models):
-            least = _nested_error(columns[:, usual], truth, owner)
-            if not _nested_error(columns, truth, owner) < (1.0 - LEAST_GAIN) * least:
+            least = _compute_nested_error(columns[:, usual], truth, owner)
+            if not _compute_nested_error(columns, truth, owner) < (1.0 - LEAST_GAIN) * least:
                 chosen = usual
         shares[chosen, output] = _weights(columns[:, chosen], truth, owner)
     return shares
@@ -66,7 +66,7 @@ def _weights(columns: DoubleArray, truth: DoubleArray, owner: NDArray[np.int64])
     return np.asarray(nnls(columns * by_row[:, None], truth * by_row)[0])
 
 
-def _nested_error(columns: DoubleArray, truth: DoubleArray, owner: NDArray[np.int64]) -> float:
+def _compute_nested_error(columns: DoubleArray, truth: DoubleArray, owner: NDArray[np.int64]) -> float:
     """Return the root-mean-square error with weights fitted without the evaluated fold."""
     squared = 0.0
     for fold in np.unique(owner):

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from edp.data.folds import Folds, blocked_folds, recording_folds
+from edp.data.folds import Folds, make_block_folds, recording_folds
 from edp.data.lags import DoubleArray
 from edp.data.prepared import Prepared
 from edp.data.series import Series
@@ -51,7 +51,7 @@ class BaggingTable:
     stride: int
     starts: tuple[tuple[int, int], ...]
 
-    def at_every_tick(self, error: DoubleArray, truth: Sequence[DoubleArray]) -> list[DoubleArray]:
+    def predict_all(self, error: DoubleArray, truth: Sequence[DoubleArray]) -> list[DoubleArray]:
         """Return predictions at every sample of each segment, standardised ``(tick, output)``.
 
         Where rows were thinned out, the error of the row before a tick stands for that of the tick.
@@ -138,7 +138,7 @@ def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> BaggingTable:
     # what tests there is the gap that lies beside that (`prepare`): wider ones would cost a third of what trains.
     gap = math.ceil(((net.spec.window if pieces > 1 else bank.reach) + reach) / stride)
     gap = min(gap, max(1, sum(lengths) // (4 * spec.folds * pieces)))
-    return BaggingTable(columns, targets, blocked_folds(lengths, spec.folds, gap, pieces), stride, tuple(starts))
+    return BaggingTable(columns, targets, make_block_folds(lengths, spec.folds, gap, pieces), stride, tuple(starts))
 
 
 def _limits(columns: NDArray[np.float32], present: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from edp.data.series import Series
 from edp.data.task import Task
 from edp.errors import ConfigError, DataError
-from edp.networks.losses import Huber, LossSpec, Prediction, masked_loss
+from edp.networks.losses import Huber, LossSpec, Prediction, compute_masked_loss
 from edp.networks.losses.base import POINT
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_hidden, stream_predictions
@@ -125,9 +125,11 @@ class Distillation:
         """Series with teacher targets: a mark whether there is truth, predictions in SI units, hidden components."""
         check_same_ends(task, self.teachers[0].task, "the student", "the teacher")
         if self.spec.hint and self.components is None:
-            self.components = Components.fitted((self._hidden(part) for part in own_series), self.spec.components)
+            self.components = Components.fitted(
+                (self._collect_hidden(part) for part in own_series), self.spec.components
+            )
         marked = [(part, True) for part in own_series] + [(part, False) for part in self.further]
-        return [self._taught(part, truth) for part, truth in marked]
+        return [self._add_teacher_outputs(part, truth) for part, truth in marked]
 
     def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
         """Copy the weights and scaling of the start, if there is one; refuse a hint for too small batches."""
@@ -154,7 +156,7 @@ class Distillation:
         labelled = batch_context.valid & (strategy_columns[..., 0] > 0.5)
         teacher_predictions = strategy_columns[..., 1 : 1 + self.said].unflatten(-1, batch_context.future.shape[2:])
         target = objective.code.encode(teacher_predictions, batch_context.features)
-        loss = (1.0 - spec.truth) * masked_loss(
+        loss = (1.0 - spec.truth) * compute_masked_loss(
             spec.soft, batch_context.answer, target, batch_context.valid, objective.weights
         )
         if spec.truth:
@@ -170,7 +172,7 @@ class Distillation:
     def end(self, net: Predictor) -> None:
         """Nothing was done to the network but to its weights."""
 
-    def _taught(self, part: Series, truth: bool) -> Series:
+    def _add_teacher_outputs(self, part: Series, truth: bool) -> Series:
         answers = [stream_predictions(teacher, [part])[0] for teacher in self.teachers]
         # The mean of teachers in double precision, so that their number does not change the last bit of the target.
         mean = np.mean(np.stack(answers), axis=0, dtype=np.float64).reshape(part.samples, -1)
@@ -181,12 +183,12 @@ class Distillation:
             )
         columns = [np.full((part.samples, 1), truth), mean]
         if self.components is not None:
-            columns.append(self.components.project(self._hidden(part)))
+            columns.append(self.components.project(self._collect_hidden(part)))
         # What stands in the place of targets without truth may be no number, and NaN times a mask of zero is NaN.
         targets = part.targets if truth else np.zeros_like(part.targets)
         return replace(part, targets=targets, strategy_columns=np.concatenate(columns, axis=1).astype(np.float32))
 
-    def _hidden(self, part: Series) -> NDArray[np.float32]:
+    def _collect_hidden(self, part: Series) -> NDArray[np.float32]:
         # Side by side: hidden spaces of several teachers have no common axes to average over.
         """Hidden features of all teachers side by side, ``(time, width)``."""
         return np.concatenate([stream_hidden(teacher, [part])[0] for teacher in self.teachers], axis=1)

@@ -138,7 +138,7 @@ class CommitteeImitation:
             raise TypeError("imitation trains a committee; `imitates` refuses any other student")
         draw = torch.Generator().manual_seed(spec.seed)
         rows, truth = self._rows(data)
-        points = torch.cat([_on_lines(rows, POINTS // 2, draw), moved_rows(rows, POINTS // 2, draw)])
+        points = torch.cat([_sample_lines(rows, POINTS // 2, draw), move_rows(rows, POINTS // 2, draw)])
         beyond = [predict_rows(self.teacher, x) - predict_rows(net, x) for x in (rows, points)]
         spread = beyond[0].std(dim=0, correction=0)
         spread[spread <= 1e-9] = 1.0  # a teacher that is a line leaves nothing
@@ -246,14 +246,14 @@ class _Perceptrons:
         return mean
 
 
-def _on_lines(rows: Tensor, count: int, draw: torch.Generator) -> Tensor:
+def _sample_lines(rows: Tensor, count: int, draw: torch.Generator) -> Tensor:
     """Points on lines through rows that lie at most `REACH` apart, ``(point, column)``."""
     first, second = _neighbours(rows, count, draw)
     share = (1.0 + 2.0 * BEYOND) * torch.rand(count, 1, generator=draw) - BEYOND
     return torch.lerp(rows[first], rows[second], share)
 
 
-def moved_rows(rows: Tensor, count: int, draw: torch.Generator) -> Tensor:
+def move_rows(rows: Tensor, count: int, draw: torch.Generator) -> Tensor:
     """Rows moved by a part of what changes between two other ones that lie at most `REACH` apart, ``(point, column)``.
 
     Args:

@@ -63,7 +63,7 @@ def dynamic_int8(predictor: Predictor) -> Quantised:
 def _round_heads(heads: Heads) -> None:
     """Round the inputs of each head layer: the representation, then the output of each non-linearity or the mix."""
     heads.register_forward_pre_hook(_round_input)
-    units = [_rounded(unit) for unit in heads.units]
+    units = [_round_outputs(unit) for unit in heads.units]
     if heads.mix is not None:
         # With a block across the outputs, that block's result is what the last layer reads.
         units[-1] = heads.units[-1]
@@ -71,7 +71,7 @@ def _round_heads(heads: Heads) -> None:
     heads.units = tuple(units)
 
 
-def _rounded(unit: GatedUnit) -> GatedUnit:
+def _round_outputs(unit: GatedUnit) -> GatedUnit:
     return replace(unit, apply=lambda x: round_tick(unit.apply(x)))
 
 

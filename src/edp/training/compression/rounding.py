@@ -48,7 +48,7 @@ class _StraightThrough(torch.autograd.Function):
         return grad, None
 
 
-def _through(values: Tensor, rounded: Tensor) -> Tensor:
+def _pass_gradient(values: Tensor, rounded: Tensor) -> Tensor:
     result: Tensor = _StraightThrough.apply(values, rounded.detach())  # type: ignore[no-untyped-call]
     return result
 
@@ -72,16 +72,16 @@ class Site:
         if self.limit is not None:
             # Outside of the range the clamp has no gradient: values there should not grow further.
             inside = x.clamp(-self.limit, self.limit)
-            return _through(inside, self._rounded(x, self.limit))
+            return _pass_gradient(inside, self._round(x, self.limit))
         if self.errors is None:
             self.largest = max(self.largest, float(x.detach().abs().max()))
         else:
             self.errors += torch.tensor(
-                [float((self._rounded(x, share * self.largest) - x).square().sum()) for share in self.shares]
+                [float((self._round(x, share * self.largest) - x).square().sum()) for share in self.shares]
             )
         return x
 
-    def _rounded(self, x: Tensor, limit: float) -> Tensor:
+    def _round(self, x: Tensor, limit: float) -> Tensor:
         # Symmetric levels, as in the exported integer code.
         step = limit / self.levels
         rounded: Tensor = (x / step).round().clamp(-self.levels, self.levels) * step
@@ -165,7 +165,7 @@ class NetworkRounding:
         def enter(*_: object) -> None:
             for parameters, key, weight, axes in replaced:
                 levels, steps = weight_levels(weight.detach(), axes)
-                parameters[key] = _through(weight, levels * steps)  # type: ignore[assignment]
+                parameters[key] = _pass_gradient(weight, levels * steps)  # type: ignore[assignment]
 
         def leave(*_: object) -> None:
             for parameters, key, weight, _axes in replaced:
@@ -185,7 +185,7 @@ class NetworkRounding:
             return
         self._units[part] = part.units
         sites = [self._site() for _ in part.units]
-        units = [_followed(unit, after) for unit, after in zip(part.units, sites, strict=True)]
+        units = [_append_site(unit, after) for unit, after in zip(part.units, sites, strict=True)]
         if part.mix is not None:  # it stands between the last unit and the last layer
             units[-1] = part.units[-1]
             last = sites[-1]
@@ -198,5 +198,5 @@ class NetworkRounding:
         return self.sites[-1]
 
 
-def _followed(unit: GatedUnit, site: Site) -> GatedUnit:
+def _append_site(unit: GatedUnit, site: Site) -> GatedUnit:
     return replace(unit, apply=lambda x: site(unit.apply(x)))

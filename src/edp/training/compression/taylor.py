@@ -50,7 +50,7 @@ def importance(predictor: Predictor, series: Sequence[Series], pieces: int = 64)
     by_module: dict[nn.Module, Tensor] = {}
     hidden = [torch.zeros(weight.shape[0], 0) for weight in predictor.heads.weights[:-1]]
     chosen = _pieces(predictor, series, pieces)
-    with _recorded(predictor) as outputs:
+    with _record_outputs(predictor) as outputs:
         for part, start, stop in chosen:
             predictor.zero_grad(set_to_none=True)
             _loss(predictor, part, start, stop).backward()
@@ -59,7 +59,7 @@ def importance(predictor: Predictor, series: Sequence[Series], pieces: int = 64)
                     # The sum over ticks before the square: a feature counts by its effect on the whole piece.
                     change = (value * value.grad).sum(dim=(0, 1)).detach().square()
                     by_module[module] = by_module.get(module, torch.zeros_like(change)) + change
-            for layer, change in enumerate(_hidden_changes(predictor)):
+            for layer, change in enumerate(_compute_sensitivities(predictor)):
                 hidden[layer] = change.square() + (hidden[layer] if hidden[layer].numel() else 0.0)
     predictor.zero_grad(set_to_none=True)
     return FeatureImportance(by_module, hidden)
@@ -97,7 +97,7 @@ def _loss(predictor: Predictor, part: Series, start: int, stop: int) -> Tensor:
 
 
 @contextmanager
-def _recorded(predictor: Predictor) -> Iterator[dict[nn.Module, Tensor]]:
+def _record_outputs(predictor: Predictor) -> Iterator[dict[nn.Module, Tensor]]:
     """Record the last output of each convolution, temporal block and recurrent layer, with its gradient."""
     outputs: dict[nn.Module, Tensor] = {}
 
@@ -119,7 +119,7 @@ def _recorded(predictor: Predictor) -> Iterator[dict[nn.Module, Tensor]]:
             hook.remove()
 
 
-def _hidden_changes(predictor: Predictor) -> list[Tensor]:
+def _compute_sensitivities(predictor: Predictor) -> list[Tensor]:
     """``sum over ticks of z dL/dz`` of each hidden layer's features, from the gradients of what makes them.
 
     For ``z = W h + b`` it equals ``sum W dL/dW + b dL/db``; of a gated unit the first half alone makes the feature

@@ -171,7 +171,7 @@ def realise_bodies(base: Doubles, guess: Machine) -> Bodies:
 
     def apart(logarithms: Doubles) -> Doubles:
         mass = np.array(own.mass) * np.exp(logarithms)
-        x, y, inertia = _given_masses(base, mass, length)
+        x, y, inertia = _compute_centres(base, mass, length)
         share = inertia / (mass * length**2) / spin
         # A steep line below a tenth: what is negative is further away than any proportion, but finite.
         bent = np.where(share > 0.1, np.log(np.maximum(share, 0.1)), np.log(0.1) - 100.0 * (0.1 - share))
@@ -179,7 +179,7 @@ def realise_bodies(base: Doubles, guess: Machine) -> Bodies:
         return np.concatenate([logarithms / NEAR[0], moved, bent / NEAR[3]])
 
     mass = np.array(own.mass) * np.exp(least_squares(apart, np.zeros(3), xtol=1e-14, ftol=1e-14, gtol=1e-14).x)
-    x, y, inertia = _given_masses(base, mass, length)
+    x, y, inertia = _compute_centres(base, mass, length)
     if not (inertia > 0.0).all():
         worst = int(np.argmin(inertia))
         raise ConfigError(
@@ -191,7 +191,7 @@ def realise_bodies(base: Doubles, guess: Machine) -> Bodies:
     return replace(own, mass=_triple(mass), com_x=_triple(x), com_y=_triple(y), inertia=_triple(inertia))
 
 
-def _given_masses(base: Doubles, mass: Doubles, length: Doubles) -> tuple[Doubles, Doubles, Doubles]:
+def _compute_centres(base: Doubles, mass: Doubles, length: Doubles) -> tuple[Doubles, Doubles, Doubles]:
     """Centres of gravity and inertias about them, of bodies with these masses."""
     behind = np.array([mass[1] + mass[2], mass[2], 0.0])
     x, y = (base[[0, 2, 4]] - behind * length) / mass, base[[1, 3, 5]] / mass

@@ -138,7 +138,7 @@ def _regeneration(machine: Machine, number: MachineNumber) -> float:
     return float(LEAST_REGENERATION * flow * np.sqrt(own_bar / bar))
 
 
-def with_values(machine: Machine, values: Sequence[float] | Doubles) -> Machine:
+def set_values(machine: Machine, values: Sequence[float] | Doubles) -> Machine:
     """Return a machine with other parameters.
 
     Args:
@@ -150,16 +150,16 @@ def with_values(machine: Machine, values: Sequence[float] | Doubles) -> Machine:
         changed = sections.setdefault(number.section, {})
         old = changed.get(number.key, getattr(getattr(machine, number.section), number.key))
         if number.cylinder is None:
-            changed[number.key] = _rated(old, float(value))
+            changed[number.key] = _read_rating(old, float(value))
         else:
             each = list(old)
-            each[number.cylinder] = _rated(each[number.cylinder], float(value))
+            each[number.cylinder] = _read_rating(each[number.cylinder], float(value))
             changed[number.key] = tuple(each)
     friction = sections["friction"]
     friction["static_fraction"] += friction["coulomb_fraction"]
     return replace(machine, **{name: replace(getattr(machine, name), **changed) for name, changed in sections.items()})
 
 
-def _rated(old: Any, value: float) -> Any:
+def _read_rating(old: Any, value: float) -> Any:
     """Return a number, or a rating with unchanged pressure."""
     return (value, old[1]) if isinstance(old, tuple) else value

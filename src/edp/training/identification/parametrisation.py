@@ -20,7 +20,7 @@ from edp.networks.twin.descent import DescentLimits, NormalEquations, descend
 from edp.networks.twin.parameters import Priors
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import BOUNDS
-from edp.training.identification.machine_numbers import MACHINE_NUMBERS, guesses, with_values
+from edp.training.identification.machine_numbers import MACHINE_NUMBERS, guesses, set_values
 from edp.training.identification.mapping import GreyParts, grey_numbers
 
 Doubles = NDArray[np.float64]
@@ -91,7 +91,7 @@ class MachineParametrisation:
         # A machine file refuses strokes that its pins cannot take, and cushions that meet in the middle.
         values[STROKES] = np.clip(values[STROKES], *(share * stated[STROKES] for share in STROKE_RANGE))
         values[CUSHIONS] = np.minimum(values[CUSHIONS], LONGEST_CUSHION * values[STROKES])
-        return with_values(self.base, values)
+        return set_values(self.base, values)
 
     def values(self, theta: Doubles) -> Doubles:
         """Return the grey-box parameters at coordinates, in units of the grey box ``(parameter,)``."""

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from edp.data.chunks import Sampler, cut, stack
-from edp.data.episodes import EpisodeSampler, by_machine
+from edp.data.episodes import EpisodeSampler, group_by_machine
 from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.data.task import Task
@@ -98,7 +98,7 @@ class Meta(ABC):
             DataError: a series is too short to be halved.
         """
         total, ticks = np.zeros(3), 0
-        for places in by_machine(data.validation).values():
+        for places in group_by_machine(data.validation).values():
             parts = [data.validation[index] for index in places]
             support, rest = self._halves(net, parts)
             adapted_parameters = self.start_of(net)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from edp.data.series import Series
 from edp.data.task import Task
-from edp.networks.losses import Huber, masked_loss
+from edp.networks.losses import Huber, compute_masked_loss
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
 from edp.settings.bounds import MOST_WEIGHT, SHARE, WEIGHT, check_bounds, span
@@ -63,14 +63,14 @@ class BothDomains:
 
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
         """Series of both domains, the shorter repeated, with their domain and the source network's predictions."""
-        own = [self._marked(part, TARGET, None) for part in own_series]
+        own = [self._mark_domain(part, TARGET, None) for part in own_series]
         source_predictions = (
             stream_predictions(self.base.start, self.source_series)
             if self.spec.soft
             else [None] * len(self.source_series)
         )
         rehearsed = [
-            self._marked(part, SOURCE, values)
+            self._mark_domain(part, SOURCE, values)
             for part, values in zip(self.source_series, source_predictions, strict=True)
         ]
         ticks = [sum(part.samples for part in parts) for parts in (own, rehearsed)]
@@ -107,7 +107,7 @@ class BothDomains:
         if spec.soft:
             source_predictions = batch.strategy_columns[..., 1:].unflatten(-1, batch.future.shape[2:])
             goal = objective.code.encode(source_predictions, batch.features)
-            soft = masked_loss(Huber(), batch.answer, goal, there, objective.weights)
+            soft = compute_masked_loss(Huber(), batch.answer, goal, there, objective.weights)
             loss = loss + spec.weight * spec.soft * soft
         if spec.reversal:
             hidden = reverse(batch.hidden, spec.reversal * ramp(batch.progress))
@@ -130,7 +130,7 @@ class BothDomains:
         # A batch of one domain still gives a loss; a batch of none gives zero with a gradient path.
         return torch.stack(parts).mean() if parts else logits.sum() * 0.0
 
-    def _marked(self, part: Series, domain: float, source_predictions: np.ndarray[Any, Any] | None) -> Series:
+    def _mark_domain(self, part: Series, domain: float, source_predictions: np.ndarray[Any, Any] | None) -> Series:
         columns = [np.full((part.samples, 1), domain, dtype=np.float32)]
         if self.spec.soft:
             width = len(self.base.start.task.horizons) * len(self.base.start.task.targets)

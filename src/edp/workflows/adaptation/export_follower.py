@@ -12,7 +12,7 @@ from edp.networks.twin.adaptive_twin import TunedSpec
 from edp.networks.twin.greybox import GreyTwin
 from edp.training import load_bundle
 from edp.training.twin_bundle import load_twin, plant_bundle
-from edp.workflows.adaptation.with_twin import correction_of, tuned_spec
+from edp.workflows.adaptation.with_twin import choose_tuned_spec, correction_of
 
 OPTIONS = tuple(one.name for one in fields(TunedSpec) if one.name != "groups")
 """Of `TunedSpec`, that may be set."""
@@ -40,7 +40,7 @@ def export_follower(
     if bundle.adaptation is None:
         raise BundleError(f"'{run}' has no adaptation; edp adapt {run} --out FOLDER makes a run that has one")
     grey = load_twin(twin)
-    spec = _with_options(tuned_spec(grey), options or {})
+    spec = _apply_options(choose_tuned_spec(grey), options or {})
     correction = correction_of(grey.twin, bundle.adaptation, bundle.task, spec)
     if not isinstance(grey.twin, GreyTwin):  # refused by the line above; this tells the type
         raise ConfigError("only a grey box can follow the machine")
@@ -55,7 +55,7 @@ def export_follower(
     return write_follower(parts, plant_bundle(grey), name, Path(folder))
 
 
-def _with_options(spec: TunedSpec, options: Mapping[str, str]) -> TunedSpec:
+def _apply_options(spec: TunedSpec, options: Mapping[str, str]) -> TunedSpec:
     changed: dict[str, float] = {}
     for option, text in options.items():
         if option not in OPTIONS:

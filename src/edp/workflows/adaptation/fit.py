@@ -26,7 +26,7 @@ from edp.training import save_bundle
 from edp.training.bundle import weights_digest
 from edp.workflows.adaptation.replay import replay
 from edp.workflows.deployment import footprint_of
-from edp.workflows.train_evaluate import trained_run
+from edp.workflows.train_evaluate import read_trained_run
 
 Rows = NDArray[np.float64]
 HISTORY = "history.jsonl"
@@ -62,7 +62,7 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
     """
     check_claimable(out, "adaptation")
     folder = Path(run)
-    bundle, experiment, provenance, data = trained_run(folder)
+    bundle, experiment, provenance, data = read_trained_run(folder)
     spec = spec or AdaptationSpec()
     key = run_key({"adaptation": asdict(spec), "weights": weights_digest(bundle.predictor)}, data.digest)
     # Before the folder is claimed: what is refused must not keep a corrected command out.
@@ -70,7 +70,7 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
     with Run.create(out, "adaptation", key, experiment_toml(experiment)) as target:
         if is_file_at(folder / HISTORY):
             write_bytes(target.file(HISTORY), (folder / HISTORY).read_bytes())
-        write_json(target.file("provenance.json"), provenance.with_entries(adaptation=adaptation.digest).to_table())
+        write_json(target.file("provenance.json"), provenance.add_entries(adaptation=adaptation.digest).to_table())
         save_bundle(replace(bundle, adaptation=adaptation), target.file("bundle"))
         # The footprint counts the adaptation too; the one of the source run would state too little.
         write_json(target.file("footprint.json"), footprint_of(target.path)[0].to_json())
@@ -103,7 +103,7 @@ def fit_adaptation(predictor: Predictor, data: Prepared, spec: AdaptationSpec) -
     # Velocities rest at zero by nature; the median of other targets is where the machine usually is.
     middle = np.where([kind is Kind.VELOCITY for kind in data.target_kinds], 0.0, np.median(present, axis=0))
     # Units come from the validation part: errors on training data are too small.
-    change, unit = _of_predictions(predictor, data.validation)
+    change, unit = _measure_spread(predictor, data.validation)
     arrays = {
         "offset": offset,
         "scale": scale,
@@ -141,7 +141,7 @@ def _directions(scaled: Rows, columns: Sequence[int], rank: int) -> Rows:
     return np.asarray((axes * signs).T)
 
 
-def _of_predictions(predictor: Predictor, parts: Sequence[Series]) -> tuple[Rows, Rows]:
+def _measure_spread(predictor: Predictor, parts: Sequence[Series]) -> tuple[Rows, Rows]:
     """Spread of predicted changes and of errors ``(horizon, target)``."""
     skip, horizons = predictor.spec.window, predictor.task.horizons
     changes: list[list[Rows]] = [[] for _ in horizons]

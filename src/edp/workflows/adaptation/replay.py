@@ -22,7 +22,7 @@ from edp.progress import SILENT, Progress
 from edp.signals import KINDS, Kind
 from edp.training import load_bundle
 from edp.training.twin_bundle import load_twin
-from edp.workflows.adaptation.with_twin import TwinMoves, correction_of, tuned_spec
+from edp.workflows.adaptation.with_twin import TwinMoves, choose_tuned_spec, correction_of
 
 # 60 s are the usual forgetting time: beyond it the adaptation is settled.
 BINS = (0.0, 10.0, 30.0, 60.0)
@@ -209,7 +209,9 @@ def replay_run(
     moves = None
     if twin is not None:
         grey = load_twin(twin)
-        by_twin = TwinMoves(grey.twin, correction_of(grey.twin, bundle.adaptation, bundle.task, tuned_spec(grey)))
+        by_twin = TwinMoves(
+            grey.twin, correction_of(grey.twin, bundle.adaptation, bundle.task, choose_tuned_spec(grey))
+        )
         moves = partial(by_twin, recordings, carry=carry, learn=learn)
     result = replay(bundle.predictor, bundle.adaptation, series, carry, learn, progress, moves)
     return result.content(bundle.task, bundle.target_kinds)

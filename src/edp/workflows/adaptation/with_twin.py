@@ -23,7 +23,7 @@ from edp.wording import typed
 Rows = NDArray[np.float32]
 
 
-def tuned_spec(bundle: TwinBundle) -> TunedSpec:
+def choose_tuned_spec(bundle: TwinBundle) -> TunedSpec:
     """Return which numbers of a twin adapt; oil temperature is known if the logs hold it.
 
     Raises:

@@ -26,7 +26,7 @@ from edp.training import load_bundle
 from edp.wording import typed
 from edp.workflows import deployment, train_evaluate
 from edp.workflows.api.predictions import Predictions
-from edp.workflows.api.recordings import MemorySource, Recordings, as_recordings
+from edp.workflows.api.recordings import MemorySource, Recordings, to_recordings
 from edp.workflows.api.scores import JudgedScores
 
 BASELINES = ("persistence", "ridge_arx")
@@ -115,9 +115,9 @@ class TrainedPredictor:
             DataError: recordings that cannot be used, too short to be judged, or training data that changed.
             ConfigError: an unknown baseline, or what a bundle alone cannot give.
         """
-        recordings = None if test is None else as_recordings(test)
+        recordings = None if test is None else to_recordings(test)
         if not is_file_at(self.folder / PROVENANCE):
-            return self._judged_alone(recordings, baselines)
+            return self._evaluate_bundle(recordings, baselines)
         source = None if recordings is None else recordings.source or _memory(recordings)
         names = BASELINES if baselines is None else tuple(baselines)
         return JudgedScores(read_facts(train_evaluate.evaluate(self.folder, source, names)))
@@ -128,7 +128,7 @@ class TrainedPredictor:
         Raises:
             DataError: another rate, a missing input, or one that is not finite.
         """
-        data = as_recordings(recordings)
+        data = to_recordings(recordings)
         predictor = self._bundle.predictor
         series = [unlabelled(self._task, recording) for recording in data]
         # Bounds cost a second pass, which a point output does not need.
@@ -154,7 +154,7 @@ class TrainedPredictor:
             DataError: as of `predict`.
             ConfigError: no such horizon.
         """
-        return self.predict(as_recordings(test)[:1]).plot(horizon=horizon)
+        return self.predict(to_recordings(test)[:1]).plot(horizon=horizon)
 
     def export(self, target: str, folder: str | Path, name: str = "predictor", **options: object) -> list[Path]:
         """Write it in a form that runs without EDP.
@@ -184,7 +184,7 @@ class TrainedPredictor:
             return AdaptedStream(self._bundle.predictor, adaptation)
         return Stream(self._bundle.predictor)
 
-    def _judged_alone(self, recordings: Recordings | None, baselines: Sequence[str] | None) -> JudgedScores:
+    def _evaluate_bundle(self, recordings: Recordings | None, baselines: Sequence[str] | None) -> JudgedScores:
         """Evaluate a bundle that has no run folder."""
         if recordings is None:
             raise ConfigError(f"'{self.folder}' is a bundle without its run folder; give the recordings to judge it on")

@@ -83,7 +83,7 @@ class Recordings(Sequence[Recording]):
         width = tables[0].shape[1]
         channel_names = names_of(names, [f"channel_{i}" for i in range(width)], "names", "channels")
         columns = [dict(zip(channel_names, values.T, strict=True)) for values in check_width(tables, channel_names)]
-        return cls._of_columns(columns, rate_hz, units_of(units, channel_names), recording_names, repair)
+        return cls._from_columns(columns, rate_hz, units_of(units, channel_names), recording_names, repair)
 
     @classmethod
     def from_frames(
@@ -112,10 +112,10 @@ class Recordings(Sequence[Recording]):
         if not listed:
             raise DataError("no frames given; give one DataFrame for each recording")
         columns = [columns_of(frame, f"frame {number}") for number, frame in enumerate(listed)]
-        return cls._of_columns(columns, rate_hz, units_of(units, list(columns[0])), recording_names, repair)
+        return cls._from_columns(columns, rate_hz, units_of(units, list(columns[0])), recording_names, repair)
 
     @classmethod
-    def _of_columns(
+    def _from_columns(
         cls,
         tables: Sequence[Mapping[str, NDArray[Any]]],
         rate_hz: float | None,
@@ -294,7 +294,7 @@ def read(
     return Recordings(source.read(), source)
 
 
-def as_recordings(data: Recordings | Recording | Sequence[Recording]) -> Recordings:
+def to_recordings(data: Recordings | Recording | Sequence[Recording]) -> Recordings:
     """Convert user data to `Recordings`.
 
     Raises:

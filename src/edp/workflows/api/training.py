@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from edp.config.experiment import AUTO, Experiment, build, preset_table, with_set_file
+from edp.config.experiment import AUTO, Experiment, build, embed_feature_set, preset_table
 from edp.data.features import FEATURE_SETS
 from edp.errors import ConfigError, DataError, closest
 from edp.logs.source import DataSource
@@ -23,7 +23,7 @@ from edp.training import Diverged
 from edp.training.progress_steps import training_steps
 from edp.workflows import train_evaluate
 from edp.workflows.api.predictor import TrainedPredictor
-from edp.workflows.api.recordings import MemorySource, Recordings, as_recordings
+from edp.workflows.api.recordings import MemorySource, Recordings, to_recordings
 from edp.workflows.auto import AutoSettings, auto_settings, train_auto
 
 RECORDINGS = "recordings"
@@ -72,8 +72,8 @@ def train(
         StorageError: the folder cannot be written or holds another run.
         Diverged: the loss was not finite any more.
     """
-    recordings = as_recordings(data)
-    tests = None if test is None else _apart(as_recordings(test), recordings)
+    recordings = to_recordings(data)
+    tests = None if test is None else _apart(to_recordings(test), recordings)
     together = recordings if tests is None else Recordings([*recordings, *tests])
     experiment = _experiment(together, tests, targets, horizons, features, preset, settings)
     folder = Path(tempfile.mkdtemp(prefix="edp-run-")) if out is None else Path(out)
@@ -159,17 +159,17 @@ def _table(settings: Mapping[str, object] | str | Path | None) -> Table:
     if settings is None:
         return {}
     if isinstance(settings, Mapping):
-        return with_set_file(_nested(settings), Path())
-    return with_set_file(read_toml(settings), Path(settings).parent)
+        return embed_feature_set(_nest_keys(settings), Path())
+    return embed_feature_set(read_toml(settings), Path(settings).parent)
 
 
-def _nested(settings: Mapping[str, object]) -> Table:
+def _nest_keys(settings: Mapping[str, object]) -> Table:
     """Dotted keys as tables, in the order given."""
     table: Table = {}
     for key, value in settings.items():
         # Keys are built up from the innermost part.
         first, *others = reversed(str(key).split("."))
-        change: Table = {first: _nested(value) if isinstance(value, Mapping) else _plain(value)}
+        change: Table = {first: _nest_keys(value) if isinstance(value, Mapping) else _plain(value)}
         for part in others:
             change = {part: change}
         table = merged(table, change)
@@ -179,7 +179,7 @@ def _nested(settings: Mapping[str, object]) -> Table:
 def _plain(value: Any) -> Any:
     """Convert tuples to lists and mappings to dictionaries, as TOML would give them."""
     if isinstance(value, list | tuple):
-        return [_nested(entry) if isinstance(entry, Mapping) else _plain(entry) for entry in value]
+        return [_nest_keys(entry) if isinstance(entry, Mapping) else _plain(entry) for entry in value]
     return value
 
 

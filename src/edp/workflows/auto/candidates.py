@@ -276,7 +276,7 @@ class Amount:
     def seconds(self, kind: str) -> float:
         """Processor time for a kind of learner."""
         budget = 60 * self.minutes
-        left = max(budget - _fixed_seconds(self), LEAST_SHARE * budget)
+        left = max(budget - _estimate_fixed_seconds(self), LEAST_SHARE * budget)
         shares = LONG_SHARE if self.rows > LONG_ROWS else SHARE
         match self.trial:
             case RecurrentTrial.RUNNING:
@@ -350,16 +350,16 @@ def _steps(amount: Amount, groups: int) -> int:
     return int(min(max(affordable, LEAST_STEPS), useful, most, MOST_STEPS))
 
 
-def _fixed_seconds(amount: Amount) -> float:
+def _estimate_fixed_seconds(amount: Amount) -> float:
     """Return the processor time of parts that no budget shortens: linear models and radial basis functions."""
     rows, columns = min(amount.rows, BaggingSpec().rows), _columns(amount)
     linear = LINEAR_MODELS * (2 * rows * columns**2 / LINEAR_PRODUCTS_PER_S + FOLDS * columns**3 / EIGEN_CUBES_PER_S)
     kernels = len(LENGTHS) * min(rows, JUDGED_ROWS) + (rows if rows > JUDGED_ROWS else 0)
-    near = sum(RADIAL_ROW_S + RADIAL_CELL_S * amount.features * (1 + (span > 0)) for span in _near(amount))
+    near = sum(RADIAL_ROW_S + RADIAL_CELL_S * amount.features * (1 + (span > 0)) for span in _list_near_spans(amount))
     return linear + kernels * (RADIAL_ROW_S + RADIAL_CELL_S * columns + near)
 
 
-def _near(amount: Amount) -> list[int]:
+def _list_near_spans(amount: Amount) -> list[int]:
     """Spans of the basis functions on few columns."""
     lags = spans_of(amount).lags
     return [span for span in NEAR if span == 0 or span in lags] if amount.rows <= NEAR_ROWS else []
@@ -424,7 +424,7 @@ def _committee(amount: Amount) -> Table:
     parts = {
         "activations": activations,
         "centres": min(CENTRES, amount.rows // ROWS_PER_CENTRE),
-        "near": _near(amount),
+        "near": _list_near_spans(amount),
         "trees": plan.trees,
         "tree_depth": TREE_DEPTH,
     }

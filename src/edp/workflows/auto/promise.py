@@ -67,7 +67,7 @@ class Promise:
             rows: of the test.
         """
         groups = np.array_split(np.arange(len(self.rows)), min(GROUPS, len(self.rows)))
-        part = self._grouped(groups)
+        part = self._group_blocks(groups)
         drawn = min(max(1, round(len(groups) * rows / float(self.rows.sum()))), 10 * len(groups))
         rng = np.random.default_rng(0)
         promised = part._error(rng.integers(len(groups), size=(DRAWS, len(groups))))
@@ -86,7 +86,7 @@ class Promise:
         below = 1.0 if self.reference is None else np.maximum(mean(self.reference), TINY**2)
         return np.asarray(np.sqrt(mean(self.squared) / below))
 
-    def _grouped(self, groups: Sequence[NDArray[np.int64]]) -> Promise:
+    def _group_blocks(self, groups: Sequence[NDArray[np.int64]]) -> Promise:
         """Return the promise with groups of blocks as one block each."""
         rows = np.array([self.rows[group].sum() for group in groups])
 
@@ -198,7 +198,7 @@ def choose(promises: Mapping[str, Promise]) -> PortfolioChoice:
     return PortfolioChoice(name, best, excess, doubt)
 
 
-def in_report_units(error: DoubleArray, data: Prepared) -> dict[str, dict[str, float]]:
+def to_report_units(error: DoubleArray, data: Prepared) -> dict[str, dict[str, float]]:
     """Root-mean-square errors, standardised by the data, by horizon and target in report units."""
     factors = np.array([KINDS[kind].report_factor for kind in data.target_kinds])
     scale = np.asarray(data.scaler().target_scale, dtype=np.float64)

@@ -56,7 +56,7 @@ def fit_to_channels(settings: AutoSettings, names: Sequence[str], where: str) ->
     task = settings.task
     notes: list[str] = []
     if task.features == USUAL and not set(FEATURE_SETS[USUAL].inputs) <= set(names):
-        features, notes = _of_these(names)
+        features, notes = _choose_features(names)
         task = replace(task, features=features)
     derived = () if isinstance(task.features, str) else task.features.derived
     channels = {*names, *(entry.name for entry in (*derived, *task.derived_targets))}
@@ -70,7 +70,7 @@ def fit_to_channels(settings: AutoSettings, names: Sequence[str], where: str) ->
     return replace(settings, task=task), notes
 
 
-def _of_these(names: Sequence[str]) -> tuple[str | FeatureSettings, list[str]]:
+def _choose_features(names: Sequence[str]) -> tuple[str | FeatureSettings, list[str]]:
     """Return the usual features, if they are present or can be derived; all channels otherwise."""
     usual = FEATURE_SETS[USUAL]
     missing = [name for name in usual.inputs if name not in names]

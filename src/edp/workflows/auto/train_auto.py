@@ -29,9 +29,9 @@ from edp.workflows.auto.promise import (
     blocks_of,
     by_output,
     choose,
-    in_report_units,
     promise_of,
     standard_truth,
+    to_report_units,
 )
 from edp.workflows.auto.recordings import (
     ReadOnce,
@@ -103,7 +103,7 @@ def train_auto(
         foundation.check_task(data)
     begun = {} if foundation is None else {"foundation": foundation.facts}
     key = run_key({"auto": plain_tree(settings), **begun}, data.digest)
-    finished = _finished(Path(out), key)
+    finished = _read_finished(Path(out), key)
     if finished is not None:
         return finished
     check_moving(data)
@@ -136,19 +136,21 @@ def _write_choice(
         raise ConfigError(f"automatic choice: every candidate diverged: {'; '.join(failed.values())}")
     choice = choose({name: one.promise for name, one in trained.items()})
     stated = replace(
-        _stated(choice, trained, failed, data, settings, amount), key=run.key, notes=(*notes, *portfolio.notes)
+        _make_choice_file(choice, trained, failed, data, settings, amount),
+        key=run.key,
+        notes=(*notes, *portfolio.notes),
     )
     winner, floor = trained[choice.name], trained.get(FLOOR)
     stated.write(run.path)
     if floor is not None and winner is not floor:
         # What the skill is measured against: `edp evaluate` needs its error on the test recordings, too.
-        provenance = Provenance().with_entries(auto=stated.sentence)
+        provenance = Provenance().add_entries(auto=stated.sentence)
         save_bundle(make_bundle(floor.fitted.predictor, data, provenance), run.file(FLOOR))
     bundle = keep_fitted(run, source, winner.experiment, data, winner.fitted, {"auto": stated.sentence})
     return AutoResult(bundle, stated)
 
 
-def _finished(folder: Path, key: str) -> AutoResult | None:
+def _read_finished(folder: Path, key: str) -> AutoResult | None:
     """Return the result of a finished run with this key; None without one."""
     # The key stands in the choice, too: earlier versions wrote the winner's key into the identity of the run.
     choice = read_choice(folder)
@@ -157,7 +159,7 @@ def _finished(folder: Path, key: str) -> AutoResult | None:
     return AutoResult(load_bundle(folder), choice)
 
 
-def _stated(
+def _make_choice_file(
     choice: PortfolioChoice,
     trained: dict[str, TrainedCandidate],
     failed: dict[str, str],
@@ -180,13 +182,13 @@ def _stated(
             label=CANDIDATES[name].label,
             seconds=round(one.fitted.seconds, 2),
             parameters=sum(parameter.numel() for parameter in one.fitted.predictor.parameters()),
-            promise=in_report_units(one.promise.error(), data),
+            promise=to_report_units(one.promise.error(), data),
         )
         for name, one in trained.items()
     }
     promise, floor = trained[choice.name].promise, trained.get(FLOOR)
     still = _persistence(settings, data, amount)
-    unchanged = in_report_units(still.last(len(promise.rows)).error(), data)
+    unchanged = to_report_units(still.last(len(promise.rows)).error(), data)
     tested = sum(max(0, part.samples - data.task.max_horizon) for part in data.test)
     against = still if floor is None or choice.name == FLOOR else floor.promise
     skill = promise.relative_to(against)
@@ -201,7 +203,7 @@ def _stated(
         candidates=candidates,
         persistence=unchanged,
         interval=ErrorBounds(
-            **{side: in_report_units(bound, data) for side, bound in promise.interval(tested).items()}
+            **{side: to_report_units(bound, data) for side, bound in promise.interval(tested).items()}
         ),
         skill=Skill(
             against=PERSISTENCE if against is still else FLOOR,

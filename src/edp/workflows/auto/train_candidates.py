@@ -105,19 +105,19 @@ def train_candidate(job: CandidateTraining, on_event: OnEvent | None = None) -> 
         EdpError: data or settings that cannot be used.
     """
     try:
-        return _on_folds(job, on_event) if job.on_folds else _by_gradient(job, on_event)
+        return _train_on_folds(job, on_event) if job.on_folds else _train_by_gradient(job, on_event)
     except Diverged as end:
         return str(end)
 
 
-def _on_folds(job: CandidateTraining, on_event: OnEvent | None) -> TrainedCandidate:
+def _train_on_folds(job: CandidateTraining, on_event: OnEvent | None) -> TrainedCandidate:
     bagged = fit_bagged(job.data, job.experiment.model, job.experiment.training, on_event)
     truth = standard_truth(bagged.fitted.predictor, job.data)
-    promise = promise_of(bagged.at_every_tick(truth), truth, job.blocks)
+    promise = promise_of(bagged.predict_all(truth), truth, job.blocks)
     return TrainedCandidate(job.experiment, bagged.fitted, promise)
 
 
-def _by_gradient(job: CandidateTraining, on_event: OnEvent | None) -> TrainedCandidate:
+def _train_by_gradient(job: CandidateTraining, on_event: OnEvent | None) -> TrainedCandidate:
     experiment, begun = job.experiment, {}
     if job.foundation is not None:
         begun = {"foundation": job.foundation.facts}
@@ -242,7 +242,7 @@ class _Display:
 
     def look(self) -> None:
         """Read the notes, and report new ones."""
-        noted = [(job, event) for job in self.jobs if (event := _noted(job)) is not None]
+        noted = [(job, event) for job in self.jobs if (event := _read_progress(job)) is not None]
         if not noted:
             return
         job, event = max(noted, key=lambda pair: pair[1].seconds_left)
@@ -251,7 +251,7 @@ class _Display:
         self.last = event
 
 
-def _noted(job: CandidateTraining) -> TrainingProgress | None:
+def _read_progress(job: CandidateTraining) -> TrainingProgress | None:
     names = ("epoch", "epochs", "update", "updates", "targets_per_s", "seconds_left")
     note = job.folder / NOTE
     if not is_file_at(note):
@@ -318,7 +318,7 @@ def train_portfolio(
     linear, trial = _jobs({name: experiments[name] for name in (LINEAR, RECURRENT)}, data, amount, folder)
     trial = replace(trial, folder=folder / "candidates" / TRIAL_FOLDER, trial=True)
     first = train([linear, trial], total=len(experiments))
-    ratio = _over_linear(first)
+    ratio = _compare_with_linear(first)
     passed = ratio is not None and ratio <= MARGIN
     amount = replace(amount, trial=RecurrentTrial.PASSED if passed else RecurrentTrial.FAILED)
     experiments = _experiments(settings, amount)
@@ -334,7 +334,7 @@ def train_portfolio(
     return TrainedPortfolio({name: outcomes[name] for name in experiments}, amount, notes)
 
 
-def _over_linear(outcomes: Mapping[str, TrainedCandidate | str]) -> float | None:
+def _compare_with_linear(outcomes: Mapping[str, TrainedCandidate | str]) -> float | None:
     """Return the error of the trial relative to the linear model's, on the comparison data; None if one diverged."""
     promises = {name: one.promise for name, one in outcomes.items() if isinstance(one, TrainedCandidate)}
     if len(promises) < len(outcomes):

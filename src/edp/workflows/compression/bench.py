@@ -16,7 +16,7 @@ from edp.training.compression.imitation import CommitteeImitation, imitates
 from edp.training.compression.pruning import prune
 from edp.training.compression.qat import QuantisationAware, RoundingSpec
 from edp.training.fit import fit
-from edp.training.spec import TrainingSpec, by_gradient
+from edp.training.spec import TrainingSpec, to_gradient_training
 from edp.training.strategy import DirectFit, TrainingStrategy
 
 # Training with rounded numbers goes on from a trained network: shorter, and in smaller steps.
@@ -64,7 +64,7 @@ class CompressionRequest:
 
     def training(self, spec: TrainingSpec) -> TrainingSpec:
         """Return the training of this network, given the general training `spec`."""
-        spec = by_gradient(spec)  # a student is taught; there are no folds of truth
+        spec = to_gradient_training(spec)  # a student is taught; there are no folds of truth
         return spec if self.rounding is None else tuning(spec)
 
     def strategy(

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from edp.config.experiment import Change, Experiment, Table, load_experiment, plain_tree
-from edp.data.frozen import frozen_of, keep_frozen, refuse_frozen
+from edp.data.frozen import keep_frozen, list_frozen, refuse_frozen
 from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.data.unlabelled import unlabelled
@@ -109,8 +109,8 @@ def distil(
     if model == teacher.spec:
         raise ConfigError(f"a student of {spec.units} units is the teacher itself; take fewer units or levels")
     teachers = [teacher, *(load_bundle(path).predictor for path in request.teachers)]
-    frozen = frozen_sessions(run, experiment)
-    series, digests = _unlabelled(teacher, request.further, frozen)
+    frozen = read_frozen_sessions(run, experiment)
+    series, digests = _read_unlabelled(teacher, request.further, frozen)
     facts = order_facts(order) | {"teachers": [weights_digest(net) for net in teachers], "further": digests}
 
     def strategy(data: Prepared) -> TrainingStrategy | DirectFit:
@@ -165,9 +165,9 @@ def read_run(run: str | Path, changes: Sequence[Change] = ()) -> tuple[Predictor
     return bundle.predictor, experiment, DataSource.from_plain(read_provenance(folder).origin.reader)
 
 
-def frozen_sessions(run: str | Path, experiment: Experiment) -> dict[str, str]:
+def read_frozen_sessions(run: str | Path, experiment: Experiment) -> dict[str, str]:
     """Return names by digest of frozen sessions for descendants of a run, from its split and earlier runs."""
-    return {**read_provenance(_run_folder(run)).origin.frozen} | frozen_of(experiment.split)
+    return {**read_provenance(_run_folder(run)).origin.frozen} | list_frozen(experiment.split)
 
 
 def _run_folder(run: str | Path) -> Path:
@@ -199,7 +199,7 @@ def _loss(spec: DistillationSpec) -> Any:
     return {"kind": name} | {key: plain_tree(value) for key, value in vars(spec.soft).items()}
 
 
-def _unlabelled(
+def _read_unlabelled(
     teacher: Predictor, source: DataSource | None, frozen: dict[str, str]
 ) -> tuple[list[Series], list[str]]:
     recordings = [] if source is None else source.read()

@@ -18,7 +18,7 @@ from edp.training.bundle import blank_scaler
 from edp.training.compression.pruning import check_pruning
 from edp.workflows.compression.bench import CompressionRequest
 from edp.workflows.compression.formats import FORMATS, resource_usage
-from edp.workflows.compression.variants import rounded_order
+from edp.workflows.compression.variants import make_rounded_request
 
 STEP = 4  # widths are multiples of it: what kernels compute at a time
 RECIPES = ("distilled", "pruned")  # and the better one is trained on with rounded numbers
@@ -59,7 +59,8 @@ class CompressionPlan:
             return []
         # The better recipe is chosen in float: rounding both would double the trainings.
         return [
-            rounded_order(min(orders, key=lambda order: errors.get(order, math.inf))) for orders in self.orders.values()
+            make_rounded_request(min(orders, key=lambda order: errors.get(order, math.inf)))
+            for orders in self.orders.values()
         ]
 
 
@@ -96,7 +97,7 @@ def make_plan(
     # One and two units are there for budgets that no multiple of four meets.
     possible = [width for width in sorted({1, 2, full, *range(STEP, full, STEP)}) if width <= full]
     possible = [width for width in possible if not _why_not(teacher, _narrow(teacher.spec, width))]
-    supported, notes = _supported(teacher, possible[0], formats or list(FORMATS))
+    supported, notes = _select_formats(teacher, possible[0], formats or list(FORMATS))
     fitting = {name: _widest(teacher, name, budget, possible) for name in supported}
     if not any(fitting.values()):
         raise ConfigError(_refusal(teacher, budget, supported, possible[0]))
@@ -135,15 +136,15 @@ def _orders(teacher: Predictor, width: int, recipes: Sequence[str], notes: list[
 def _why_not(teacher: Predictor, model: ModelSpec) -> str:
     """Why a network of these settings cannot be built; empty where it can."""
     try:
-        _untrained(model, teacher.task)
+        _build_untrained(model, teacher.task)
     except ConfigError as error:
         return str(error)
     return ""
 
 
-def _supported(teacher: Predictor, least: int, formats: Sequence[str]) -> tuple[list[str], list[str]]:
+def _select_formats(teacher: Predictor, least: int, formats: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the formats that support every part of the network, and the reasons against the others."""
-    net = _untrained(_narrow(teacher.spec, least), teacher.task)
+    net = _build_untrained(_narrow(teacher.spec, least), teacher.task)
     # Two windows of random inputs suffice to find whether a format has a form for every part.
     drawn = np.random.default_rng(0).normal(size=(2 * net.spec.window, len(net.task.inputs))).astype(np.float32)
     series = [Series("drawn", drawn, np.zeros((len(drawn), len(net.task.targets)), dtype=np.float32))]
@@ -166,13 +167,13 @@ def _narrow(model: ModelSpec, units: int) -> ModelSpec:
     return student(model, units, None if channels is None else len(channels))
 
 
-def _untrained(model: ModelSpec, task: Task) -> Predictor:
+def _build_untrained(model: ModelSpec, task: Task) -> Predictor:
     # Counts depend on sizes only: weights are not trained for them.
     return build_model(task, model, blank_scaler(task), seed=0)
 
 
 def _usage_at(teacher: Predictor, units: int, name: str, budget: Budget) -> ResourceUsage:
-    return resource_usage(_untrained(_narrow(teacher.spec, units), teacher.task), name, budget)
+    return resource_usage(_build_untrained(_narrow(teacher.spec, units), teacher.task), name, budget)
 
 
 def _widest(teacher: Predictor, name: str, budget: Budget, widths: Sequence[int]) -> int:

@@ -15,7 +15,7 @@ from edp.storage.paths import is_file_at
 from edp.storage.runs import Run, check_claimable, run_key
 from edp.training import save_bundle
 from edp.training.bundle import weights_digest
-from edp.workflows.train_evaluate import trained_run
+from edp.workflows.train_evaluate import read_trained_run
 
 
 def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str, float]:
@@ -37,7 +37,7 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
     """
     check_claimable(out, "network")
     folder = Path(run)
-    bundle, experiment, provenance, data = trained_run(folder)
+    bundle, experiment, provenance, data = read_trained_run(folder)
     if bundle.predictor.number_format != "float32":
         raise ExportError(f"'{folder}' computes in {bundle.predictor.number_format} already; give the float run")
     check_writable(out)
@@ -52,7 +52,7 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
         for name in ("history.jsonl", "footprint.json"):
             if is_file_at(folder / name):
                 write_bytes(target.file(name), (folder / name).read_bytes())
-        provenance = provenance.with_entries(number_format=integer_network.number_format)
+        provenance = provenance.add_entries(number_format=integer_network.number_format)
         write_json(target.file("provenance.json"), provenance.to_table())
         # Scores are those of the float network; they would be wrong for the integer one.
         save_bundle(replace(bundle, predictor=integer_network, scores={}), target.file("bundle"))

@@ -27,7 +27,7 @@ from edp.training.bundle import weights_digest
 from edp.training.progress_steps import training_steps
 from edp.training.strategy import DirectFit, TrainingStrategy
 from edp.workflows.compression.bench import Bench, CompressionRequest
-from edp.workflows.compression.distil import frozen_sessions, order_facts, read_run
+from edp.workflows.compression.distil import order_facts, read_frozen_sessions, read_run
 from edp.workflows.compression.formats import FORMATS
 from edp.workflows.compression.pipeline import (
     TEACHER,
@@ -179,7 +179,7 @@ def search(
     plan = make_plan(teacher, spec.budget, spec.units, spec.formats, spec.recipes)
     for note in plan.notes:
         progress.note(note)
-    frozen = frozen_sessions(run, experiment)
+    frozen = read_frozen_sessions(run, experiment)
     data = prepare_data(source or own, experiment, frozen)
     held_out = _find_sealed(source or own, experiment, data)
     # The judge changes no weights; its settings stay out of the key.

@@ -38,7 +38,7 @@ class CompressedCandidate:
 VARIANTS: Registry[Callable[[Bench], CompressedCandidate]] = Registry("variant")
 
 
-def rounded_order(of: CompressionRequest) -> CompressionRequest:
+def make_rounded_request(of: CompressionRequest) -> CompressionRequest:
     """Return the order to train on what another one made, with everything rounded."""
     return CompressionRequest(name=f"{of.name}_qat", units=of.units, rounding=RoundingSpec(), of=of)
 
@@ -85,7 +85,7 @@ for variant in (
     MadeByOrder("B_LPTQ", U64, "dynamic_int8"),
     RoundedLikeThesis("C_QAT", None),
     RoundedLikeThesis("C_u64_QAT", U64),
-    MadeByOrder("D_u32", rounded_order(P32), "w8a16"),
-    MadeByOrder("D_u64", rounded_order(P64), "w8a16"),
+    MadeByOrder("D_u32", make_rounded_request(P32), "w8a16"),
+    MadeByOrder("D_u64", make_rounded_request(P64), "w8a16"),
 ):
     VARIANTS.register(variant.name)(variant)

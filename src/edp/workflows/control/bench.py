@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from edp.config.control import ControlExperiment
-from edp.control.base import unused_models
+from edp.control.base import list_unused_models
 from edp.control.controllers import CONTROLLERS, ControllerSpec
 from edp.control.guard import LoopGuard
 from edp.control.loop import LoopResult, run_loop, start_options
@@ -94,9 +94,9 @@ class ControlBench:
         longest = (max(task.reference.ticks for task in self.tasks) + 1) / rate
         self._env = plant_of(experiment.machine, longest, rate, sources.plant, sources.trusted)
         self.plant = interface_of(self._env)
-        self.models = models or self._commissioned(probe, sources)
+        self.models = models or self._prepare_models(probe, sources)
 
-    def _commissioned(self, probe: Any, sources: ControlSources) -> ControlModels:
+    def _prepare_models(self, probe: Any, sources: ControlSources) -> ControlModels:
         """Models of the sources, and a valve map where one is needed: measured before the loops, on the plant."""
         valve_map: ValveMap | None = None
         if "valve_map" in self.experiment.controller.needs:
@@ -244,7 +244,7 @@ def _check_used(experiment: ControlExperiment, sources: ControlSources) -> None:
     """Raise ConfigError for models that the controller of an experiment does not use."""
     needs, kind = experiment.controller.needs, CONTROLLERS.name_of(experiment.controller)
     available = [name for name in ("twin", "predictor") if getattr(sources, name) is not None]
-    for name in unused_models(needs, available):
+    for name in list_unused_models(needs, available):
         uses = " and a ".join(need.replace("_", " ") for need in needs)
         raise ConfigError(
             f"--{name}: it has no effect with the controller '{kind}', which uses a {uses}; "

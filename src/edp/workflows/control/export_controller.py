@@ -87,7 +87,7 @@ def parts_of(
             f"controller '{CONTROLLERS.name_of(spec)}' has no form in C; these have: pi, nmpc. Run edp control with "
             "one of them"
         )
-    valves = models.needed_map(CONTROLLERS.name_of(spec))
+    valves = models.require_map(CONTROLLERS.name_of(spec))
     loop = spec if isinstance(spec, ProportionalIntegral) else ProportionalIntegral()
     plan: PlanParts | None = None
     reads: tuple[str, ...] = STROKES
@@ -219,11 +219,11 @@ def golden_loop(parts: ControllerParts, stored: KeptController) -> GoldenLoop | 
     ahead = parts.lead if parts.plan is None else max(parts.lead, sum(parts.plan.blocks))
     # Two more rows: slopes are central.
     rows = slice(0, ticks + ahead + 2)
-    before, levers = _replayed(stored, ticks)
+    before, levers = _replay(stored, ticks)
     return GoldenLoop(measured[:ticks], before, levers, stored.strokes[rows], stored.tip[rows])
 
 
-def _replayed(stored: KeptController, ticks: int) -> tuple[Array, Array]:
+def _replay(stored: KeptController, ticks: int) -> tuple[Array, Array]:
     """Return memory before each tick and levers of the controller under the kept observations."""
     experiment = stored.experiment
     controller = experiment.controller.build(stored.plant, experiment.task.limits, stored.models)

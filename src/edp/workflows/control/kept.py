@@ -35,7 +35,7 @@ from edp.storage.headers import read_header
 from edp.storage.paths import entries_of, is_file_at
 from edp.storage.reading import Table
 from edp.storage.runs import missing_text
-from edp.training.bundle import as_damage, check_hash, read_arrays, with_plugins, write_arrays
+from edp.training.bundle import add_plugins, check_hash, convert_damage, read_arrays, write_arrays
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 
 KEPT, HEADER, MACHINE, TWIN = "controller", "controller.json", "machine.toml", "twin"
@@ -111,7 +111,7 @@ def keep_controller(
         "twin": twin is not None,
         "arrays": write_arrays(folder, "arrays", save_arrays({k: np.ascontiguousarray(v) for k, v in arrays.items()})),
     }
-    write_json(folder / HEADER, with_plugins(header))
+    write_json(folder / HEADER, add_plugins(header))
     for old in entries_of(folder, "arrays-*.safetensors"):
         if old.name != header["arrays"]["file"]:  # type: ignore[index]
             old.unlink(missing_ok=True)
@@ -130,7 +130,7 @@ def load_kept(run: str | Path) -> KeptController:
     folder = path / KEPT
     if not is_file_at(folder / HEADER):
         raise StorageError(missing_text(path, "control", "a run of edp control, or is one of an earlier version"))
-    with as_damage(folder):
+    with convert_damage(folder):
         header = read_header(folder / HEADER, ("schema",))
         if header["schema"] != SCHEMA:
             raise BundleError(
@@ -140,7 +140,7 @@ def load_kept(run: str | Path) -> KeptController:
         check_hash(header, folder / HEADER)
         channels = tuple(_channel(entry) for entry in header["channels"])
         arrays = load_arrays(read_arrays(folder, header["arrays"]))
-        valve_map = _checked(arrays, len(channels))
+        valve_map = _check_arrays(arrays, len(channels))
         rate = above(0.0, 1e6)
         if not rate.holds(header["rate_hz"]):
             raise ValueError(f"its rate_hz is {str(header['rate_hz'])[:40]}; {rate.rule('rate_hz')} must hold")
@@ -162,7 +162,7 @@ def _channel(entry: Table) -> Channel:
     return Channel(entry["name"], Kind(entry["kind"]), entry["description"])
 
 
-def _checked(arrays: Mapping[str, Array], channels: int) -> ValveMap | None:
+def _check_arrays(arrays: Mapping[str, Array], channels: int) -> ValveMap | None:
     """Return the valve map if present, after a check of shapes and values of all arrays."""
     ticks, rows = len(arrays["observed"]), len(arrays["strokes"])
     shapes = {"observed": (ticks, channels), "levers": (ticks, AXES), "strokes": (rows, AXES), "tip": (rows, AXES)}

@@ -88,7 +88,7 @@ def control_loops(
         keep_controller(run.path, bench.plant, bench.models, chosen.twin, (bench.tasks[0], results[0]))
         content = _content(experiment, bench.tasks, results)
         content.write(run.path)
-        provenance = replace(new_provenance(), seed=experiment.seed).with_entries(
+        provenance = replace(new_provenance(), seed=experiment.seed).add_entries(
             machine=content.machine,
             plant=content.plant if chosen.plant is None else str(chosen.plant),
             twin=str(chosen.twin or ""),

@@ -12,7 +12,7 @@ from edp.control.controllers import ControllerSpec
 from edp.errors import ConfigError
 from edp.settings.bounds import check_bounds, integer
 from edp.workflows.control.bench import ControlBench
-from edp.workflows.control.tune_gains import with_gains
+from edp.workflows.control.tune_gains import set_gains
 
 Array = NDArray[np.float64]
 
@@ -59,7 +59,7 @@ class TuningTransfer:
         return float(self.on_plant[int(np.argmin(self.on_model))] / self.on_plant.min())
 
 
-def drawn_settings(controller: ControllerSpec, spec: TransferSpec) -> list[ControllerSpec]:
+def draw_settings(controller: ControllerSpec, spec: TransferSpec) -> list[ControllerSpec]:
     """Return controllers with gains drawn uniformly from their space.
 
     Raises:
@@ -69,7 +69,7 @@ def drawn_settings(controller: ControllerSpec, spec: TransferSpec) -> list[Contr
         raise ConfigError("the controller has no gains to vary; give another one")
     rng = np.random.default_rng(spec.seed)
     rows = [{name: rng.uniform(*ends) for name, ends in controller.space.items()} for _ in range(spec.settings)]
-    return [with_gains(controller, row) for row in rows]
+    return [set_gains(controller, row) for row in rows]
 
 
 def costs_of(bench: ControlBench, settings: list[ControllerSpec]) -> Array:

@@ -111,11 +111,11 @@ def tune_gains(
                     f"'{run.file(TuningFile.NAME)}': got gains {listed(content.gains)}, expected {listed(space)}; "
                     f"{TuningFile.ADVICE}"
                 )
-            return Tuning(with_gains(experiment.controller, content.gains), content)
+            return Tuning(set_gains(experiment.controller, content.gains), content)
         study = Study(
             {name: Real(*ends) for name, ends in space.items()}, chosen.seed, SamplerSpec(kind=chosen.sampler)
         )
-        study.suggest({name: _within(getattr(experiment.controller, name), ends) for name, ends in space.items()})
+        study.suggest({name: _clip(getattr(experiment.controller, name), ends) for name, ends in space.items()})
         rows: list[TuningTrial] = []
         units = run.file(UNITS)
         tuned = DividedLoops(staying, units, f"{key} tuned on")
@@ -123,7 +123,7 @@ def tune_gains(
         for number in range(chosen.trials):
             trials.note(f"trial {number + 1}")
             trial = study.ask(1)[0]
-            spec = with_gains(experiment.controller, trial.values)
+            spec = set_gains(experiment.controller, trial.values)
             cost = bench.cost(spec, tuned)
             study.tell(trial.number, [cost])
             best = spec if not rows or cost < min(row.cost_mm for row in rows) else best
@@ -148,11 +148,11 @@ def tune_gains(
     return Tuning(best, content)
 
 
-def with_gains(spec: ControllerSpec, gains: Mapping[str, Any]) -> ControllerSpec:
+def set_gains(spec: ControllerSpec, gains: Mapping[str, Any]) -> ControllerSpec:
     """Return a controller with some of its options changed."""
     values = {name: float(np.round(value, 6)) for name, value in gains.items()}
     return cast(ControllerSpec, replace(cast(Any, spec), **values))
 
 
-def _within(value: float, ends: tuple[float, float]) -> float:
+def _clip(value: float, ends: tuple[float, float]) -> float:
     return float(min(max(value, ends[0]), ends[1]))

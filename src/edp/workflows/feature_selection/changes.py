@@ -11,7 +11,7 @@ from edp.data.screening.proposal import CLEAR
 from edp.recording import Recording
 
 
-def with_changes(
+def add_changes(
     settings: FeatureSettings, screening: ScreeningResult, recording: Recording, name: str
 ) -> FeatureSettings:
     """Return the set with a change of each channel over the span that the screening gives for it.

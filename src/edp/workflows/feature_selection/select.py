@@ -24,8 +24,8 @@ from edp.report import build_screening_page, write_screening_pictures
 from edp.signals import VOCABULARY, SignalMap
 from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.storage.provenance import command_line
-from edp.workflows.feature_selection.changes import with_changes
-from edp.workflows.feature_selection.trials import OnTrial, Trials, TrialSpec, try_feature_sets, with_differences
+from edp.workflows.feature_selection.changes import add_changes
+from edp.workflows.feature_selection.trials import OnTrial, Trials, TrialSpec, add_differences, try_feature_sets
 
 PROPOSED, DIFFERENCES, CHANGES, ALL = "proposed", "proposed + differences", "proposed + changes", "all candidates"
 # The file stays readable; the whole list is in `screening.json`.
@@ -119,19 +119,19 @@ def select_features(
     order, listeners = order or SelectionOrder(), listeners or Listeners()
     folder = check_writable(out)
     # Without a map all channels are read under the names of the files: a screening may judge each of them.
-    mapped = source if source.signal_map is not None or _lists_maps(source) else _taken_whole(source)
+    mapped = source if source.signal_map is not None or _lists_maps(source) else _read_all_columns(source)
     quality = mapped.inspect(listeners.logs, workers)
     recordings, notes = _read(mapped, quality)
     spec, more = _candidates(recordings[0], order)
     screening = screen(recordings, spec, listeners.on_progress)
-    notes += [*more, *_sampled(recordings, screening)]
+    notes += [*more, *_note_sampling(recordings, screening)]
     sets = _sets(screening, recordings[0])
     files = _write(folder, screening, quality, sets)
-    needed = _needed_map(source, screening, recordings[0])
+    needed = _make_map(source, screening, recordings[0])
     if needed is not None:
         files["map"] = folder / "map.toml"
         write_bytes(files["map"], needed.encode())
-    trials = _tried(mapped, folder, order, screening, sets, listeners.on_trial, workers)
+    trials = _try_sets(mapped, folder, order, screening, sets, listeners.on_trial, workers)
     if trials is not None:
         files["trials"] = folder / "trials"
     if order.pictures:
@@ -143,7 +143,7 @@ def select_features(
     return Selection(screening, quality, tuple(notes), sets, files, trials)
 
 
-def _sampled(recordings: Sequence[Recording], screening: ScreeningResult) -> list[str]:
+def _note_sampling(recordings: Sequence[Recording], screening: ScreeningResult) -> list[str]:
     """Note that a large data set was screened on a part of its rows."""
     total = sum(recording.samples for recording in recordings)
     if total <= MOST_ROWS:
@@ -157,7 +157,7 @@ def _lists_maps(source: DataSource) -> bool:
     return source.path.suffix == ".toml" and any(log.signal_map is not None for log in source.logs())
 
 
-def _taken_whole(source: DataSource) -> DataSource:
+def _read_all_columns(source: DataSource) -> DataSource:
     return source if source.stored else replace(source, signal_map=SignalMap(others=True))
 
 
@@ -213,10 +213,10 @@ def _sets(screening: ScreeningResult, first: Recording) -> dict[str, FeatureSett
     channels = (*(target for target in screening.targets if target not in names), *names)
     proposed = FeatureSettings(name=PROPOSED, channels=channels)
     sets = {PROPOSED: proposed}
-    differences = with_differences(proposed, first, DIFFERENCES)
+    differences = add_differences(proposed, first, DIFFERENCES)
     if differences.derived:
         sets[DIFFERENCES] = differences
-    changes = with_changes(proposed, screening, first, CHANGES)
+    changes = add_changes(proposed, screening, first, CHANGES)
     if changes.derived:
         sets[CHANGES] = changes
     sets[ALL] = FeatureSettings(name=ALL, channels=screening.channels)
@@ -281,7 +281,7 @@ def _settings_text(screening: ScreeningResult, name: str) -> str:
     return f"# Settings for a training on what edp screen proposed.\n# window: {why}\n\n{tomli_w.dumps(table)}"
 
 
-def _needed_map(source: DataSource, screening: ScreeningResult, first: Recording) -> str | None:
+def _make_map(source: DataSource, screening: ScreeningResult, first: Recording) -> str | None:
     """Return a signal map of the proposed channels if a training requires it."""
     if source.signal_map is not None or _lists_maps(source):
         return None
@@ -304,7 +304,7 @@ def _needed_map(source: DataSource, screening: ScreeningResult, first: Recording
     )
 
 
-def _tried(
+def _try_sets(
     source: DataSource,
     folder: Path,
     order: SelectionOrder,

@@ -157,7 +157,7 @@ def try_feature_sets(
     chosen, notes = _usable(sets, experiment, first)
     if not chosen:
         raise ConfigError("no feature set can be tried: " + "; ".join(notes))
-    drawn = _drawn(chosen, experiment, first, spec)
+    drawn = _draw_sets(chosen, experiment, first, spec)
     if len(drawn) < spec.random:
         notes.append(f"{len(drawn)} of {spec.random} random sets were drawn: there are no others of this size")
     chosen |= drawn
@@ -177,7 +177,7 @@ def try_feature_sets(
         tell(trial.name, done, len(planned), None)
         bundle = _train_trial(source, trial, partial(tell, trial.name, done, len(planned)))
         finished.setdefault(trial.name, []).append(_Finished.of(bundle, trial.run))
-    trials = _compared(finished, notes, experiment.task.horizons)
+    trials = _tabulate_trials(finished, notes, experiment.task.horizons)
     write_json(folder / FILE, trials.to_json())
     return trials
 
@@ -225,7 +225,7 @@ def train_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str
     return {}
 
 
-def with_differences(settings: FeatureSettings, recording: Recording, name: str) -> FeatureSettings:
+def add_differences(settings: FeatureSettings, recording: Recording, name: str) -> FeatureSettings:
     """Return the set with tick-to-tick changes of its cylinder pressures, as in FG2 (eq. 3.1)."""
     derived_sources = {entry.source for entry in settings.derived}
     candidates = [c for c in settings.channels if c not in derived_sources]
@@ -242,7 +242,7 @@ def _usable(sets: Sets, experiment: Experiment, first: Recording) -> tuple[dict[
         if isinstance(features, str) and features != "all" and features not in FEATURE_SETS:
             raise ConfigError(f"there is no feature set '{features}'{closest(features, [*FEATURE_SETS, 'all'])}")
         if isinstance(features, FeatureSettings) and experiment.task.mode is TargetMode.DELTA:
-            features, added = _with_targets(features, experiment.task.targets)
+            features, added = _add_targets(features, experiment.task.targets)
             if added:
                 notes.append(
                     f"{name}: {', '.join(added)} added, because mode = 'delta' needs the targets' present values"
@@ -262,13 +262,13 @@ def _inputs(features: str | FeatureSettings, first: Recording) -> tuple[str, ...
     return first.channel_names if features == "all" else FEATURE_SETS[features].inputs
 
 
-def _with_targets(features: FeatureSettings, targets: Sequence[str]) -> tuple[FeatureSettings, list[str]]:
+def _add_targets(features: FeatureSettings, targets: Sequence[str]) -> tuple[FeatureSettings, list[str]]:
     derived = {entry.name for entry in features.derived}
     added = [target for target in targets if target not in features.channels and target not in derived]
     return replace(features, channels=(*added, *features.channels)), added
 
 
-def _drawn(
+def _draw_sets(
     chosen: Mapping[str, str | FeatureSettings], experiment: Experiment, first: Recording, spec: TrialSpec
 ) -> dict[str, str | FeatureSettings]:
     """Return random sets with the number of channels of the first set, all different.
@@ -321,7 +321,9 @@ class _Finished:
         )
 
 
-def _compared(finished: Mapping[str, Sequence[_Finished]], notes: Sequence[str], horizons: Sequence[int]) -> Trials:
+def _tabulate_trials(
+    finished: Mapping[str, Sequence[_Finished]], notes: Sequence[str], horizons: Sequence[int]
+) -> Trials:
     """Return the table of the kept scores."""
     ahead = [str(horizon) for horizon in horizons]
     names = list(finished)

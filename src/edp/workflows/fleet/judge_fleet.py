@@ -40,7 +40,7 @@ from edp.storage.paths import files_below, full_path, status_of
 from edp.training import Bundle, load_bundle
 from edp.training.blas import one_blas_thread
 from edp.training.bundle import weights_digest
-from edp.training.delta import MOST_BYTES, read_delta, with_delta
+from edp.training.delta import MOST_BYTES, apply_delta, read_delta
 from edp.workflows.fleet.machines import MachineSource, StoredMachine, machines_of
 from edp.workflows.fleet.personal import read_fleet
 from edp.workflows.monitor import run_monitor
@@ -108,7 +108,7 @@ def report_fleet(
             ReportedTarget(name, KINDS[kind].report_unit)
             for name, kind in zip(task.targets, bundle.target_kinds, strict=True)
         ),
-        machines=tuple(_reported(machine, result) for machine, result in zip(machines, results, strict=True)),
+        machines=tuple(_make_report(machine, result) for machine, result in zip(machines, results, strict=True)),
     )
     write_json(folder / RESULT, report.to_json())
     facts = fleet_facts(report, full_path(Path(question.store)).name)
@@ -117,7 +117,7 @@ def report_fleet(
     return facts
 
 
-def _reported(machine: StoredMachine, result: UnitResult) -> ReportedMachine:
+def _make_report(machine: StoredMachine, result: UnitResult) -> ReportedMachine:
     if result.content is None:
         return ReportedMachine(machine.name, machine.minutes, failed=str(result.values["failed"]))
     return ReportedMachine(machine.name, machine.minutes, unpack(result.content, MachineErrors))
@@ -179,7 +179,7 @@ def _errors_of(bundle: Bundle, source: MachineSource, where: Mapping[str, str | 
     series = [task.series(recording) for recording in recordings]
     delta, monitor = where["delta"], where["monitor"]
     if delta is not None:
-        network = with_delta(network, read_delta(delta))
+        network = apply_delta(network, read_delta(delta))
     factor = np.array([KINDS[kind].report_factor for kind in bundle.target_kinds])
     errors = [np.abs(error) * factor for horizon, error in stream_errors(network, series) if horizon == 0]
     if not errors:

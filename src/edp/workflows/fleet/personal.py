@@ -29,7 +29,7 @@ from edp.storage.ledger import TrainingIdentity, WithState
 from edp.storage.paths import full_path, is_file_at
 from edp.storage.runs import Run, check_claimable, missing_text, run_key
 from edp.training.bundle import load_bundle, save_bundle, weights_digest
-from edp.training.delta import DELTA_BYTES, SUFFIX, delta_from_bytes, delta_of, read_delta, with_delta
+from edp.training.delta import DELTA_BYTES, SUFFIX, apply_delta, delta_from_bytes, delta_of, read_delta
 from edp.workflows.fleet.machines import MachineSource, StoredMachine, machines_of
 from edp.workflows.transfer import METHODS, FinetuneRequest, FinetuneSpec
 from edp.workflows.transfer.case import TransferCase
@@ -153,9 +153,9 @@ def network_of(folder: str | Path, machine: str, out: str | Path, base: str | Pa
         raise ConfigError(f"machine '{machine}' has no network of its own: {rows[machine].failed}")
     bundle = load_bundle(base or content.source)
     delta = read_delta(Path(folder, DELTAS, file_of(machine)))
-    own = with_delta(bundle.predictor, delta)
+    own = apply_delta(bundle.predictor, delta)
     strategy = {"method": "delta", "source": {"weights": delta.base}, **delta.facts}
-    provenance = bundle.provenance.with_entries(strategy=strategy)
+    provenance = bundle.provenance.add_entries(strategy=strategy)
     return save_bundle(replace(bundle, predictor=own, provenance=provenance, scores={}), out)
 
 
@@ -220,7 +220,7 @@ def tune_machine(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithSt
     errors = {
         "before": _errors(base.predictor, data),
         "full": _errors(network, data),
-        "delta": _errors(with_delta(base.predictor, delta), data),
+        "delta": _errors(apply_delta(base.predictor, delta), data),
     }
     facts_of_delta = {"bytes": len(content), "rank": delta.rank, "trained_min": facts["minutes"]}
     return WithState({**facts_of_delta, "mae": errors}, content)

@@ -134,7 +134,7 @@ def _add_network(top: Path, folder: Path, name: str) -> RegistryEntry:
         edp=__version__,
     )
     save_bundle(bundle, make_folder(top / FILES) / digest)
-    return _entered(top, entry)
+    return _write_entry(top, entry)
 
 
 def _add_fleet(top: Path, folder: Path, name: str) -> RegistryEntry:
@@ -173,14 +173,14 @@ def _add_fleet(top: Path, folder: Path, name: str) -> RegistryEntry:
         make_folder((target / file).parent)
         write_bytes(target / file, data)
     content.write(target)
-    return _entered(top, entry)
+    return _write_entry(top, entry)
 
 
 def _is_there(top: Path, digest: str) -> bool:
     return is_file_at(top / ENTRIES / f"{digest}.json")
 
 
-def _entered(top: Path, entry: RegistryEntry) -> RegistryEntry:
+def _write_entry(top: Path, entry: RegistryEntry) -> RegistryEntry:
     """Write an entry after all its files."""
     write_json(make_folder(top / ENTRIES) / f"{entry.id}.json", entry.to_table())
     return entry

@@ -60,7 +60,7 @@ from edp.training.provenance import training_provenance
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 from edp.wording import percent, typed
 from edp.workflows.identify.compare import FrontChannels, simulate_machine
-from edp.workflows.twin.prepare_twin import prepared_twin
+from edp.workflows.twin.prepare_twin import cut_recordings
 
 Doubles = NDArray[np.float64]
 KIND, RUN, RESULT, GREY_FOLDER = "identification", ".run", "identification.json", "grey"
@@ -142,7 +142,7 @@ def identify(
     base = load_machine(machine)
     progress.note("reading logs")
     recordings = source.read()
-    loaded = None if run is None else _of_run(run)
+    loaded = None if run is None else _read_run(run)
     settings = experiment or load_twin_experiment(None, ["twin.kind=greybox"])
     settings = loaded[1] if loaded is not None else settings
     grey = _whole_grey_box(settings.twin)
@@ -151,7 +151,7 @@ def identify(
             f"settings: twin.linkage = '{grey.linkage[:80]}' came; the linkage is that of --machine ({base.name}): "
             "leave twin.linkage out"
         )
-    channels, data = prepared_twin(recordings, settings)
+    channels, data = cut_recordings(recordings, settings)
     _check_strokes(channels, data, base)
     # What could not be judged, or holds no number, is refused before the fit of minutes.
     celsius, notes = _celsius(recordings, base)
@@ -163,13 +163,13 @@ def identify(
     key = run_key({"identify": TWIN_SETTINGS.plain(settings)} | made_of, data.digest)
     with Run.create(target.with_suffix(RUN), KIND, key, twin_toml(settings)) as opened:
         if loaded is None:
-            fitted = _fitted(opened, base, machine, grey, (channels, data, settings.training.seed), progress)
+            fitted = _fit_grey_box(opened, base, machine, grey, (channels, data, settings.training.seed), progress)
         else:
-            fitted = _informed(loaded[0], data, settings.training.seed)
+            fitted = _add_information(loaded[0], data, settings.training.seed)
         parts = parts_of(fitted.twin, base, celsius)
         notes += _notes(parts)
         progress.note("fitting the machine itself to free runs")
-        fit = _refined(opened, base, parts, fitted, (data, settings), progress)
+        fit = _refine_machine(opened, base, parts, fitted, (data, settings), progress)
         progress.note("asking what parts of the logs, and runs of other lengths, would say")
         spread = _stage(
             opened,
@@ -274,7 +274,7 @@ def _whole_grey_box(spec: TwinSpec | AutoTwin) -> GreyBox:
     return spec
 
 
-def _of_run(run: str | Path) -> tuple[GreyTwin, TwinExperiment]:
+def _read_run(run: str | Path) -> tuple[GreyTwin, TwinExperiment]:
     bundle = load_twin(run)
     if not isinstance(bundle.twin, GreyTwin):
         raise ConfigError(
@@ -285,7 +285,7 @@ def _of_run(run: str | Path) -> tuple[GreyTwin, TwinExperiment]:
     return bundle.twin, replace(load_twin_experiment(Path(run) / "config.toml"), twin=bundle.spec)
 
 
-def _fitted(
+def _fit_grey_box(
     run: Run, base: Machine, machine: str, spec: GreyBox, logs: tuple[TwinChannels, Prepared, int], progress: Progress
 ) -> _Fitted:
     """Return a grey box with the elements of an excavator front, fitted to the logs; `logs` ends with the seed.
@@ -313,7 +313,7 @@ def _fitted(
     return _Fitted(grey, _read_stage(run, GREY_STAGE, {"information": (count, count)})["information"])
 
 
-def _informed(twin: GreyTwin, data: Prepared, seed: int) -> _Fitted:
+def _add_information(twin: GreyTwin, data: Prepared, seed: int) -> _Fitted:
     """Return an earlier grey box with the information of free runs of its last stage."""
     problem, spec = GreyProblem(twin, data.train), twin.spec.fit
     rng, total = np.random.default_rng(seed), np.zeros((len(twin.numbers),) * 2)
@@ -324,7 +324,7 @@ def _informed(twin: GreyTwin, data: Prepared, seed: int) -> _Fitted:
     return _Fitted(twin, total / ROUNDS_THAT_INFORM)
 
 
-def _refined(
+def _refine_machine(
     run: Run,
     base: Machine,
     parts: GreyParts,
@@ -349,7 +349,7 @@ def _refined(
 
     count = len(own.begin)
     stage = _stage(run, "machine", {"theta": (count,), "information": (count, count)}, refine)
-    return _FittedMachine(twin.with_numbers(own.values(stage["theta"])), own, stage["theta"], stage["information"])
+    return _FittedMachine(twin.with_parameters(own.values(stage["theta"])), own, stage["theta"], stage["information"])
 
 
 def _machine(fit: _FittedMachine, spread: Doubles, data: Prepared) -> tuple[Machine, list[IdentifiedNumber], list[str]]:

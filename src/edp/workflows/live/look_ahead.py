@@ -49,7 +49,7 @@ class LiveNetwork(LivePart):
             self._stream.missed(missed)
         tick = self._stream.step(row[self._columns])
         self._tell(tick.status)
-        return self._shown(tick)
+        return self._make_row(tick)
 
     def at_once(self, rows: Row) -> Row | None:
         """Return predictions, see `LivePart`; rejected and held values are reported tick by tick."""
@@ -58,9 +58,9 @@ class LiveNetwork(LivePart):
             return None
         ticks = self._stream.steps(inputs)
         self._tell(ticks[-1].status)
-        return np.array([self._shown(tick) for tick in ticks])
+        return np.array([self._make_row(tick) for tick in ticks])
 
-    def _shown(self, tick: StreamTick) -> Row:
+    def _make_row(self, tick: StreamTick) -> Row:
         """Predictions by horizon and target, then lower and upper bounds."""
         if not tick.valid:
             return np.full(self.width, np.nan, np.float32)

@@ -70,7 +70,7 @@ class RerunMirror:
                 self._files.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True))
             )
             port, page = _free_ports(2)
-            self._process = _started(folder, port, page)
+            self._process = _start_server(folder, port, page)
             inner = f"rerun+http://{LOOPBACK}:{port}/proxy"
             self.address = f"http://{LOOPBACK}:{page}/?url={quote(inner, safe='')}"
             self._stream = rerun.RecordingStream("edp_live", send_properties=False)
@@ -156,7 +156,7 @@ def quiet_environment(folder: Path) -> dict[str, str]:
     return {**os.environ, **dict.fromkeys(places, str(folder))}
 
 
-def _started(folder: Path, port: int, page: int) -> subprocess.Popen[bytes]:
+def _start_server(folder: Path, port: int, page: int) -> subprocess.Popen[bytes]:
     """Rerun's server, once it listens."""
     variables, call = quiet_environment(folder), [str(_program())]
     quiet: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "env": variables}

@@ -62,7 +62,7 @@ class McapRecorder:
             for suffix, column in (("", one.column), (" low", one.lower), (" high", one.upper))
             if column is not None
         ]
-        self._facts.log(json.dumps(self._about()).encode(), log_time=0)
+        self._facts.log(json.dumps(self._describe()).encode(), log_time=0)
 
     def row(self, tick: int, row: NDArray[np.float32]) -> None:
         """Write a row of the session at its time."""
@@ -83,7 +83,7 @@ class McapRecorder:
         """Finish the file; without its end no reader takes it."""
         self._writer.close()
 
-    def _about(self) -> dict[str, object]:
+    def _describe(self) -> dict[str, object]:
         """Return the facts of `edp.logs.formats.edp_metadata.facts_text` without a digest, unknown until the end."""
         channels = [
             {"name": c.name, "unit": c.unit, "kind": str(c.kind), "description": c.description} for c in self._channels

@@ -12,7 +12,7 @@ import numpy as np
 from edp.errors import ConfigError, EdpError, brief
 from edp.live.addresses import LOOPBACK, resolve_bind
 from edp.live.layout import Forecast, LiveLayout, LiveTrace, label, sentence
-from edp.live.pace import Pace, checked_speed
+from edp.live.pace import Pace, check_speed
 from edp.live.saved import write_session_page
 from edp.live.session import HISTORY_BYTES, MOST_TEXT, LiveSession
 from edp.monitor.monitor_file import load_monitor
@@ -68,7 +68,7 @@ class LiveOrder:
 
     def __post_init__(self) -> None:
         check_bounds("the live view", self, free_s=span(0.1, MAX_FREE_S))
-        checked_speed(self.speed)
+        check_speed(self.speed)
         resolve_bind(self.host, "--bind")
 
 
@@ -136,7 +136,7 @@ class LiveRun:
             self._on_event("preparing", preparing)
         self.source = source or SOURCES[order.source].of(order.options, needs_of(models, order.monitor))
         try:
-            self._parts, layout = self._assembled(models)
+            self._parts, layout = self._assemble_parts(models)
             self.pace = Pace(self.source.rate_hz, order.speed)
             self.session = LiveSession(layout, order.history_bytes, preparing)
             self._bounds = RowBounds(self.source.channels)
@@ -183,14 +183,14 @@ class LiveRun:
         if not self._due:
             return
         rows, self._due = np.array(self._due), []
-        columns = [rows, *(self._computed(part, rows, missed) for part in self._parts)]
+        columns = [rows, *(self._compute_part(part, rows, missed) for part in self._parts)]
         self._ahead = 0
         for full in np.concatenate(columns, axis=1).astype(np.float32, copy=False):
             self.session.append(full)
             if self._recorder is not None:
                 self._recorder.row(self.session.ticks - 1, full)
 
-    def _computed(self, part: LivePart, rows: Row, missed: int) -> Row:
+    def _compute_part(self, part: LivePart, rows: Row, missed: int) -> Row:
         """Columns of a part for rows, shape (ticks, width), by one call of its model where that gives the same."""
         if not self._trusted and not isinstance(part, LiveFront):
             return np.full((len(rows), part.width), np.nan, np.float32)
@@ -233,7 +233,7 @@ class LiveRun:
     def play(self) -> None:
         """Give all rows of the source; returns when there are no more, the session is over, or something failed."""
         try:
-            ending = self._played()
+            ending = self._play_source()
         except EdpError as error:
             self._fail(error)
         except Exception as error:  # a fault of a source or a model: nobody would see what its thread raises
@@ -241,7 +241,7 @@ class LiveRun:
         else:
             self.session.end(ending)
 
-    def _played(self) -> str:
+    def _play_source(self) -> str:
         """Give all rows of the source; return why there are no more."""
         try:
             self.source.prepare()
@@ -275,7 +275,7 @@ class LiveRun:
             result.saved = write_session_page(self.session, self.order.save)
         return result
 
-    def _assembled(self, models: LiveModels) -> tuple[list[LivePart], LiveLayout]:
+    def _assemble_parts(self, models: LiveModels) -> tuple[list[LivePart], LiveLayout]:
         """Return the parts of a row after the source's own, and all columns."""
         source, order = self.source, self.order
         parts: list[LivePart] = []

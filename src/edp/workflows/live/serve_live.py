@@ -37,10 +37,10 @@ def run_live(
         EdpError: source, models, port or files cannot be used.
     """
     live = LiveRun(order, on_event, source)
-    mirror = _mirrored(live, on_mirror)
+    mirror = _start_mirror(live, on_mirror)
     playing = threading.Thread(target=live.play, name="edp-live-source", daemon=True)
     try:
-        asyncio.run(_served(live, playing, on_ready))
+        asyncio.run(_serve(live, playing, on_ready))
     finally:
         live.pace.stop()
         if playing.ident is not None:
@@ -53,7 +53,7 @@ def run_live(
     return result
 
 
-def _mirrored(live: LiveRun, on_mirror: Callable[[str], None] | None) -> RerunMirror | None:
+def _start_mirror(live: LiveRun, on_mirror: Callable[[str], None] | None) -> RerunMirror | None:
     if not live.order.rerun:
         return None
     try:
@@ -66,7 +66,7 @@ def _mirrored(live: LiveRun, on_mirror: Callable[[str], None] | None) -> RerunMi
     return mirror
 
 
-async def _served(live: LiveRun, playing: threading.Thread, on_ready: Callable[[LiveServer], None] | None) -> None:
+async def _serve(live: LiveRun, playing: threading.Thread, on_ready: Callable[[LiveServer], None] | None) -> None:
     stop, order = asyncio.Event(), live.order
     server = LiveServer(live.session, live.pace if live.source.steered else None, order.host, order.port)
 

@@ -15,7 +15,7 @@ from edp.monitor.diagnosis.causes import FaultClass
 from edp.monitor.diagnosis.evidence import ONSET, mean_features, parts_of
 from edp.monitor.diagnosis.learning import SimulatedFault, check_healthy_blocks, fit_dictionary
 from edp.monitor.diagnosis.signatures import Dictionary
-from edp.monitor.fitting import watched_blocks
+from edp.monitor.fitting import count_watched_blocks
 from edp.monitor.monitor import Monitor
 from edp.monitor.residuals.base import ONE_BY_ONE, SideBySide
 from edp.monitor.session_blocks import block_ticks
@@ -27,12 +27,12 @@ from edp.storage.reading import Table
 from edp.wording import typed
 from edp.workflows.monitor.fault_sessions import (
     FaultSession,
+    add_noise,
     cases_of,
     fault_classes,
     mirrors,
     noise_of,
     simulated,
-    with_noise,
 )
 
 Array = NDArray[np.float64]
@@ -94,7 +94,7 @@ def check_dictionary_inputs(
         return
     rate = healthy[0].rate_hz
     block = block_ticks(experiment.chain.block_s, healthy)
-    check_healthy_blocks(watched_blocks(experiment.chain, healthy)[:HEALTHY_SESSIONS])
+    check_healthy_blocks(count_watched_blocks(experiment.chain, healthy)[:HEALTHY_SESSIONS])
     if round((spec.before_s + spec.after_s) * rate) // block - int(spec.before_s * rate / block) <= ONSET:
         raise _too_short(block / rate)
     _check_machine([channel.name for channel in channels], machine, rate)
@@ -142,7 +142,7 @@ def build_dictionary(
     """
     began = time.process_time()
     _check_machine(monitor.inputs, machine, monitor.rate_hz)
-    rows = [monitor.conditioned_rows(session) for session in healthy[:HEALTHY_SESSIONS]]
+    rows = [monitor.condition_rows(session) for session in healthy[:HEALTHY_SESSIONS]]
     rows = [part[np.isfinite(part).any(axis=1)] for part in rows]
     if not rows:
         raise DataError("a dictionary needs healthy sessions that no network was fitted to; bring more")
@@ -221,8 +221,8 @@ def _draw(
     faults: list[SimulatedFault] = []
     done, sessions = 0, progress.stage("session", total)
     for session in simulated(classes, plan.machine, plan.seconds, (plan.seed, draw), monitor.rate_hz):
-        noisy = with_noise(session.recording, plan.added, [plan.seed, draw, session.base])
-        seen = _after(monitor, noisy, before), _shown(session, further, before)
+        noisy = add_noise(session.recording, plan.added, [plan.seed, draw, session.base])
+        seen = _average_blocks(monitor, noisy, before), _summarise_channels(session, further, before)
         if session.fault < 0:
             sound[session.base] = seen
             continue
@@ -232,27 +232,27 @@ def _draw(
         faults.append(SimulatedFault(draw, session.fault, session.size, change, shown))
         done += 1
         if session.fault in mirrored:
-            faults.append(SimulatedFault(draw, mirrored[session.fault], -session.size, _mirrored(change), shown))
+            faults.append(SimulatedFault(draw, mirrored[session.fault], -session.size, _mirror(change), shown))
         sessions.step(done)
-    return _standardised(faults, sound)
+    return _standardise(faults, sound)
 
 
-def _mirrored(change: Array) -> Array:
+def _mirror(change: Array) -> Array:
     """Return the change by a fault of the other sign: means change sign, sizes do not."""
     means, sizes = np.split(change, 2, axis=1)
     return np.concatenate([-means, sizes], axis=1)
 
 
-def _after(monitor: Monitor, recording: Recording, onset_s: float) -> Array:
+def _average_blocks(monitor: Monitor, recording: Recording, onset_s: float) -> Array:
     """Mean features of the blocks at an onset and of those after it, shape (2, features)."""
-    rows = monitor.conditioned_rows(recording)
+    rows = monitor.condition_rows(recording)
     at, after = parts_of(rows[int(onset_s / monitor.block_s) :])
     if at is None or after is None:
         raise _too_short(monitor.block_s)
     return np.stack([mean_features(at), mean_features(after)])
 
 
-def _shown(session: FaultSession, names: Sequence[str], onset_s: float) -> dict[str, Array]:
+def _summarise_channels(session: FaultSession, names: Sequence[str], onset_s: float) -> dict[str, Array]:
     """Return level, width and rate of change of further channels after an onset."""
     shown = {}
     first = round(onset_s * session.recording.rate_hz)
@@ -262,7 +262,7 @@ def _shown(session: FaultSession, names: Sequence[str], onset_s: float) -> dict[
     return shown
 
 
-def _standardised(
+def _standardise(
     faults: Sequence[SimulatedFault], sound: dict[int, tuple[Array, dict[str, Array]]]
 ) -> list[SimulatedFault]:
     """Return changes of further channels relative to their scatter between sound sessions."""

@@ -304,9 +304,9 @@ def golden_residuals(monitor: Monitor) -> GoldenResiduals:
     inputs[holes] = np.nan
     residuals, _ = monitor.residuals(inputs, monitor.initial_state())
     allowed_by, first = np.zeros(residuals.shape[1]), 0
-    filled = _filled(inputs, summaries.centre)
+    filled = _fill_missing(inputs, summaries.centre)
     for part in (part for source in monitor.sources for part in source_parts(source, _places(monitor))):
-        allowed = _allowed(part, filled)
+        allowed = _compute_tolerance(part, filled)
         allowed_by[first : first + len(allowed)] = allowed
         first += len(allowed)
     return GoldenResiduals(inputs, residuals, allowed_by.astype(np.float32))
@@ -316,7 +316,7 @@ def _places(monitor: Monitor) -> dict[str, int]:
     return {name: i for i, name in enumerate(monitor.inputs)}
 
 
-def _filled(rows: Rows, start: NDArray[np.float64]) -> Rows:
+def _fill_missing(rows: Rows, start: NDArray[np.float64]) -> Rows:
     """Return rows with missing values replaced by the last value."""
     filled, last = rows.copy(), start.astype(np.float32)
     for row in filled:
@@ -324,14 +324,14 @@ def _filled(rows: Rows, start: NDArray[np.float64]) -> Rows:
     return filled
 
 
-def _allowed(part: SourcePart, rows: Rows) -> NDArray[np.float64]:
+def _compute_tolerance(part: SourcePart, rows: Rows) -> NDArray[np.float64]:
     """Return the tolerance of residuals in C: that of the network's numbers; zero for sums and integers."""
     if isinstance(part, BalancePart):
         return np.zeros(len(part.levels))
     if isinstance(part, FlowPart):
         return np.zeros(len(part.chambers))
     if isinstance(part, TwinPart):
-        return _allowed_of_twin(part, rows)
+        return _compute_twin_tolerance(part, rows)
     network, ran = part.bundle.predictor, rows[part.first :: part.every]
     fed, judged = ran[:, part.reads], ran[:, part.judged]
     outputs = stream(network, fed)
@@ -351,7 +351,7 @@ def _allowed(part: SourcePart, rows: Rows) -> NDArray[np.float64]:
     return np.asarray((apart + largest / width * 0.5 * (off[upper] + off[lower])) / width)
 
 
-def _allowed_of_twin(part: TwinPart, rows: Rows) -> NDArray[np.float64]:
+def _compute_twin_tolerance(part: TwinPart, rows: Rows) -> NDArray[np.float64]:
     """Return the growth of single-precision errors while ports are free, group by group."""
     plant, fed = part.bundle.predictor, rows[:, part.reads]
     if not isinstance(plant, TwinPlant):

@@ -11,7 +11,7 @@ from edp.monitor.diagnosis.causes import AtFault, FaultClass
 from edp.recording import Recording
 from edp.sim import Scenario, Simulation
 from edp.sim.excitation import EXCITATIONS
-from edp.sim.faults import FAULTS, FaultSpec, MachineFault, at_site
+from edp.sim.faults import FAULTS, FaultSpec, MachineFault, insert_site
 from edp.sim.plan import DEFAULT_MIX
 
 SEGMENT_S = 20.0
@@ -52,7 +52,7 @@ def fault_classes(kinds: Sequence[str] | None = None) -> tuple[FaultClass, ...]:
         kind = FAULTS[name]
         at_fault: AtFault = "machine" if isinstance(kind, MachineFault) else "sensor"
         for site in kind.sites or ("",):
-            words = at_site(kind.words, site)
+            words = insert_site(kind.words, site)
             for sign in (1.0, -1.0) if kind.signed else (1.0,):
                 sizes = tuple(sign * size for size in kind.ladder)
                 part = kind.component(site)
@@ -145,7 +145,7 @@ def noise_of(recording: Recording, names: Sequence[str]) -> Mapping[str, float]:
     return sizes
 
 
-def with_noise(recording: Recording, sizes: Mapping[str, float], seed: Sequence[int]) -> Recording:
+def add_noise(recording: Recording, sizes: Mapping[str, float], seed: Sequence[int]) -> Recording:
     """Return a recording with white noise added to channels that the simulator gives without noise."""
     values = recording.values.copy()
     for n, name in enumerate(sorted(sizes)):

@@ -22,7 +22,7 @@ from edp.monitor.monitor import Monitor
 from edp.monitor.monitor_file import load_monitor, save_monitor
 from edp.monitor.residuals.base import ONE_BY_ONE, FitMaterial, ResidualSource, ResidualSpec, SideBySide
 from edp.monitor.residuals.flow_balances import FlowBalances
-from edp.monitor.residuals.groups import Group, sensed_channels
+from edp.monitor.residuals.groups import Group, select_sensed
 from edp.monitor.residuals.virtual_sensors import VirtualSensorsSpec
 from edp.monitor.session_blocks import SessionBlocks, session_means
 from edp.progress import SILENT, Progress
@@ -202,7 +202,7 @@ def fit_to_recordings(
             better = fit_to_recordings(left, experiment, bundles, progress, True, side_by_side)
             seconds = time.process_time() - began
             return replace(better, doubtful=(*trained, *better.doubtful), seconds=seconds)
-    monitor = _assembled(material, sources, fitted, sessions, rest)
+    monitor = _assemble_monitor(material, sources, fitted, sessions, rest)
     # Validation sessions set no limit.
     minutes = 60.0 * float(monitor.provenance["hours"])
     fit_s = time.process_time() - began + (side_by_side.seconds if isinstance(side_by_side, UnitMap) else 0.0)
@@ -211,12 +211,12 @@ def fit_to_recordings(
     measured["healthy_range"] = healthy_range(fitted)
     healthy = [session for session in rest if session.name not in fitted.doubtful]
     provenance = dict(monitor.provenance) | measured | {"seconds": time.process_time() - began}
-    monitor = _with_dictionary(replace(monitor, provenance=provenance), healthy, experiment, progress, side_by_side)
+    monitor = _add_dictionary(replace(monitor, provenance=provenance), healthy, experiment, progress, side_by_side)
     alone = _fits_one_machine(experiment, sources)
     return FittedMonitor(monitor, fitted.doubtful, time.process_time() - began, None, fitted.sessions, alone)
 
 
-def _assembled(
+def _assemble_monitor(
     material: FitMaterial,
     sources: tuple[ResidualSource, ...],
     fitted: FittedChain,
@@ -241,7 +241,7 @@ def _assembled(
     )
 
 
-def _with_dictionary(
+def _add_dictionary(
     monitor: Monitor,
     healthy: Sequence[Recording],
     experiment: MonitorExperiment,
@@ -259,7 +259,7 @@ def _with_dictionary(
     return replace(monitor, diagnosis=dictionary)
 
 
-def watched_channels(recordings: Sequence[Recording], experiment: MonitorExperiment) -> tuple[Channel, ...]:
+def select_watched(recordings: Sequence[Recording], experiment: MonitorExperiment) -> tuple[Channel, ...]:
     """Return the channels that all recordings hold and sensors can measure, or those of the settings.
 
     Raises:
@@ -279,7 +279,7 @@ def watched_channels(recordings: Sequence[Recording], experiment: MonitorExperim
                 hint = closest(name, recording.channel_names)
                 raise DataError(f"healthy log '{recording.name}' has no channel '{name}'{hint}")
     shared = set(first.channel_names).intersection(*(recording.channel_names for recording in recordings))
-    offered = [channel for channel in sensed_channels(first.channels) if channel.name in shared]
+    offered = [channel for channel in select_sensed(first.channels) if channel.name in shared]
     chosen = experiment.channels or tuple(channel.name for channel in offered)
     channels = tuple(channel for channel in first.channels if channel.name in chosen)
     if len(channels) < 2:
@@ -411,7 +411,7 @@ def _healthy_sessions(recordings: Sequence[Recording], experiment: MonitorExperi
         ConfigError: a dictionary that cannot be.
     """
     check_dictionary(experiment.dictionary)
-    channels = watched_channels(recordings, experiment)
+    channels = select_watched(recordings, experiment)
     _check_values(recordings, channels)
     sessions = _enough_sessions(recordings)
     order = np.random.default_rng(experiment.seed).permutation(len(sessions)).tolist()

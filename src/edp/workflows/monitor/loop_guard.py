@@ -14,7 +14,7 @@ from edp.errors import ConfigError
 from edp.monitor.alarms import MonitorAlarm
 from edp.monitor.monitor import Monitor, MonitorStream
 from edp.monitor.monitor_file import load_monitor
-from edp.sim.faults.shown import falsified_channels
+from edp.sim.faults.shown import list_falsified
 from edp.wording import typed
 
 Array = NDArray[np.float64]
@@ -90,19 +90,19 @@ class MonitorGuard:
         cause = alarm.causes[0] if alarm.causes else None
         sure = cause is not None and cause.probability >= SURE
         if cause is not None and sure and cause.at_fault == "sensor":
-            falsified = frozenset(falsified_channels(cause.kind, cause.site)) & self._names
+            falsified = frozenset(list_falsified(cause.kind, cause.site)) & self._names
             if falsified:
                 reason = f"sensor fault, {cause.kind}, probability {cause.probability:.2f}"
                 return GuardVerdict(falsified, bool(falsified & {*STROKES}), reason)
         if cause is not None and sure and cause.at_fault == "machine":
             # Sensors tell the truth, and the model is of another machine.
             return GuardVerdict(frozenset(), True, f"fault of the machine, {cause.kind}")
-        names, share = suspected(alarm, judged_by(self.monitor))
+        names, share = suspected(alarm, list_evaluated_channels(self.monitor))
         suspects = (frozenset(names) & self._names) - {*STROKES}
         return GuardVerdict(suspects, not suspects or share < EXPLAINED, f"alarm of the monitor, {alarm.detector}")
 
 
-def judged_by(monitor: Monitor) -> dict[str, tuple[str, ...]]:
+def list_evaluated_channels(monitor: Monitor) -> dict[str, tuple[str, ...]]:
     """Return the judged channels of each residual by its name."""
     return {
         name: judged for source in monitor.sources for name, judged in zip(source.names, source.judged, strict=True)
@@ -117,7 +117,7 @@ def suspected(alarm: MonitorAlarm, judged: Mapping[str, tuple[str, ...]]) -> tup
 
     Args:
         alarm: with its evidence.
-        judged: see `judged_by`.
+        judged: see `list_evaluated_channels`.
     """
     squares: dict[str, float] = {}
     for summary, deviation in alarm.evidence:

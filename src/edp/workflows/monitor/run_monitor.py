@@ -152,7 +152,7 @@ def run_monitor(
     key = run_key({"monitor": model_digest(folder)}, origin.digest or "")
     with Run.create(out, "monitor run", key) as opened:
         run = _watch_all(monitor, folder, recordings, opened.file(UNITS), progress, workers)
-        provenance = new_provenance(origin).with_entries(monitor=str(folder))
+        provenance = new_provenance(origin).add_entries(monitor=str(folder))
         write_json(opened.file(PROVENANCE), provenance.to_table())
         _write(run, opened.path, str(folder))
     forget_units(opened.file(UNITS))

@@ -2,7 +2,7 @@
 
 import edp.workflows.parity.forms  # noqa: F401, enters them
 from edp.workflows.parity.base import FORMS, Broken, Missing, ParityCase, Ran, Row
-from edp.workflows.parity.compare import compare, golden_case, recorded_case
+from edp.workflows.parity.compare import compare, golden_case, record_case
 from edp.workflows.parity.consent import WHAT, from_own_run
 
 __all__ = [
@@ -16,5 +16,5 @@ __all__ = [
     "compare",
     "from_own_run",
     "golden_case",
-    "recorded_case",
+    "record_case",
 ]

@@ -14,7 +14,7 @@ import numpy as np
 
 from edp.export.golden import SHARE, Rows, at_thresholds, stream
 from edp.registry import Registry
-from edp.sandbox.environment import BUILD_NAMES, reduced_environment
+from edp.sandbox.environment import BUILD_NAMES, reduce_environment
 from edp.training.bundle import Bundle
 
 NAME = "predictor"
@@ -181,7 +181,7 @@ def called(command: Sequence[object], folder: Path, feed: bytes = b"") -> bytes:
         Broken: it failed; the text ends with what it said last.
     """
     # A bundle's author may have written what runs here: it sees no secret of this process's environment.
-    environment = reduced_environment(BUILD_NAMES)
+    environment = reduce_environment(BUILD_NAMES)
     line = [str(part) for part in command]
     done = subprocess.run(line, cwd=folder, input=feed, capture_output=True, env=environment)
     if done.returncode:

@@ -45,7 +45,7 @@ def _length(bundle: Bundle) -> int:
     return predictor.window + round(FREE_S * bundle.task.rate_hz) if isinstance(predictor, TwinPlant) else TICKS
 
 
-def recorded_case(bundle: Bundle, source: DataSource, ticks: int | None = None) -> ParityCase:
+def record_case(bundle: Bundle, source: DataSource, ticks: int | None = None) -> ParityCase:
     """Return a case of the first ticks of each recording of a source, in equal parts, one after another.
 
     A plant runs free on the commands, after a measured prefix.

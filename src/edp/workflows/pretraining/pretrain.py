@@ -7,7 +7,7 @@ from pathlib import Path
 
 from edp import __version__
 from edp.config.experiment import Experiment, plain_tree
-from edp.data.episodes import by_machine
+from edp.data.episodes import group_by_machine
 from edp.data.prepared import Prepared
 from edp.data.splits import ByMachine
 from edp.errors import BundleError, ConfigError
@@ -168,7 +168,7 @@ def _carrying(experiment: Experiment, episodic: bool, rate_hz: float) -> Experim
 
 
 def _result(order: Pretrain, experiment: Experiment, data: Prepared, contexts: Contexts) -> FoundationFile:
-    parts = {part: by_machine(getattr(data, part)) for part in ("train", "validation", "test")}
+    parts = {part: group_by_machine(getattr(data, part)) for part in ("train", "validation", "test")}
     return FoundationFile(
         edp=__version__,
         method=order.method,

@@ -50,10 +50,10 @@ def choose_targets(proposal: MapProposal) -> tuple[tuple[str, ...], list[str]]:
     Raises:
         DataError: nothing moves.
     """
-    measured = proposal.of_role("measured")
+    measured = proposal.select_role("measured")
     notes = []
     if not measured:
-        measured = proposal.of_role("command", "reference")
+        measured = proposal.select_role("command", "reference")
         if not measured:
             texts = len(proposal.look.texts)
             unread = f", and {texts} that hold text" if texts else ""
@@ -67,7 +67,7 @@ def choose_targets(proposal: MapProposal) -> tuple[tuple[str, ...], list[str]]:
     # A change of another column is a velocity, whatever its unit.
     changes = [guess for guess in measured if guess.relation is not None and guess.relation.how == "change"]
     # Where one of a row of axes shows it, its brothers are velocities, too.
-    families = {_stem(guess.column) for guess in changes} | _beside_changes(changes, proposal)
+    families = {_stem(guess.column) for guess in changes} | _find_related_columns(changes, proposal)
     changes = [guess for guess in measured if guess in changes or {guess.column, _stem(guess.column)} & families]
     by_kind = [[g for g in measured if g.kind.kind in kinds] for kinds in _TARGETS]
     chosen = next((guesses for guesses in [by_kind[0], by_kind[1], changes, *by_kind[2:]] if guesses), list(measured))
@@ -81,19 +81,19 @@ def _stem(name: str) -> str:
     return name.rstrip("0123456789") or name
 
 
-def _beside_changes(changes: Sequence[ColumnGuess], proposal: MapProposal) -> set[str]:
+def _find_related_columns(changes: Sequence[ColumnGuess], proposal: MapProposal) -> set[str]:
     """Return columns named like known changes: v_boom for s_boom, if v_arm is the change of s_arm."""
     columns = [guess.column for guess in proposal.columns]
     named = set[str]()
     for change in changes:
         other = "" if change.relation is None else change.relation.other
-        ahead, of = _without_shared_end(change.column, other)
+        ahead, of = _drop_common_suffix(change.column, other)
         if ahead and of and len(ahead) < len(change.column):
             named |= {name for name in columns if name.startswith(ahead) and of + name[len(ahead) :] in columns}
     return named
 
 
-def _without_shared_end(one: str, other: str) -> tuple[str, str]:
+def _drop_common_suffix(one: str, other: str) -> tuple[str, str]:
     """Two names without the letters that end both."""
     shared = 0
     while shared < min(len(one), len(other)) and one[-1 - shared] == other[-1 - shared]:
@@ -182,7 +182,7 @@ def propose_plant(proposal: MapProposal, targets: Sequence[str], inputs: Sequenc
         inputs: channels that command, where no kind tells it.
     """
     kinds = {guess.channel: guess.kind.kind for guess in proposal.columns if guess.channel}
-    commands = [guess.channel for guess in proposal.of_role("command")]
+    commands = [guess.channel for guess in proposal.select_role("command")]
     if not commands:
         return PlantProposal(
             why_not="no column looks like a command: record what moves the machine (valve current, pilot pressure, "
@@ -197,31 +197,31 @@ def propose_plant(proposal: MapProposal, targets: Sequence[str], inputs: Sequenc
         return PlantProposal(assignments | ({"velocities": tuple(targets)} if Kind.GENERIC in answers else {}))
     if not answers <= {*RATE_OF}:
         return PlantProposal(
-            why_not=f"it answers with positions or speeds, and {_shown(targets)} are none: record one, or give what "
+            why_not=f"it answers with positions or speeds, and {_list_names(targets)} are none: record one, or give what "
             "shall answer the kind generic in the map and name it, edp twin --set 'channels.velocities=[...]'"
         )
-    return _of_positions(proposal, kinds, commands, assignments)
+    return _propose_from_positions(proposal, kinds, commands, assignments)
 
 
-def _of_positions(
+def _propose_from_positions(
     proposal: MapProposal, kinds: dict[str, Kind], commands: Sequence[str], assignments: dict[str, tuple[str, ...]]
 ) -> PlantProposal:
     """Propose a plant model without measured velocities: `edp twin` differentiates the positions."""
     asked = [name for name, kind in kinds.items() if kind in INTEGRAL]
     if asked:  # one that is no answer, or the answers to predict would be velocities
         return PlantProposal(
-            why_not=f"it would take {_shown(asked)}, which no measurement follows, for an answer: record the speed "
+            why_not=f"it would take {_list_names(asked)}, which no measurement follows, for an answer: record the speed "
             "itself, or give this column the kind generic in the map"
         )
     if not assignments["commands"] and not any(kinds[name] in COMMANDS for name in commands):
         assignments = {"commands": tuple(commands)}
-    measured = tuple(guess.channel for guess in proposal.of_role("measured") if guess.kind.kind in RATE_OF)
+    measured = tuple(guess.channel for guess in proposal.select_role("measured") if guess.kind.kind in RATE_OF)
     others = [
         name for name, kind in kinds.items() if kind in RATE_OF and name not in (*measured, *assignments["commands"])
     ]
     return PlantProposal(assignments | ({"strokes": measured} if others else {}))
 
 
-def _shown(names: Sequence[str]) -> str:
+def _list_names(names: Sequence[str]) -> str:
     more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
     return ", ".join(names[:_LISTED]) + more

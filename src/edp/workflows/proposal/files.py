@@ -93,7 +93,7 @@ def settings_text(
     )
 
 
-def named_paths(paths: Sequence[Path]) -> list[tuple[Path, str]]:
+def name_paths(paths: Sequence[Path]) -> list[tuple[Path, str]]:
     """Return the paths that a data-set file can list, each with a unique name."""
     # A data-set file expands environment variables in paths.
     usable = [path for path in paths if "$" not in str(full_path(path)) and str(path).isprintable()]

@@ -16,7 +16,7 @@ from edp.logs.proposal.experiments import Experiments, part_experiments
 from edp.logs.proposal.frames import refuse_frames
 from edp.logs.proposal.groups import LogGroup, group_logs
 from edp.logs.proposal.propose import ColumnGuess, MapProposal, propose_map
-from edp.logs.proposal.shapes import beside_notes, pace_notes, shape_notes
+from edp.logs.proposal.shapes import note_ignored_files, pace_notes, shape_notes
 from edp.logs.proposal.timing import Timing, repair_table, timing_of
 from edp.logs.read import find_recordings
 from edp.logs.source import DataSource
@@ -34,7 +34,7 @@ from edp.workflows.proposal.files import (
     check_files,
     data_set_text,
     map_table,
-    named_paths,
+    name_paths,
     remarks_of,
     settings_text,
     toml_text,
@@ -118,7 +118,7 @@ class LogsProposal:
 
 def _untold_inputs(proposal: MapProposal) -> tuple[str, ...]:
     """Return command channels if all are generic; none if a name contains the comma that separates names."""
-    commands = proposal.of_role("command")
+    commands = proposal.select_role("command")
     names = tuple(guess.channel for guess in commands)
     plain = all(guess.kind.kind is Kind.GENERIC for guess in commands) and not any("," in name for name in names)
     return names if plain else ()
@@ -142,7 +142,7 @@ def propose(path: str | Path | Sequence[str | Path], progress: Progress = SILENT
     for one in source.paths:
         if one.suffix.lower() == ".toml":
             raise ConfigError(f"'{one}' is a data-set file; give the log or the folder of logs that it is to describe")
-    paths, copies = _without_copies(list(dict.fromkeys(file for one in source.paths for file in find_recordings(one))))
+    paths, copies = _drop_copies(list(dict.fromkeys(file for one in source.paths for file in find_recordings(one))))
     groups, broken = group_logs(paths, progress)
     experiments, others = part_experiments(groups[0]), tuple(groups[1:])
     group = groups[0] if experiments is None else experiments.group
@@ -150,8 +150,8 @@ def propose(path: str | Path | Sequence[str | Path], progress: Progress = SILENT
     proposal = propose_map(group.looks[0], group.common, group.looks[1:])
     pairs = _side_by_side(proposal)
     if pairs:
-        return _of_pairs(source, group, others, broken, proposal, pairs)
-    proposal, timing = _timed(group, proposal)
+        return _propose_from_pairs(source, group, others, broken, proposal, pairs)
+    proposal, timing = _set_rate(group, proposal)
     notes = [*_notes(group, others, broken, proposal), *timing.notes]
     if copies:
         shown = ", ".join(f"{copy.name[:40]} (as {first.name[:40]})" for copy, first in copies[:3])
@@ -162,9 +162,9 @@ def propose(path: str | Path | Sequence[str | Path], progress: Progress = SILENT
     notes += [
         *more,
         *pace_notes(proposal.look, proposal.clock, chosen),
-        *(note for one in source.paths for note in beside_notes(one, paths)),
+        *(note for one in source.paths for note in note_ignored_files(one, paths)),
     ]
-    channels = [guess.channel for guess in proposal.of_role("reference", "command", "measured")]
+    channels = [guess.channel for guess in proposal.select_role("reference", "command", "measured")]
     if len(channels) > MOST_FEATURES:
         notes.append(
             f"of {count_of(len(channels), 'moving channel')} the first {MOST_FEATURES} are features (task.features)"
@@ -174,7 +174,7 @@ def propose(path: str | Path | Sequence[str | Path], progress: Progress = SILENT
     if experiments is not None:
         tests = experiments.tests()
         split, why = ({"kind": "recordings", "test": tests}, []) if tests else (split, why)
-        why = [*why, *_of_experiments(experiments, tests)]
+        why = [*why, *_note_experiments(experiments, tests)]
     notes += why
     files = {
         MAP: toml_text(map_table(proposal.signal_map), remarks_of(source.paths, proposal)),
@@ -202,7 +202,7 @@ def _recordings(
 ) -> list[tuple[Path, dict[str, object]]]:
     """Return the logs of a group as entries of a data set; an experiment has a map that names its variable."""
     if experiments is None:
-        return [(path, {"path": str(full_path(path)), "name": name}) for path, name in named_paths(group.paths)]
+        return [(path, {"path": str(full_path(path)), "name": name}) for path, name in name_paths(group.paths)]
     columns = map_table(proposal.signal_map)
     named = zip(group.paths, experiments.entries, experiments.names())
     return [
@@ -211,7 +211,7 @@ def _recordings(
     ]
 
 
-def _of_experiments(experiments: Experiments, tests: Sequence[str]) -> list[str]:
+def _note_experiments(experiments: Experiments, tests: Sequence[str]) -> list[str]:
     """Return notes on parallel experiments."""
     parted = f", of which {len(tests)} test by their name" if tests else ""
     other = f"other columns: {', '.join(experiments.others[:3])}; give such logs on their own"
@@ -221,7 +221,7 @@ def _of_experiments(experiments: Experiments, tests: Sequence[str]) -> list[str]
     ]
 
 
-def _without_copies(paths: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, Path]]]:
+def _drop_copies(paths: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, Path]]]:
     """Return the logs without copies, and each copy with the log that it repeats byte for byte.
 
     A test on a copy of what trained says nothing.
@@ -243,7 +243,7 @@ def _without_copies(paths: Sequence[Path]) -> tuple[list[Path], list[tuple[Path,
     return single, copies
 
 
-def _timed(group: LogGroup, proposal: MapProposal) -> tuple[MapProposal, Timing]:
+def _set_rate(group: LogGroup, proposal: MapProposal) -> tuple[MapProposal, Timing]:
     """Return a proposal with one rate for logs with several rates, and the required repairs."""
     mapped = [guess.column for guess in proposal.columns if guess.channel]
     timing = timing_of(group.looks, proposal.clock, mapped)
@@ -321,7 +321,7 @@ def _side_by_side(proposal: MapProposal) -> dict[str, dict[str, ColumnGuess]]:
     return sets if len(sets) == 2 and len(trains) == 1 and stems[0] == stems[1] else {}
 
 
-def _of_pairs(
+def _propose_from_pairs(
     source: DataSource,
     group: LogGroup,
     others: tuple[LogGroup, ...],
@@ -333,7 +333,7 @@ def _of_pairs(
     train = next(ending for ending in pairs if ending in _TRAINS)
     test = next(ending for ending in pairs if ending != train)
     recordings = []
-    for path, name in named_paths(group.paths):
+    for path, name in name_paths(group.paths):
         for ending in (train, test):
             renamed = [(stem, guess) for stem, guess in pairs[ending].items()]
             entries = tuple(
@@ -347,8 +347,8 @@ def _of_pairs(
     renamed_columns = tuple(replace(guess, channel=stem) for stem, guess in pairs[train].items())
     renamed_proposal = replace(proposal, columns=renamed_columns)
     targets, notes = choose_targets(renamed_proposal)
-    repairs = _timed(group, proposal)[1].shared
-    channels = [guess.channel for guess in renamed_proposal.of_role("reference", "command", "measured")]
+    repairs = _set_rate(group, proposal)[1].shared
+    channels = [guess.channel for guess in renamed_proposal.select_role("reference", "command", "measured")]
     tests = [str(one["name"]) for one in recordings if str(one["name"]).endswith(f"_{test}")]
     files = {
         DATA: data_set_text(recordings),

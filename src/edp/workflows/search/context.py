@@ -14,7 +14,7 @@ from edp.config.experiment import Table
 from edp.errors import ConfigError, DataError, closest
 from edp.evaluation.study import Decision, facts_of_kind
 from edp.stats.folds import repeated_folds, repeated_splits
-from edp.workflows.search.modules import with_modules
+from edp.workflows.search.modules import add_modules
 from edp.workflows.search.settings import SearchSpec
 from edp.workflows.search.space import WIDTHS, Candidate
 from edp.workflows.search.trainings import Outcome, TrainingRequest
@@ -93,7 +93,7 @@ class SearchContext:
 
     def network(self, settings: Table, names: Sequence[str] = (), options: Candidate | None = None) -> Table:
         """Return settings with modules and toggles added, and this search's widths."""
-        return with_modules(settings, names, self.channels, options, self.shaped)
+        return add_modules(settings, names, self.channels, options, self.shaped)
 
     def orders(self, settings: Table, runs: Sequence[int], seed: int = 0) -> list[TrainingRequest]:
         """Return one request per run: the same folds and seeds for every arm (common random numbers).
@@ -191,13 +191,13 @@ def set_apart(
     free = [name for name in sessions if name not in spec.second]
     named = tuple(name for name in sessions if name in spec.test)
     # The seed differs from all others of the search, so that the same draw never serves two purposes.
-    test = named or _drawn(free, families, [spec.seed, 0x7E57], max(1, round(spec.test_share * len(sessions))))
+    test = named or _draw_sessions(free, families, [spec.seed, 0x7E57], max(1, round(spec.test_share * len(sessions))))
     rest = [name for name in free if name not in test]
     second: tuple[str, ...] = ()
     if spec.compression.on:
         count = max(1, round(spec.second_share * len(sessions)))
         named = tuple(name for name in sessions if name in spec.second)
-        second = named or _drawn(rest, families, [spec.seed, 0x7E58], count)
+        second = named or _draw_sessions(rest, families, [spec.seed, 0x7E58], count)
     development = tuple(name for name in sessions if name not in (*test, *second))
     if not _fills_folds(len(development), spec):
         less = "a smaller test_share" + (", --set search.compression.on=false" if second else "")
@@ -211,7 +211,7 @@ def set_apart(
     return development, test, second
 
 
-def _drawn(
+def _draw_sessions(
     sessions: Sequence[str], families: Mapping[str, str], seed: list[int], session_count: int
 ) -> tuple[str, ...]:
     rng = np.random.default_rng(seed)

@@ -143,7 +143,7 @@ class Dispatcher:
         records = complete(
             self.ledger,
             self.executor,
-            [self._begun(request) for request in batch.values()],
+            [self._make_job(request) for request in batch.values()],
             lambda record, trained: self.on_record(record, batch[record.key], trained),
         )
         self.teacher_keys.update(key for key, request in batch.items() if request.recipe is not None)
@@ -155,7 +155,7 @@ class Dispatcher:
     def _job(self, request: TrainingRequest) -> Job:
         return job_of(request, self.data, self.threads, self.seconds, self.memory_mb)
 
-    def _begun(self, request: TrainingRequest) -> Job:
+    def _make_job(self, request: TrainingRequest) -> Job:
         """Return the job of a request with its start state, if it has one."""
         job = self._job(request)
         if self.ledger.finished(job.key):

@@ -29,7 +29,7 @@ def export_study(folder: str | Path, path: str | Path | None = None) -> tuple[Pa
     """
     study = read_study(folder)
     file = Path(folder, JOURNAL) if path is None else Path(path)
-    studies = ended_studies(study)
+    studies = list_ended_studies(study)
     if not studies:
         raise StorageError(
             f"'{folder}' has asked no questions yet: phase 1 (calibration) has not ended; go on with edp search, then "
@@ -39,7 +39,7 @@ def export_study(folder: str | Path, path: str | Path | None = None) -> tuple[Pa
     return file, [one.name for one in studies]
 
 
-def ended_studies(study: StudyFile) -> list[FinishedStudy]:
+def list_ended_studies(study: StudyFile) -> list[FinishedStudy]:
     """Return the finished studies of phases 1, 4 and 5."""
     space, cost = space_of(study.spec["space"]), study.spec["cost"]
     score = f"composite, {study.unit}"

@@ -147,7 +147,7 @@ def title_of(name: str) -> str:
     return part_of(name).title
 
 
-def with_modules(
+def add_modules(
     settings: Table,
     names: Iterable[str],
     channels: Sequence[str] = (),
@@ -171,7 +171,7 @@ def with_modules(
     reasons = conflicts(settings, module_names, channels)
     if reasons:
         raise ConfigError("modules: " + "; ".join(reasons))
-    changed_settings = _added(settings, module_names)
+    changed_settings = _add_modules(settings, module_names)
     if shape is not None:
         changed_settings = shape(changed_settings)
     for name in (name for name in MODULES if name in module_names):
@@ -191,7 +191,7 @@ def options_of(settings: Table, name: str, shape: Shape | None = None) -> dict[s
     Args:
         settings: to which the module would be added; what it would have there is one of the values.
         name: of the module, or of a toggle, which has none.
-        shape: as in `with_modules`.
+        shape: as in `add_modules`.
     """
     options = {key: tuple(option.values) for key, option in _options(settings, name, shape).items()}
     return {key: Choice(values) for key, values in options.items() if len(values) > 1}
@@ -225,7 +225,7 @@ def _options(settings: Table, name: str, shape: Shape | None = None) -> dict[str
     module, options = part_of(name), {}
     if not module.options:
         return {}  # a search asks for those of every module thousands of times
-    plain = plain_tree(build(Experiment, _added(settings, {name}), f"with {name}"))
+    plain = plain_tree(build(Experiment, _add_modules(settings, {name}), f"with {name}"))
     if shape is not None:
         plain = shape(plain)
     for joined_key, values in module.options.items():
@@ -274,7 +274,9 @@ def conflicts(settings: Table, names: Iterable[str], channels: Sequence[str] = (
     try:
         # Building the experiment is the rule: every part knows its own conflicts.
         experiment = build(
-            Experiment, _added(settings, module_names), "with " + (", ".join(sorted(module_names)) or "no modules")
+            Experiment,
+            _add_modules(settings, module_names),
+            "with " + (", ".join(sorted(module_names)) or "no modules"),
         )
         # Conflicts do not depend on the rate; 100 Hz is the thesis's.
         task = experiment.task.resolve(100.0, channels, physics=experiment.model.physics)
@@ -292,7 +294,7 @@ def fitting(settings: Table, channels: Sequence[str] = (), among: Sequence[str] 
         channels: of the recordings, for the feature set ``all``.
         among: names of those that are asked about; empty for all.
     """
-    free = (name for name in MODULES if (not among or name in among) and _added(settings, {name}) != settings)
+    free = (name for name in MODULES if (not among or name in among) and _add_modules(settings, {name}) != settings)
     return tuple(name for name in free if not conflicts(settings, (name,), channels))
 
 
@@ -302,7 +304,7 @@ def contradicting(settings: Table, names: Iterable[str], channels: Sequence[str]
     return frozenset(frozenset(pair) for pair in pairs if conflicts(settings, pair, channels))
 
 
-def _added(settings: Table, names: set[str]) -> Table:
+def _add_modules(settings: Table, names: set[str]) -> Table:
     changed_settings = copy.deepcopy(settings)
     for name, module in (*MODULES.items(), *TOGGLES.items()):
         if name not in names:

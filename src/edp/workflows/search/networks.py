@@ -28,7 +28,7 @@ from edp.workflows.search.trainings import Outcome, experiment_of
 FOLDER, CHOSEN = "networks", "chosen"
 
 
-def frozen_split(folder: Path, context: SearchContext, digests: Mapping[str, str]) -> ByFrozen:
+def freeze_split(folder: Path, context: SearchContext, digests: Mapping[str, str]) -> ByFrozen:
     """Return the sessions of a search by their content, for every later command.
 
     Args:
@@ -99,4 +99,4 @@ def _provenance(source: DataSource, experiment: Experiment, data: Prepared, reci
     frozen = split.frozen if isinstance(split, ByFrozen) else {}
     provenance = training_provenance(source, data, training.seed, training.threads, 0.0, frozen)
     search = {"phase": NAME, "recipe": recipe.to_json()}
-    return provenance.with_entries(regime=training.chunks.regime, device=training.device, search=search)
+    return provenance.add_entries(regime=training.chunks.regime, device=training.device, search=search)

@@ -13,12 +13,12 @@ from edp.config.experiment import (
     FeatureSettings,
     Table,
     build,
+    embed_feature_set,
     merged,
     override,
     plain_tree,
     preset_table,
     read_toml,
-    with_set_file,
 )
 from edp.data.feature_files import is_set_file, read_set_table
 from edp.data.features import FEATURE_SETS
@@ -71,8 +71,8 @@ def load_plan(path: str | Path | None = None, preset: str = "quick", overrides: 
     table = parse_toml(text, where, ConfigError)
     if path is not None:
         # Files named in settings are looked for beside the settings file, not in the working directory.
-        table, where = merged(table, _with_files(read_toml(path), Path(path).parent)), f"'{path}'"
-    table = merged(table, combined([_with_files(override(change), Path()) for change in overrides]))
+        table, where = merged(table, _read_named_files(read_toml(path), Path(path).parent)), f"'{path}'"
+    table = merged(table, combined([_read_named_files(override(change), Path()) for change in overrides]))
     where += " with --set" if overrides else ""
     base, search = table.pop("base", "quick"), table.pop("search", {})
     if not isinstance(search, Mapping):
@@ -81,7 +81,7 @@ def load_plan(path: str | Path | None = None, preset: str = "quick", overrides: 
     for key in search:
         if key in MOVED:
             raise ConfigError(f"settings {where}: 'search.{key}' is now called 'search.{MOVED[key]}'")
-    spec = _spec(_with_task(dict(search), table, experiment), where)
+    spec = _spec(_use_task(dict(search), table, experiment), where)
     _check_parts(spec, settings_of(experiment), f"settings {where}: search")
     # Scores exist for the horizons of the task only.
     if spec.horizon not in experiment.task.horizons:
@@ -93,7 +93,7 @@ def load_plan(path: str | Path | None = None, preset: str = "quick", overrides: 
     return SearchPlan(spec, experiment, preset)
 
 
-def _with_task(search: Table, table: Table, experiment: Experiment) -> Table:
+def _use_task(search: Table, table: Table, experiment: Experiment) -> Table:
     """Use the feature set and the horizon of the task if ``[search]`` does not set them."""
     completed, task = {**search}, table.get("task")
     if "features" not in search and isinstance(task, Mapping) and "features" in task:
@@ -106,9 +106,9 @@ def _with_task(search: Table, table: Table, experiment: Experiment) -> Table:
     return completed
 
 
-def _with_files(table: Table, folder: Path) -> Table:
+def _read_named_files(table: Table, folder: Path) -> Table:
     """`table` with the feature sets and the budget that it names by files."""
-    resolved, search = with_set_file(table, folder), table.get("search")
+    resolved, search = embed_feature_set(table, folder), table.get("search")
     if not isinstance(search, Mapping):
         return resolved
     compression = search.get("compression")

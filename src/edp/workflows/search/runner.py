@@ -28,7 +28,7 @@ from edp.storage.ledger import Ledger, Record, check_uncoordinated
 from edp.wording import typed
 from edp.workflows.search.context import SearchContext, is_enough, set_apart
 from edp.workflows.search.engine import Dispatcher, run_phases
-from edp.workflows.search.networks import frozen_split, write_networks
+from edp.workflows.search.networks import freeze_split, write_networks
 from edp.workflows.search.phases import PHASES
 from edp.workflows.search.plan import SearchPlan, plain_spec
 from edp.workflows.search.sessions import SESSIONS_FILE, divide_logs
@@ -165,7 +165,7 @@ def run_search(
             # Openings are written down even where the search ends with an error.
             study_log.openings = ledger.openings()
             study_log.end(state)
-        split = frozen_split(target, context, data.digests)
+        split = freeze_split(target, context, data.digests)
         networks = write_networks(target, source, context, split, list(observer.second.values()))
         teacher = _write_teacher(target, context, split)
         return SearchResult(target, context, state, ledger.digest(), study_log.trained, source, teacher, networks)

@@ -26,7 +26,7 @@ from edp.training.fit import fit
 from edp.training.spec import TrainingSpec
 from edp.workflows.compression.bench import TUNING_EPOCHS, Bench, CompressionRequest
 from edp.workflows.compression.pipeline import TEACHER, Evaluator, formats_of
-from edp.workflows.compression.variants import rounded_order
+from edp.workflows.compression.variants import make_rounded_request
 from edp.workflows.search.trainings import TrainingRequest, experiment_of, mean_scores, prepared, session_scores
 
 Weights = dict[str, Tensor]
@@ -64,7 +64,7 @@ class Recipe:
         # Rounded networks are made of plain ones, whose order comes first.
         name = f"{'p' if self.pruned else 'u'}{self.units}"
         plain = CompressionRequest(name=name, units=self.units, pruned=self.pruned)
-        return rounded_order(plain) if self.rounded else plain
+        return make_rounded_request(plain) if self.rounded else plain
 
     def experiment(self, experiment: Experiment) -> Experiment:
         """Return the experiment of the network's last training, given the teacher's."""
@@ -151,7 +151,7 @@ def make_smaller(plain: Table, start: bytes | None = None) -> tuple[Table, bytes
 
 def network_of(weights: str, task: Task, model: ModelSpec) -> Predictor:
     """Return the network of a result with ``weights``."""
-    return _restored(load(base64.b64decode(weights)), task, model)
+    return _restore_network(load(base64.b64decode(weights)), task, model)
 
 
 class _StateBench(Bench):
@@ -168,7 +168,7 @@ class _StateBench(Bench):
         self.updates, self.weights = updates, weights
         if TEACHER not in weights:
             weights[TEACHER] = _weights(fit(data, experiment.model, experiment.training).predictor)
-        super().__init__(_restored(weights[TEACHER], data.task, experiment.model), data, experiment.training)
+        super().__init__(_restore_network(weights[TEACHER], data.task, experiment.model), data, experiment.training)
 
     def training_of(self, order: CompressionRequest) -> TrainingSpec:
         """Return the training of a smaller network for the steps of the recipe."""
@@ -179,7 +179,7 @@ class _StateBench(Bench):
         if order.name not in self.weights:
             self.weights[order.name] = _weights(super().train(order, start))
         # Always through its weights, so that a network that was kept and one that was trained just now are the same.
-        return _restored(self.weights[order.name], self.data.task, order.model(self.teacher.spec))
+        return _restore_network(self.weights[order.name], self.data.task, order.model(self.teacher.spec))
 
 
 def shortened(order: CompressionRequest, training: TrainingSpec, updates: int) -> TrainingSpec:
@@ -195,7 +195,7 @@ def _weights(network: Predictor) -> Weights:
     return {name: tensor.detach().cpu().clone().contiguous() for name, tensor in network.state_dict().items()}
 
 
-def _restored(weights: Weights, task: Task, model: ModelSpec) -> Predictor:
+def _restore_network(weights: Weights, task: Task, model: ModelSpec) -> Predictor:
     network = Predictor(task, model, blank_scaler(task))
     network.load_state_dict(weights)
     return network.eval()

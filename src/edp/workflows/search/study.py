@@ -197,7 +197,7 @@ class Study:
         asked = self._study.ask(self._distributions)
         self._open[asked.number] = asked
         values = {name: asked.params[name] for name in names(self.space)}
-        on = self._allowed(tuple(name for name in self.flags if asked.params[name]))
+        on = self._select_allowed(tuple(name for name in self.flags if asked.params[name]))
         chosen: dict[str, Any] = {
             name: asked.suggest_categorical(name, choice.options)
             for flag in on
@@ -205,7 +205,7 @@ class Study:
         }
         return Trial(asked.number, values, on, chosen)
 
-    def _allowed(self, on: tuple[str, ...]) -> tuple[str, ...]:
+    def _select_allowed(self, on: tuple[str, ...]) -> tuple[str, ...]:
         allowed: tuple[str, ...] = ()
         for name in on:
             # Barred partners: the first of a pair in the registry's order stays on.
@@ -350,10 +350,10 @@ def write_journal(path: str | Path, studies: Sequence[FinishedStudy]) -> None:
             study = optuna.create_study(storage=storage, study_name=finished.name, directions=directions)
             # A viewer shows objectives without units; the names carry them.
             study.set_user_attr("objectives", list(finished.objectives))
-            study.add_trials([_frozen(finished, trial) for trial in finished.trials])
+            study.add_trials([_freeze_trial(finished, trial) for trial in finished.trials])
 
 
-def _frozen(study: FinishedStudy, trial: TrialRow) -> optuna.trial.FrozenTrial:
+def _freeze_trial(study: FinishedStudy, trial: TrialRow) -> optuna.trial.FrozenTrial:
     from optuna.trial import TrialState, create_trial
 
     # Options of modules that were off are absent, switches are always there.

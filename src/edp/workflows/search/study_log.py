@@ -12,7 +12,7 @@ from edp.config.experiment import Table
 from edp.errors import StorageError
 from edp.evaluation.study import FILE, Decision, PhaseRow, StudyFile, TrainingCounts, TrainingRow, read_study
 from edp.progress import Progress
-from edp.storage import held_by, write_json
+from edp.storage import find_holder, write_json
 from edp.storage.ledger import Opening, Record, digest_of
 from edp.storage.paths import entries_of
 from edp.workflows.search.context import SearchContext
@@ -240,7 +240,7 @@ def look_at(folder: str | Path) -> StudyStatus:
     """
     study = read_study(folder)
     ledger = Path(folder, "ledger")
-    holder = held_by(ledger / ".lock")
+    holder = find_holder(ledger / ".lock")
     # Claims of a dead coordinator are stale.
     claims = entries_of(ledger / "claims", "*.lock") if holder else []
     if study.state == "running" and holder is None:

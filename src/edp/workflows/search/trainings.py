@@ -248,7 +248,7 @@ def prepared(order: TrainingRequest, experiment: Experiment) -> Prepared:
         ConfigError: settings that contradict the data.
         DataError: a session is missing or cannot be read.
     """
-    recordings = {recording.name: recording for recording in _recordings(_frozen(order.source))}
+    recordings = {recording.name: recording for recording in _recordings(_freeze_source(order.source))}
     needed = dict.fromkeys((*order.train, *order.validation, *order.judged))
     missing = [name for name in needed if name not in recordings]
     if missing:
@@ -286,7 +286,7 @@ class _Named:
         return Split(*(tuple(whole[name] for name in part) for part in parts))
 
 
-def _frozen(source: Table) -> str:
+def _freeze_source(source: Table) -> str:
     # Text as a key: `lru_cache` needs something that can be hashed.
     return json.dumps(source, sort_keys=True)
 
@@ -304,7 +304,7 @@ def costs_of(settings: Table, channels: Sequence[str] = ()) -> dict[str, float]:
     Raises:
         ConfigError: settings that cannot be, or a part that counts other work than it does.
     """
-    return dict(_costs(_frozen(settings), tuple(channels)))
+    return dict(_costs(_freeze_source(settings), tuple(channels)))
 
 
 # A study that goes on asks for the costs of all its networks again, and phases ask for those of the same network.

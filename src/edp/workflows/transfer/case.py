@@ -117,7 +117,7 @@ def tuned(
         near = NEIGHBOURS if spec.batch % NEIGHBOURS == 0 else spec.batch
         chunks = replace(chunks, consecutive=near if terms else 1)
     else:
-        chunks = walked_again(chunks)
+        chunks = repeat_chunks(chunks)
     return replace(
         training,
         chunks=chunks,
@@ -129,7 +129,7 @@ def tuned(
     )
 
 
-def walked_again(chunks: ChunkSpec) -> ChunkSpec:
+def repeat_chunks(chunks: ChunkSpec) -> ChunkSpec:
     """Return chunks for minutes of logs, which fill few lanes: they are read repeatedly with other cuts."""
     if chunks.carried or chunks.regime == "window":
         return chunks

@@ -28,7 +28,7 @@ from edp.training.schedules import Constant
 from edp.training.transfer.both_domains import BothDomains, BothSpec
 from edp.training.transfer.strategies import LowRank
 from edp.training.warm_start import WarmStart
-from edp.workflows.transfer.case import TransferCase, walked_again
+from edp.workflows.transfer.case import TransferCase, repeat_chunks
 
 CODE_RATE = 0.05
 """Learning rate of a machine's code, whose values are of the order of one: a hundred times the rate of weights."""
@@ -55,7 +55,7 @@ class Made:
     network: Predictor | None = None
 
 
-def of_network(network: Predictor, names: Sequence[str] | None = None) -> Made:
+def result_of_network(network: Predictor, names: Sequence[str] | None = None) -> Made:
     """Return the result of a method that trained the parameters with these names; None for all parameters."""
     learned = sum(value.numel() for name, value in network.named_parameters() if names is None or name in names)
     return Made(lambda data: stream_predictions(network, data.test), learned, network)
@@ -100,7 +100,7 @@ class MachineCodeAlone(Method):
         frozen = [name for name, _ in source.named_parameters() if name not in names]
         training = case.tuning(AdamW(learning_rate=CODE_RATE, weight_decay=0.0))
         network = case.train("code", training, lambda: WarmStart(source, frozen), centred=False)
-        return of_network(network, names)
+        return result_of_network(network, names)
 
 
 @METHODS.register("direct")
@@ -112,7 +112,7 @@ class Direct(Method):
 
     def make(self, case: TransferCase) -> Made:
         """Return the network of the source unchanged."""
-        return of_network(case.source.predictor, ())
+        return result_of_network(case.source.predictor, ())
 
 
 @METHODS.register("few_steps")
@@ -138,7 +138,7 @@ class FewSteps(Method):
         )
         network = case.train("few_steps", training, lambda: WarmStart(source.predictor, frozen), centred=False)
         names = [name for name, _ in network.named_parameters() if name not in frozen]
-        return of_network(network, names)
+        return result_of_network(network, names)
 
 
 @METHODS.register("full")
@@ -150,7 +150,7 @@ class Full(Method):
     def make(self, case: TransferCase) -> Made:
         """Train everything."""
         network = case.train("full", case.tuning(), lambda: WarmStart(case.source.predictor))
-        return of_network(network)
+        return result_of_network(network)
 
 
 @METHODS.register("linear_probe")
@@ -164,7 +164,7 @@ class LinearProbe(Method):
         parts = decompose(case.source.predictor)
         frozen = {*parts.encoding, *parts.head} - {*parts.last}
         network = case.train("linear_probe", case.tuning(), lambda: WarmStart(case.source.predictor, frozen))
-        return of_network(network, parts.last)
+        return result_of_network(network, parts.last)
 
 
 @METHODS.register("low_rank")
@@ -180,7 +180,7 @@ class Adapters(Method):
             "low_rank", case.tuning(), lambda: LowRank(case.source.predictor, rank), {"rank": rank}, centred=False
         )
         learned = sum(change_size(m.values.shape, m.axes, rank) for m in matrices_of(network))
-        return replace(of_network(network), learned=learned)
+        return replace(result_of_network(network), learned=learned)
 
 
 def change_size(shape: tuple[int, ...], axes: tuple[int, ...], rank: int) -> int:
@@ -253,7 +253,7 @@ def train_both(case: TransferCase, name: str, spec: BothSpec) -> Made:
         judged=judged,
         centred=False,
     )
-    return of_network(network)
+    return result_of_network(network)
 
 
 def share(series: Sequence[Series], ticks: int, least: int) -> list[Series]:
@@ -287,12 +287,12 @@ class Scratch(Method):
     def make(self, case: TransferCase) -> Made:
         """Train as ``edp train`` would, with the early stopping of the fine-tuning."""
         training, spec = case.experiment.training, case.spec
-        chunks = walked_again(training.chunks)
+        chunks = repeat_chunks(training.chunks)
         training = replace(
             training, chunks=chunks, epochs=SCRATCH_TIMES * spec.rounds, patience=spec.patience, refit="none"
         )
         network = case.train("scratch", training, None)
-        return of_network(network)
+        return result_of_network(network)
 
 
 @METHODS.register("two_phase")
@@ -318,4 +318,4 @@ class TwoPhase(Method):
         optimizer = Discriminative(rates=rates, learning_rate=spec.head_rate, weight_decay=spec.weight_decay)
         start = {"start": weights_digest(warmed)}
         network = case.train("two_phase", case.tuning(optimizer, spec.epochs), lambda: WarmStart(warmed), start)
-        return of_network(network)
+        return result_of_network(network)

@@ -28,7 +28,7 @@ from edp.settings.tree import combined
 from edp.storage.paths import is_file_at
 from edp.training import Bundle, load_bundle
 from edp.training.bundle import weights_digest
-from edp.workflows.train_evaluate import trained_run
+from edp.workflows.train_evaluate import read_trained_run
 
 OWN = ("training.epochs", "training.optimizer", "training.patience", "training.refit", "training.chunks.batch")
 """Settings that a fine-tuning has others for, in the table ``[finetune]``."""
@@ -96,7 +96,7 @@ def read_source(path: str | Path, recordings: bool = True) -> SourceModel:
     if not recordings:
         return SourceModel(bundle, experiment, None, "its recordings were not asked for")
     try:
-        return SourceModel(bundle, experiment, trained_run(folder)[3])
+        return SourceModel(bundle, experiment, read_trained_run(folder)[3])
     # Missing or changed recordings do not prevent a transfer; methods that need them are left out.
     except EdpError as error:
         return SourceModel(bundle, experiment, None, str(error))

@@ -21,7 +21,7 @@ from edp.networks.twin.model_selection import AutoTwin
 from edp.networks.twin.recurrent import Recurrent, member_seed
 from edp.storage.runs import PARTS, KeyedRun, part_of
 from edp.training.free_run import FreeRunSpec
-from edp.training.free_run_members import MemberTraining, joined_members
+from edp.training.free_run_members import MemberTraining, join_members
 from edp.wording import setting_text, typed
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
 from edp.workflows.twin.pace import paced
@@ -123,13 +123,13 @@ class TwinChoice:
         """
         tried: list[TwinCandidate] = []
         for name in self.auto.tried:
-            tried += self._tried(name, _best(tried))
+            tried += self._try_formulation(name, _best(tried))
         chosen = self._simplest(tried)
         if chosen is None or chosen.trial is None:
             reasons = "; ".join(f"{one.label}: {one.why}" for one in tried)
             raise ConfigError(f"twin.candidates: none of them can be fitted to these recordings: {reasons}")
         tried[tried.index(chosen)] = replace(chosen, chosen=True)
-        result = self._settled(chosen.trial)
+        result = self._fit_final(chosen.trial)
         # What chose is no less work than what was chosen.
         facts = {**result.fitted.facts, "chosen": chosen.label, "folds": len(self.folds)}
         fitted = replace(result.fitted, seconds=sum(one.seconds for one in tried), facts=facts)
@@ -177,7 +177,7 @@ class TwinChoice:
         shared = (self._whole.channels, self._whole.scales)
         return [self._runs(spec.start(*shared, fold.train, seed), fold) for fold in self.folds]
 
-    def _tried(self, name: str, rival: TwinCandidate | None) -> list[TwinCandidate]:
+    def _try_formulation(self, name: str, rival: TwinCandidate | None) -> list[TwinCandidate]:
         """Try a formulation with default options; the recurrent one in several forms, the simplest first."""
         if name == "recurrent":  # a short training far behind a floor may be ahead of it as a long one
             return self._recurrent()
@@ -209,12 +209,12 @@ class TwinChoice:
                 training = shortened(self.training, share)
                 cost = training_seconds(form, self.fit.channels, training, count)
                 if self.auto.minutes and spent + cost > 60.0 * self.auto.minutes:
-                    unfit.append(self._beyond_budget(form, training, spent + cost))
+                    unfit.append(self._skip_training(form, training, spent + cost))
                     continue
                 spent += cost
                 # A length that helped neither form would take more time than all before it.
                 most = FAR_BEHIND if round_ < BOTH_FORMS else 1.0
-                tried.append(self._trained(form, training, _best(tried), most))
+                tried.append(self._train_members(form, training, _best(tried), most))
             if len(tried) == count_before:
                 break
             # Before the first training has ended there is nothing to be better than.
@@ -222,7 +222,7 @@ class TwinChoice:
                 break
         return tried + unfit[:1]
 
-    def _beyond_budget(self, form: Recurrent, training: FreeRunSpec, seconds: float) -> TwinCandidate:
+    def _skip_training(self, form: Recurrent, training: FreeRunSpec, seconds: float) -> TwinCandidate:
         """Return a training that is left out, with the reason."""
         why = (
             f"about {typed(seconds / 60.0, 2)} min of counted time with those before it, of minutes = "
@@ -230,7 +230,7 @@ class TwinChoice:
         )
         return TwinCandidate(labelled(form, training), 0.0, why=why)
 
-    def _trained(
+    def _train_members(
         self, form: Recurrent, training: FreeRunSpec, rival: TwinCandidate | None, most: float
     ) -> TwinCandidate:
         """Train the members of a form for a length, each without one of the folds."""
@@ -301,12 +301,12 @@ class TwinChoice:
         trial = None if error is None else TwinTrial(spec, tuple(fits), tuple(runs))
         return TwinCandidate(label, seconds, trial, error, why)
 
-    def _settled(self, trial: TwinTrial) -> FittedFormulation:
+    def _fit_final(self, trial: TwinTrial) -> FittedFormulation:
         """Return the twin of all training data; the intervals come from the left-out part of each fold."""
         first, several = trial.fits[0], len(trial.fits) > 1
         unseen = [(fit.fitted.twin, fold.validation) for fit, fold in zip(trial.fits, self.folds, strict=True)]
         if isinstance(trial.spec, Recurrent):
-            result = FittedFormulation(trial.spec, joined_members([fit.fitted for fit in trial.fits]))
+            result = FittedFormulation(trial.spec, join_members([fit.fitted for fit in trial.fits]))
         elif not first.fitted.history:
             result = self._whole.fitted(trial.spec, None)
         elif isinstance(trial.spec, ElementsBox):

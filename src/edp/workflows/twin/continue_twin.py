@@ -17,12 +17,12 @@ from edp.evaluation.free_run import free_runs
 from edp.networks.twin import TWINS, Twin
 from edp.networks.twin.model_selection import AutoTwin
 from edp.networks.twin.recurrent import RecurrentTwin, member_seed
-from edp.networks.twin.recurrent_members import scales_for, separated, with_scales
+from edp.networks.twin.recurrent_members import replace_scales, scales_for, separated
 from edp.networks.twin.static_map import StaticMap
 from edp.settings.tree import Table
 from edp.storage.runs import PARTS, KeyedRun
 from edp.training.fitted_twin import FittedTwin
-from edp.training.free_run_members import MemberTraining, joined_members
+from edp.training.free_run_members import MemberTraining, join_members
 from edp.training.twin_bundle import TwinBundle, load_twin, twin_hash
 from edp.wording import typed
 from edp.workflows.twin.choose_twin import LENGTHENED, TwinCandidate, relative_error, shortened
@@ -162,11 +162,11 @@ class ContinuedTwin:
         start = self.start.twin
         scales = scales_for(start, self.fit.scales, self.fit.data.train)
         # End stops are the machine's: the twin as it is has those of these recordings, too.
-        as_it_is = with_scales(start, scales)
+        as_it_is = replace_scales(start, scales)
         fits = [FittedTwin(as_it_is, [], 0.0)]
         tried = [TwinCandidate("the twin as it is", 0.0, error=self._error(as_it_is))]
         for share in SHARES:
-            fit = self._trained(as_it_is, share)
+            fit = self._train_members(as_it_is, share)
             label = f"{round(share * sum(self.fit.experiment.training.updates)):,} further updates"
             fits.append(fit)
             tried.append(TwinCandidate(label, fit.seconds, error=self._error(fit.twin)))
@@ -178,7 +178,7 @@ class ContinuedTwin:
         seconds, facts = sum(one.seconds for one in tried), self.start.provenance()
         return FittedFormulation(self.start.bundle.spec, replace(fits[best], seconds=seconds, facts=facts)), tried
 
-    def _trained(self, start: RecurrentTwin, share: float) -> FittedTwin:
+    def _train_members(self, start: RecurrentTwin, share: float) -> FittedTwin:
         """Train each member further from its start, and average them again."""
         training = shortened(self.fit.experiment.training, share)
         train, validation = self.fit.data.train, self.fit.data.validation
@@ -192,9 +192,9 @@ class ContinuedTwin:
             folder = self.run.folder.path / PARTS / f"further_{sum(training.updates)}_{which}"
             jobs.append(MemberTraining(label, twin, train, validation, seeded, (folder, self.run.key), True))
         fits = list(self.fit.train_members(jobs, self.fit.on_event))
-        joined = joined_members(fits)
+        joined = join_members(fits)
         # One network of members that read one another stays the average that it was said to be.
-        return joined if len(fits) > 1 else replace(joined, twin=_with_members(joined.twin, start.members))
+        return joined if len(fits) > 1 else replace(joined, twin=_set_members(joined.twin, start.members))
 
     def _error(self, twin: Twin) -> float:
         """Error of free runs of the validation part over the static map's there."""
@@ -206,7 +206,7 @@ class ContinuedTwin:
         return relative_error(ours, theirs, self.fit.experiment.judge, training.validation_s)
 
 
-def _with_members(twin: Twin, members: int) -> Twin:
+def _set_members(twin: Twin, members: int) -> Twin:
     if not isinstance(twin, RecurrentTwin) or twin.members == members:
         return twin
     parts = (twin.channels, twin.scales, twin.prefix_ticks, twin.network, twin.static)

@@ -20,7 +20,7 @@ from edp.progress import SILENT, Progress
 from edp.storage.runs import KeyedRun
 from edp.training.elements_fit import fit_elements
 from edp.training.fitted_twin import FittedTwin, FreeRunProgress
-from edp.training.free_run_members import MemberTraining, fit_members, member_unit, noted_progress, one_by_one
+from edp.training.free_run_members import MemberTraining, fit_members, member_unit, one_by_one, read_progress_notes
 from edp.training.grey_fit import fit_grey_box
 from edp.training.progress_steps import free_run_steps
 from edp.training.residual_fit import fit_residual
@@ -114,7 +114,7 @@ class TwinFit:
         shown: list[int] = []
 
         def look() -> None:
-            event = noted_progress(jobs)
+            event = read_progress_notes(jobs)
             if on_event is not None and event is not None and event.update not in shown:
                 shown[:] = [event.update]
                 on_event(event)

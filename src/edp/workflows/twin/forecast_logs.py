@@ -101,15 +101,15 @@ def forecast_logs(
     _refuse_used(Path(out))
     recordings = source.read()
     if gain is None:
-        gain = _chosen_gain(bundle, recordings, horizons)
+        gain = _choose_gain(bundle, recordings, horizons)
     names, errors, logs = [], [], progress.stage("log", len(recordings))
     with replacing_folder(out) as folder:
         for number, logged in enumerate(recordings, start=1):
             logs.note(logged.name)
-            recording = _checked(twin, logged)
+            recording = _check_recording(twin, logged)
             values, measured, settled = _forecasts(twin, recording, horizons, columns, gain)
             errors.append(_errors(values, measured, horizons, settled))
-            extended = _extended(twin, recording, values, horizons, columns)
+            extended = _add_forecasts(twin, recording, values, horizons, columns)
             # The name comes from a file: as it is, it could be a path out of the folder, or that of another log.
             names.append(f"{number:04d}_{file_name(recording.name)}.parquet")
             write_recording(extended, folder / names[-1])
@@ -119,12 +119,12 @@ def forecast_logs(
     return ForecastLogs(files, channels, gain, _scores(twin, errors, horizons, columns))
 
 
-def _chosen_gain(bundle: TwinBundle, recordings: Sequence[Recording], horizons: Sequence[int]) -> float:
+def _choose_gain(bundle: TwinBundle, recordings: Sequence[Recording], horizons: Sequence[int]) -> float:
     """Choose a gain on the twin's training logs, or on the first logs if none of them is given."""
     learned_names = bundle.provenance.recording_names("train", "validation")
     chosen = [logged for logged in recordings if logged.name in learned_names] or list(recordings)
     task = bundle.twin.channels.task()
-    series = [task.series(_checked(bundle.twin, logged)) for logged in chosen[:CHOICE_LOGS]]
+    series = [task.series(_check_recording(bundle.twin, logged)) for logged in chosen[:CHOICE_LOGS]]
     return choose_gain(bundle.twin, series, horizons)
 
 
@@ -134,7 +134,7 @@ def _refuse_used(folder: Path) -> None:
         raise ConfigError(f"--out '{folder}' holds something already; name a folder that is new or empty")
 
 
-def _checked(twin: Twin, logged: Recording) -> Recording:
+def _check_recording(twin: Twin, logged: Recording) -> Recording:
     if logged.rate_hz != twin.channels.rate_hz:
         raise DataError(
             f"recording '{logged.name}' has {typed(logged.rate_hz)} Hz, the twin {typed(twin.channels.rate_hz)} Hz; "
@@ -174,7 +174,7 @@ def _channels(twin: Twin, horizons: Sequence[int], columns: list[int]) -> list[C
     return described
 
 
-def _extended(
+def _add_forecasts(
     twin: Twin, recording: Recording, values: np.ndarray, horizons: Sequence[int], columns: list[int]
 ) -> Recording:
     """Return the recording with its forecasts after its own channels."""

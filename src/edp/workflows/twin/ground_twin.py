@@ -21,7 +21,7 @@ from edp.storage.runs import Run, run_key
 from edp.training.ground_fit import fit_ground
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin, twin_hash
 from edp.workflows.twin.continue_twin import BaseTwin
-from edp.workflows.twin.prepare_twin import prepared_twin
+from edp.workflows.twin.prepare_twin import cut_recordings
 
 FOLDER = "twin"
 JUDGED = (FreeRunFile.NAME, RUNS, StepResponses.NAME)
@@ -59,7 +59,7 @@ def ground_twin(
     base, linkage = _base(start)
     experiment = base.settled(experiment)
     progress.note("reading recordings")
-    channels, data = prepared_twin(source.read(), experiment)
+    channels, data = cut_recordings(source.read(), experiment)
     base.check(channels, data.train)
     key = run_key({"twin": TWIN_SETTINGS.plain(experiment), "from": base.digest}, data.digest)
     with Run.create(out, "twin", key, twin_toml(experiment)) as run:
@@ -74,7 +74,7 @@ def ground_twin(
         Datasheet(basis=f"{BASIS}; {GROUND_BASIS}", numbers=rows).write(run.path)
         contact = {"source": source.label, "digest": data.digest}
         facts = {**fitted.facts, **base.provenance(), "ground_data": contact}
-        bundle = replace(base.bundle, ground=fitted.law, provenance=base.bundle.provenance.with_entries(**facts))
+        bundle = replace(base.bundle, ground=fitted.law, provenance=base.bundle.provenance.add_entries(**facts))
         for name in JUDGED:
             # In free air it is the twin that was judged there, so its page needs no evaluation of its own.
             if is_file_at(base.folder / name):

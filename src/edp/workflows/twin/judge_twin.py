@@ -17,7 +17,7 @@ from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, DataError, NotFiniteError
-from edp.evaluation.ahead import Ahead, ahead_scores, look_ahead, predictor_scores
+from edp.evaluation.ahead import Ahead, look_ahead, predictor_scores, score_ahead
 from edp.evaluation.beyond import RANGES, commands_beyond
 from edp.evaluation.free_run import FreeRunJudgeSpec, FreeRuns, free_run_scores, free_runs
 from edp.evaluation.free_run_file import (
@@ -43,7 +43,7 @@ from edp.storage import check_writable, make_folder, write_bytes
 from edp.storage.headers import digests_of
 from edp.training import load_bundle
 from edp.training.twin_bundle import TwinBundle, load_twin
-from edp.workflows.twin.prepare_twin import driving_labels, prepared_twin
+from edp.workflows.twin.prepare_twin import cut_recordings, driving_labels
 
 SHOWN_RUNS = 6
 """Free runs on a page: a reader goes through a few."""
@@ -73,7 +73,7 @@ def judge_twin(
     runs = free_runs(twin, data.test, spec.seconds, spec.starts)
     beyond = commands_beyond(bundle.provenance.more.get(RANGES), twin.channels, [part.inputs for part in data.test])
     own = free_run_scores(runs, spec, bundle.intervals, labels)
-    scores = {TWIN: replace(own, ahead=_ahead(twin, data, spec), beyond=beyond)}
+    scores = {TWIN: replace(own, ahead=_score_ahead(twin, data, spec), beyond=beyond)}
     for name in spec.floors:
         progress.note(f"free runs of {name}")
         floor_spec: TwinSpec = replace(TWINS[name](), prefix_ticks=experiment.twin.prefix_ticks)
@@ -85,7 +85,7 @@ def judge_twin(
             # What such a log is too short for is no rival on it, and no reason to have no twin.
             progress.note(f"the floor {name} is left out: {problem}")
             continue
-        scores[name] = replace(free_run_scores(floor_runs, spec, None, labels), ahead=_ahead(floor, data, spec))
+        scores[name] = replace(free_run_scores(floor_runs, spec, None, labels), ahead=_score_ahead(floor, data, spec))
     return scores, runs
 
 
@@ -97,12 +97,12 @@ def write_scores(
     Raises:
         StorageError: a file cannot be written.
     """
-    write_bytes(folder / RUNS, save(shown_runs(runs, intervals)))
-    channels = reported_channels(runs.channels)
+    write_bytes(folder / RUNS, save(select_shown_runs(runs, intervals)))
+    channels = describe_channels(runs.channels)
     FreeRunFile(channels=channels, models=dict(scores), files=digests_of(folder, RUNS)).write(folder)
 
 
-def reported_channels(channels: TwinChannels) -> AnswerChannels:
+def describe_channels(channels: TwinChannels) -> AnswerChannels:
     """Return the facts of each answer for a page."""
 
     def reported(channel: Channel) -> ReportedChannel:
@@ -115,7 +115,7 @@ def reported_channels(channels: TwinChannels) -> AnswerChannels:
     return AnswerChannels(**parts)
 
 
-def shown_runs(runs: FreeRuns, intervals: FreeRunIntervals | None) -> dict[str, NDArray[Any]]:
+def select_shown_runs(runs: FreeRuns, intervals: FreeRunIntervals | None) -> dict[str, NDArray[Any]]:
     """Return a few thinned runs for pages: time, answers, truth, and half widths if intervals are known.
 
     One run of each way of driving would need labels; one of each recording, evenly chosen, needs none.
@@ -134,12 +134,12 @@ def shown_runs(runs: FreeRuns, intervals: FreeRunIntervals | None) -> dict[str, 
     return arrays
 
 
-def _ahead(twin: Twin, data: Prepared, spec: FreeRunJudgeSpec) -> AheadErrors | None:
+def _score_ahead(twin: Twin, data: Prepared, spec: FreeRunJudgeSpec) -> AheadErrors | None:
     """Scores a few ticks ahead; None where no recording is long enough."""
     longest = max(part.samples for part in data.test)
     if longest < twin.prefix_ticks + spec.ahead_ticks + 1:
         return None
-    return ahead_scores(look_ahead(twin, data.test, spec.ahead_ticks))
+    return score_ahead(look_ahead(twin, data.test, spec.ahead_ticks))
 
 
 def evaluate_twin(
@@ -168,7 +168,7 @@ def evaluate_twin(
     experiment = load_twin_experiment(folder / "config.toml")
     progress.note("reading recordings")
     recordings = DataSource.from_plain(bundle.provenance.origin.reader).read()
-    channels, data = prepared_twin(recordings, experiment)
+    channels, data = cut_recordings(recordings, experiment)
     if data.digest != bundle.provenance.origin.digest:
         raise DataError(
             f"the recordings in '{bundle.provenance.origin.source}' changed since '{folder}' was trained; the "
@@ -183,14 +183,14 @@ def evaluate_twin(
     scores, runs = judge_twin(bundle, experiment, data, driving_labels(recordings), progress)
     if predictor_run is not None:
         progress.note("the look-ahead predictor")
-        beside = beside_predictor(bundle.twin, data.test, recordings, Path(predictor_run), experiment.judge)
+        beside = compare_with_predictor(bundle.twin, data.test, recordings, Path(predictor_run), experiment.judge)
         scores[TWIN] = replace(scores[TWIN], beside=beside)
     write_scores(target, scores, runs, bundle.intervals)
     step_responses(bundle.twin, data.test).write(target)
     return target
 
 
-def beside_predictor(
+def compare_with_predictor(
     twin: Twin, test: Sequence[Series], recordings: Sequence[Recording], run: Path, spec: FreeRunJudgeSpec
 ) -> PredictorComparison:
     """Return errors of a look-ahead predictor and of the twin at the same moments, for their common channels.
@@ -212,7 +212,7 @@ def beside_predictor(
     by_recording = {recording.name: recording for recording in recordings}
     pieces = [task.series(*_rows(part.name, by_recording), part.name) for part in test]
     ahead = look_ahead(twin, test, ticks, predictor.spec.window)
-    predicted = _at_moments(predictor, pieces, ahead)
+    predicted = _predict_at_moments(predictor, pieces, ahead)
     columns = {name: predicted[:, task.targets.index(name)] for name in names}
     # A recording that trained the predictor flatters it: a reader must know.
     trained = bundle.provenance.recording_names("train")
@@ -237,11 +237,11 @@ def _rows(name: str, recordings: Mapping[str, Recording]) -> tuple[Recording, in
     return recordings[whole], int(start), int(stop)
 
 
-def _at_moments(predictor: Predictor, series: Sequence[Series], ahead: Ahead) -> NDArray[np.float32]:
+def _predict_at_moments(predictor: Predictor, series: Sequence[Series], ahead: Ahead) -> NDArray[np.float32]:
     """Predictions that far ahead at the moments ``(moment, target)``, SI units."""
     which = predictor.task.horizons.index(ahead.ticks)
     predictions = stream_predictions(predictor, series)
     return np.concatenate([p[at, which] for p, at in zip(predictions, ahead.moments, strict=True)])
 
 
-__all__ = ["beside_predictor", "evaluate_twin", "judge_twin", "write_scores"]
+__all__ = ["compare_with_predictor", "evaluate_twin", "judge_twin", "write_scores"]

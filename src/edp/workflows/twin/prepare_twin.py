@@ -25,10 +25,10 @@ def prepare_twin(source: DataSource, experiment: TwinExperiment) -> tuple[TwinCh
     Raises:
         EdpError: recordings or settings that cannot be used.
     """
-    return prepared_twin(source.read(), experiment)
+    return cut_recordings(source.read(), experiment)
 
 
-def prepared_twin(recordings: Sequence[Recording], experiment: TwinExperiment) -> tuple[TwinChannels, Prepared]:
+def cut_recordings(recordings: Sequence[Recording], experiment: TwinExperiment) -> tuple[TwinChannels, Prepared]:
     """Cut recordings as `prepare_twin` does; where they hold positions alone, velocities are derived from these.
 
     Raises:

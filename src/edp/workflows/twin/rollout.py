@@ -23,7 +23,7 @@ from edp.settings.bounds import above, span
 from edp.signals import Channel
 from edp.training.twin_bundle import load_twin
 from edp.wording import setting_text, typed
-from edp.workflows.twin.judge_twin import reported_channels, shown_runs
+from edp.workflows.twin.judge_twin import describe_channels, select_shown_runs
 from edp.workflows.twin.prepare_twin import answer_columns
 
 FREE = "_twin"
@@ -107,7 +107,7 @@ def rollout_log(run: str | Path, source: DataSource, request: RolloutRequest) ->
     intervals = None if measured_columns else bundle.intervals
     half = None if intervals is None else intervals.at(np.arange(1, ticks + 1)).astype(np.float32)
     result = Rollout(
-        _recorded(twin, recording, answers[0], half, start),
+        _make_recording(twin, recording, answers[0], half, start),
         free_run_scores(runs, replace(spec, at_s=tuple(at_s)), intervals),
         start / recording.rate_hz,
         None if intervals is None else intervals.coverage,
@@ -119,9 +119,9 @@ def rollout_log(run: str | Path, source: DataSource, request: RolloutRequest) ->
     if request.plots is not None:
         write_rollout_plots(result.recording, FREE, (start + 1) / recording.rate_hz, request.plots)
     if request.page is not None:
-        content = FreeRunFile(channels=reported_channels(twin.channels), models={TWIN: result.scores})
+        content = FreeRunFile(channels=describe_channels(twin.channels), models={TWIN: result.scores})
         title = f"{recording.name} from {typed(result.start_s)} s"
-        build_twin_page(FreeRunFacts(title, content, shown_runs(runs, intervals))).write(request.page)
+        build_twin_page(FreeRunFacts(title, content, select_shown_runs(runs, intervals))).write(request.page)
     return result
 
 
@@ -165,14 +165,16 @@ def _span(twin: Twin, recording: Recording, seconds: float, start_s: float | Non
     return start, ticks
 
 
-def _recorded(twin: Twin, recording: Recording, answers: np.ndarray, half: np.ndarray | None, start: int) -> Recording:
+def _make_recording(
+    twin: Twin, recording: Recording, answers: np.ndarray, half: np.ndarray | None, start: int
+) -> Recording:
     """Return a recording; row t holds commands, measurements, answers and intervals of tick start + 1 + t."""
     channels = twin.channels.commands + twin.channels.answers
     rows = slice(start + 1, start + 1 + len(answers))
     measured_values = recording.select([channel.name for channel in channels])[rows]
-    columns, own = [measured_values, answers], _named(twin, FREE, "free run")
+    columns, own = [measured_values, answers], _rename_channels(twin, FREE, "free run")
     if half is not None:
-        own += _named(twin, LOW, "free run, lower end") + _named(twin, HIGH, "free run, upper end")
+        own += _rename_channels(twin, LOW, "free run, lower end") + _rename_channels(twin, HIGH, "free run, upper end")
         columns += [answers - half, answers + half]
     return Recording(
         f"{recording.name}_rollout",
@@ -184,7 +186,7 @@ def _recorded(twin: Twin, recording: Recording, answers: np.ndarray, half: np.nd
     )
 
 
-def _named(twin: Twin, suffix: str, text: str) -> tuple[Channel, ...]:
+def _rename_channels(twin: Twin, suffix: str, text: str) -> tuple[Channel, ...]:
     """Return the channels of the answers under other names."""
     return tuple(
         replace(channel, name=f"{channel.name}{suffix}", description=f"{channel.description} ({text})".strip())

@@ -40,7 +40,7 @@ from edp.workflows.twin.continue_twin import BaseTwin, ContinuedTwin
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
 from edp.workflows.twin.ground_twin import ground_twin
 from edp.workflows.twin.judge_twin import judge_twin, write_scores
-from edp.workflows.twin.prepare_twin import driving_labels, prepare_twin, prepared_twin
+from edp.workflows.twin.prepare_twin import cut_recordings, driving_labels, prepare_twin
 
 FOLDER = "twin"
 
@@ -94,7 +94,7 @@ def train_twin(
     if base is not None:
         experiment = base.settled(experiment)
     recordings = source.read()
-    channels, data = prepared_twin(recordings, experiment)
+    channels, data = cut_recordings(recordings, experiment)
     labels, begun = driving_labels(recordings), {}
     if base is not None:
         base.check(channels, data.train)
@@ -109,7 +109,7 @@ def train_twin(
             bundle = load_twin(run.path)
             return TrainedTwin(bundle, read_models(bundle.scores, f"'{run.path}'"), True)
         fit = TwinFit(channels, fit_scales(channels, data.train), data, experiment, progress, staying)
-        result = _chosen(fit, KeyedRun(run, key), base)
+        result = _train_or_choose(fit, KeyedRun(run, key), base)
         fitted = result.fitted
         run.write_history(fitted.history)
         if fitted.datasheet:
@@ -118,7 +118,7 @@ def train_twin(
         intervals = calibrated(result.unseen or ((fitted.twin, data.validation),), experiment.judge)
         before = None if base is None else base.bundle.provenance.more.get(RANGES)
         ranges = command_ranges(channels, [*data.train, *data.validation], before)
-        provenance = training_provenance(source, data, experiment.training.seed, 1, fitted.seconds).with_entries(
+        provenance = training_provenance(source, data, experiment.training.seed, 1, fitted.seconds).add_entries(
             **_full_strokes(recordings), **_oil(recordings), **fitted.facts, **{RANGES: ranges}
         )
         bundle = TwinBundle(result.spec, fitted.twin, provenance, {}, intervals)
@@ -164,7 +164,7 @@ def _linkage(experiment: TwinExperiment) -> dict[str, object]:
     return {"linkage": asdict(load_machine(spec.linkage))}
 
 
-def _chosen(fit: TwinFit, run: KeyedRun, base: BaseTwin | None) -> FittedFormulation:
+def _train_or_choose(fit: TwinFit, run: KeyedRun, base: BaseTwin | None) -> FittedFormulation:
     """Return the twin of the settings, or the further trained one; a choice is kept in ``candidates.json``."""
     spec = fit.experiment.twin
     if base is not None:

@@ -46,12 +46,12 @@ def check_size(path: Path) -> tuple[int, int]:
         DataError: the file is cut off or damaged, or its variables do not fit into memory.
     """
     # The text of the header does not tell: some writers leave that of v5 before HDF5.
-    total, objects = _announced_v73(path) if h5py.is_hdf5(path) else _announced_v5(path)
+    total, objects = _measure_v73(path) if h5py.is_hdf5(path) else _measure_v5(path)
     check_memory(path, _COPIES * total, "the variables of this MAT file", _ADVICE)
     return total, objects
 
 
-def _announced_v5(path: Path) -> tuple[int, int]:
+def _measure_v5(path: Path) -> tuple[int, int]:
     size, total, objects = path.stat().st_size, 0, 0
     with path.open("rb") as stream:
         head = stream.read(_HEADER)
@@ -66,7 +66,7 @@ def _announced_v5(path: Path) -> tuple[int, int]:
                     f"'{path}' is a MAT file that is cut off: a variable at byte {at} has {length} bytes, the file "
                     f"ends after {size}; copy or export it again"
                 )
-            array_bytes = _unpacked(stream.read(min(length, 256)), order) if kind == _PACKED else length
+            array_bytes = _measure_packed(stream.read(min(length, 256)), order) if kind == _PACKED else length
             if array_bytes > DEFLATE_RATIO * (length + 64):
                 raise _impossible(path, f"the variable at byte {at}", array_bytes, length)
             total += array_bytes
@@ -75,7 +75,7 @@ def _announced_v5(path: Path) -> tuple[int, int]:
     return total, objects
 
 
-def _unpacked(start: bytes, order: str) -> int:
+def _measure_packed(start: bytes, order: str) -> int:
     """Bytes that a packed element announces; 0 where it is damaged, which its reader finds."""
     # Eight bytes unpacked tell the length, whatever the rest would lead to.
     head = unpack_start(start, 8)
@@ -85,7 +85,7 @@ def _unpacked(start: bytes, order: str) -> int:
     return int(length) if kind == _MATRIX else 0
 
 
-def _announced_v73(path: Path) -> tuple[int, int]:
+def _measure_v73(path: Path) -> tuple[int, int]:
     try:
         with h5py.File(path, "r") as file:
             walk = _Walk(path)
@@ -161,7 +161,7 @@ class _Walk:
         # A chunk is unpacked whole, even where an array uses a corner of it.
         memory_bytes = max(size, chunk if stored else 0) * part.dtype.itemsize
         if memory_bytes > DEFLATE_RATIO * stored + _UNSTORED_BYTES:
-            raise _impossible(self.path, f"the array {_shown(name)}", memory_bytes, stored)
+            raise _impossible(self.path, f"the array {_format_name(name)}", memory_bytes, stored)
         self.total += memory_bytes
         if size and h5py.check_ref_dtype(part.dtype) is not None:
             check_memory(self.path, _COPIES * self.total, "the variables of this MAT file", _ADVICE)
@@ -177,12 +177,12 @@ class _Walk:
 
     def refused(self, name: str, what: str) -> DataError:
         return DataError(
-            f"'{self.path}': {_shown(name)} is {what}; a MAT file of MATLAB holds all of its values itself. Load it in "
+            f"'{self.path}': {_format_name(name)} is {what}; a MAT file of MATLAB holds all of its values itself. Load it in "
             "MATLAB and save it again"
         )
 
 
-def _shown(name: str) -> str:
+def _format_name(name: str) -> str:
     name = name.lstrip("/")
     return repr(name if len(name) <= _SHOWN else name[: _SHOWN - 3] + "...")
 

@@ -38,7 +38,7 @@ def pick_experiment(variables: Mapping[str, object], name: str) -> dict[str, obj
 def _experiments(value: Any) -> list[Any]:
     """Return the experiments of a variable; empty if it is a single one or none."""
     if isinstance(value, MatlabOpaque):
-        return _of_iddata(value)
+        return _split_iddata(value)
     if not isinstance(value, np.ndarray) or value.size < 2 or not (value.dtype.names or value.dtype == object):
         return []
     elements = [np.asarray(element) for element in value.ravel(order="F")]
@@ -57,7 +57,7 @@ def _is_experiment(element: Any) -> bool:
     return any(rows.count(count) >= _LEAST_FIELDS for count in rows if count >= _LEAST_ROWS)
 
 
-def _of_iddata(value: MatlabOpaque) -> list[Any]:
+def _split_iddata(value: MatlabOpaque) -> list[Any]:
     """Return one iddata per experiment of an iddata with several experiments, whose properties are cells."""
     props = value.properties
     if value.classname != "iddata" or not isinstance(props, dict):

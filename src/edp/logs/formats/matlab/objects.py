@@ -199,7 +199,7 @@ def _add_streamed(element: Any, fields: tuple[str, ...], path: str, mat_variable
     values, time = element[VALUES], element[EVEN_TIMES]
     if not isinstance(values, np.ndarray) or values.ndim != 2 or time is None:
         return
-    units = [_nested_text(element[key]) if key in fields else "" for key in ("TimeUnits", "DataUnits")]
+    units = [_find_text(element[key]) if key in fields else "" for key in ("TimeUnits", "DataUnits")]
     seconds = np.asarray(time, dtype=np.float64) * _SECONDS.get(units[0].lower(), 1.0)
     name = (_text(element["Name"]) if "Name" in fields else "") or path.rpartition(".")[2]
     _add_array(values, name, path, seconds, mat_variables, units[1] or None)
@@ -214,7 +214,7 @@ def _port(element: Any, path: str) -> str:
     return f"{_text(block)}:{1 if port is None else port:.0f}" if _text(block) else path
 
 
-def _nested_text(value: Any) -> str:
+def _find_text(value: Any) -> str:
     """Return the text in the ``Value`` field of a struct, or the text itself."""
     if isinstance(value, np.ndarray) and value.dtype.names and "Value" in value.dtype.names and value.size:
         return _text(value.ravel()[0]["Value"])

@@ -49,7 +49,7 @@ def place_streams(path: Path, variables: dict[str, object]) -> None:
     with h5py.File(path, "r") as stored:
         records = stored[GROUP]
         if not isinstance(records, h5py.Group):
-            raise _damaged(path, GROUP, "is no group")
+            raise _damage_error(path, GROUP, "is no group")
         for signal in _signals(list(variables.values()), 0):
             values = _record(path, records, signal, VALUES)
             signal[VALUES] = values
@@ -64,7 +64,7 @@ def _times(path: Path, records: h5py.Group, signal: Any, samples: int) -> NDArra
     count = len(stream) if stream is not None else facts.ravel()[2] if even else 0
     # Before any array is made: a damaged file may announce more samples than memory holds.
     if count != samples:
-        raise _damaged(path, _name(signal), f"has {samples} samples and {count:.0f} times")
+        raise _damage_error(path, _name(signal), f"has {samples} samples and {count:.0f} times")
     if stream is not None:
         return np.asarray(stream.ravel(), dtype=np.float64)
     return np.asarray(facts.ravel()[0] + facts.ravel()[1] * np.arange(samples), dtype=np.float64)
@@ -95,7 +95,7 @@ def _record(path: Path, records: h5py.Group, signal: Any, field: str) -> NDArray
         return None
     record = records.get(str(int(reference.ravel()[0])))
     if not isinstance(record, h5py.Group) or not isinstance(record.get("#data#"), h5py.Dataset):
-        raise _damaged(path, _name(signal), f"refers to a record {int(reference.ravel()[0])}, which is not there")
+        raise _damage_error(path, _name(signal), f"refers to a record {int(reference.ravel()[0])}, which is not there")
     kind, width = ("<f8", 1) if field == TIMES else _sample(signal)
     if kind is None:
         return None
@@ -103,7 +103,7 @@ def _record(path: Path, records: h5py.Group, signal: Any, field: str) -> NDArray
     data = np.asarray(record["#data#"]).ravel()
     need = count * width * np.dtype(kind).itemsize
     if count < 0 or data.dtype != np.uint8 or need > data.size:
-        raise _damaged(path, _name(signal), f"announces {count} samples, its record has {data.size} bytes")
+        raise _damage_error(path, _name(signal), f"announces {count} samples, its record has {data.size} bytes")
     return data[:need].view(kind).reshape(count, width)
 
 
@@ -129,5 +129,5 @@ def _name(signal: Any) -> str:
     return f"the signal {_text(signal['Name'])[:80]!r}" if "Name" in signal.dtype.names else "a signal"
 
 
-def _damaged(path: Path, what: str, how: str) -> DataError:
+def _damage_error(path: Path, what: str, how: str) -> DataError:
     return DataError(f"'{path}': {what} {how}; the recording was cut off or damaged: copy or export it again")

@@ -12,7 +12,7 @@ from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.equations import Equations, GreyForm
 from edp.networks.twin.grey.jit import compiled
 from edp.networks.twin.grey.linkage import joint_actuators, joint_angle
-from edp.networks.twin.grey.program import ANGLES, ExpressionAlgebra, loaded_module
+from edp.networks.twin.grey.program import ANGLES, ExpressionAlgebra, load_module
 from edp.networks.twin.symbolic.expression import ExpressionGraph
 from edp.networks.twin.symbolic.machine_code import CodeModule, Loaded, call
 
@@ -56,7 +56,7 @@ def _functions(joints: tuple[int, ...]) -> Loaded:
     module.add("moments", [*values, *(slope for row in slopes for slope in row)])
     forces = equations.balance(moments, strokes, speeds, accelerations, angles[::ANGLES])
     module.add("balance", [slope for row in algebra.derivatives(forces, moments) for slope in row])
-    return loaded_module(module, ("bodies", joints))
+    return load_module(module, ("bodies", joints))
 
 
 def moments_of(values: Array, inertia_at: int, linkage: Array) -> BodyMoments:

@@ -92,7 +92,7 @@ def index_of(port: IntArray, n: int, nodes: int) -> Any:
 
 
 @inner
-def fed_ports(ports: IntArray, y: Array, s: Array, fed: Array) -> None:
+def read_ports(ports: IntArray, y: Array, s: Array, fed: Array) -> None:
     """Write the port readings to `fed`, in units of the grey box, shape (output,)."""
     n, nodes = len(s), len(y) - len(s)
     for c in range(len(ports)):
@@ -251,11 +251,11 @@ def run_back(
                 along = by_read[row, answers + j] / change[j]
                 by_tick[row, where[solved[j]]] += along
                 by_fed[row, where[solved[j]]] -= along
-            _before((t, row), port, where, trace, by_fed[row], by_tick[row], by_state[row])
+            _propagate_back((t, row), port, where, trace, by_fed[row], by_tick[row], by_state[row])
 
 
 @inner
-def _before(
+def _propagate_back(
     now: tuple[int, int],
     port: Singles,
     where: IntArray,

@@ -216,7 +216,7 @@ def default_elements(channels: TwinChannels) -> Elements:
             "[[twin.cylinders]], [[twin.motors]], [[twin.valves]] and [[twin.pumps]]"
         )
     pumps = tuple(PumpElement(name=f"pump_{m + 1}", pressure=name) for m, name in enumerate(left))
-    return _paired(tuple(actuators), valves, second, pumps)
+    return _assign_pumps(tuple(actuators), valves, second, pumps)
 
 
 def _actuator(name: str, velocity: Channel, pressures: Sequence[str], angles: bool) -> Actuator:
@@ -228,7 +228,7 @@ def _actuator(name: str, velocity: Channel, pressures: Sequence[str], angles: bo
     return CylinderElement(name=name, velocity=velocity.name, head=first, rod=second)
 
 
-def _paired(
+def _assign_pumps(
     actuators: tuple[Actuator, ...],
     valves: Sequence[ValveElement],
     second: Sequence[ValveElement],

@@ -110,7 +110,7 @@ class DragLaw(GroundLaw):
                 f"{len(forces)} ticks of the training part; {LEAST_ROWS} must hold: give logs of work in the ground, "
                 "or another machine in twin.linkage"
             )
-        numbers, deviations = _solved(terms, forces, blocks)
+        numbers, deviations = _solve_parameters(terms, forces, blocks)
         return replace(empty, numbers=numbers, deviations=deviations)
 
     def r_squared(self, twin: GreyTwin, logs: Logs) -> float:
@@ -174,7 +174,7 @@ class DragLaw(GroundLaw):
         return terms, forces, blocks
 
 
-def _solved(terms: Array, forces: Array, blocks: NDArray[np.int64]) -> tuple[Array, Array]:
+def _solve_parameters(terms: Array, forces: Array, blocks: NDArray[np.int64]) -> tuple[Array, Array]:
     """Solve for parameters by least squares with Huber weights; directional ones are non-negative.
 
     Returns standard errors, too.

@@ -82,8 +82,8 @@ def load_start(
     flat = matrix.reshape(-1, matrix.shape[2]), goal.reshape(-1)
     if table.front is not None:
         values, others = _balance_bodies(table, *flat)
-        return _with_friction(table, others, declared, values)
-    return _taken(table, _ridge(*flat), declared, values)
+        return _insert_friction(table, others, declared, values)
+    return _insert_solution(table, _ridge(*flat), declared, values)
 
 
 def _balance_bodies(table: ParameterTable, matrix: Array, goal: Array) -> tuple[Array, Array]:
@@ -150,7 +150,7 @@ def _entries(n: int) -> list[tuple[int, int]]:
     return [(a, c) for a in range(n) for c in range(a + 1)]
 
 
-def _taken(table: ParameterTable, solution: Array, declared: Sequence[bool], values: Array) -> Array:
+def _insert_solution(table: ParameterTable, solution: Array, declared: Sequence[bool], values: Array) -> Array:
     """Insert the solution into the parameters where it is plausible."""
     n = len(table.actuator_at)
     inertia = _entries(n)
@@ -166,10 +166,10 @@ def _taken(table: ParameterTable, solution: Array, declared: Sequence[bool], val
         values[table.inertia_at + k * table.inertia_terms] = low[p, r]
     potential = len(table.exponents) - 1
     values[table.potential_at : table.potential_at + potential] = solution[len(inertia) : len(inertia) + potential]
-    return _with_friction(table, solution[len(inertia) + potential :], declared, values)
+    return _insert_friction(table, solution[len(inertia) + potential :], declared, values)
 
 
-def _with_friction(table: ParameterTable, solution: Array, declared: Sequence[bool], values: Array) -> Array:
+def _insert_friction(table: ParameterTable, solution: Array, declared: Sequence[bool], values: Array) -> Array:
     """Insert friction and rod areas into the parameters where they are plausible."""
     for i in range(len(table.actuator_at)):
         a, own = table.actuator_at[i], 3 * i

@@ -68,11 +68,11 @@ def add_layer(build: Builder, twin: GreyTwin, fed: str) -> str:
         tick_s=tick_s,
     )
     slots = build.slots_since(before)
-    build.start_from(slots, np.concatenate([_padded(rest[slot.name].ravel(), slot.size) for _, slot in slots]))
+    build.start_from(slots, np.concatenate([_pad(rest[slot.name].ravel(), slot.size) for _, slot in slots]))
     return name
 
 
-def _padded(values: Values, size: int) -> Values:
+def _pad(values: Values, size: int) -> Values:
     return np.pad(values, (0, size - len(values)))
 
 
@@ -81,7 +81,7 @@ def _places(values: Any) -> NDArray[np.uint16]:
     return indices(np.where(np.asarray(values) < 0, NONE, values))
 
 
-def _signed(values: NDArray[np.uint16]) -> NDArray[np.int64]:
+def _decode_missing(values: NDArray[np.uint16]) -> NDArray[np.int64]:
     whole = values.astype(np.int64)
     return np.where(whole == NONE, -1, whole)
 
@@ -91,7 +91,7 @@ def _tick(
 ) -> Values:
     """Compute one sample of the layer with the machine code of the twin, without output bounds."""
     values = {name: np.asarray(array, np.float64) for name, array in w.items()}
-    sides, ports = _signed(layer.sides), _signed(layer.ports)
+    sides, ports = _decode_missing(layer.sides), _decode_missing(layer.ports)
     demand = commands[sides[:, 0]] - np.where(sides[:, 1] >= 0, commands[sides[:, 1]], 0.0)
     demand = np.clip(np.asarray(demand / values["full"], np.float32), -1.0, 1.0)
     measured = values["offset"] + values["answer_width"] * fed
@@ -112,7 +112,7 @@ def _tick(
         None,
     )
     for slot, value in zip(layer.slots, state, strict=True):
-        memory[slot.name] = _padded(value[0], slot.size) if slot.shape != value[0].shape else value[0]
+        memory[slot.name] = _pad(value[0], slot.size) if slot.shape != value[0].shape else value[0]
     scaled = (answers[0, 0] - values["offset"]) / values["answer_width"]
     return np.asarray(scaled[ports[:, 0] != 1], commands.dtype)
 

@@ -349,7 +349,7 @@ def _clamp_others(ports: IntArray, bounds: OutputBounds, runs: NearRuns, strokes
 
 
 @inner
-def _near_runs(program: GreyProgram, count: int, ticks: int, steps: int) -> NearRuns:
+def _make_near_runs(program: GreyProgram, count: int, ticks: int, steps: int) -> NearRuns:
     valves, size = program.sizes.valves, program.sizes.nodes + program.sizes.actuators
     return NearRuns(
         np.zeros((count, program.frame.size)),
@@ -391,7 +391,7 @@ def run_near(
     sizes = program.sizes
     n, count, pumps, nodes = sizes.actuators, sizes.valves, sizes.pumps, sizes.nodes
     frame, ports = program.frame, machine.ports
-    runs, ticks = _near_runs(program, len(demands), demands.shape[1], machine.steps), demands.shape[1]
+    runs, ticks = _make_near_runs(program, len(demands), demands.shape[1], machine.steps), demands.shape[1]
     work = work_arrays(program, 0)
     shared = RunValues(
         runs.frames[0], work.tangents, work.own, work.out, work.contents, work.rows, work.states, work.before,

@@ -173,7 +173,9 @@ def number_table(
     potential_at = len(numbers)
     numbers += _potential(elements.actuators, sizes, travels, exponents)
     neutral = {name: value for part in left_out for name, value in LEFT_OUT[part].items()}
-    every = tuple(_fixed(number, neutral[number.name]) if number.name in neutral else number for number in numbers)
+    every = tuple(
+        _fix_parameter(number, neutral[number.name]) if number.name in neutral else number for number in numbers
+    )
     return ParameterTable(
         every, valve_at, np.array(actuator_at), np.array(pump_at, dtype=np.int64), circuit_at, inertia_at,
         inertia_terms, potential_at, exponents, front, stretches,
@@ -263,7 +265,7 @@ def _potential(
     ]  # fmt: skip
 
 
-def _fixed(number: Parameter, value: float) -> Parameter:
+def _fix_parameter(number: Parameter, value: float) -> Parameter:
     """Return the parameter fixed at a value."""
     return replace(number, nominal=value, width=0.0, positive=False)
 

@@ -157,10 +157,10 @@ def frame_of(form: GreyForm) -> FramePlaces:
 def program_of(form: GreyForm) -> GreyProgram:
     """Return the compiled functions of a form, from the cache on disk if it has them."""
     functions = _Functions(form)
-    return functions.program(loaded_module(functions.module, form))
+    return functions.program(load_module(functions.module, form))
 
 
-def loaded_module(module: CodeModule, identity: object) -> Loaded:
+def load_module(module: CodeModule, identity: object) -> Loaded:
     """Load the functions of a module, from the cache on disk if it has them under this identity."""
     file = None if compiler.folder is None else compiler.folder / f"{digest_of(identity)}.o"
     loaded = load(read_or_compile(file, module.object_code), module.names)
@@ -230,7 +230,7 @@ class _Functions:
         self.entries = np.concatenate([self.entries, np.array(places, np.int64).reshape(-1, 2)])
         self.groups[group] = first, begin, len(self.entries)
 
-    def _by_parameter(self) -> dict[int, Expression]:
+    def _index_parameters(self) -> dict[int, Expression]:
         return dict(enumerate(self.parameters))
 
     def _stage(self) -> None:
@@ -268,7 +268,7 @@ class _Functions:
         for group, variables in (
             (BY_FRAME, moving),
             (BY_SPOOL, dict(enumerate(spools))),
-            (BY_PARAMETER, self._by_parameter()),
+            (BY_PARAMETER, self._index_parameters()),
         ):
             written += self._slopes(group, len(written), whole, variables)
         self._add("slopes", written)
@@ -281,7 +281,7 @@ class _Functions:
         contents = self.equations.contents(pressures)
         own = [self._jacobian([content], [p])[0][0] for content, p in zip(contents, pressures, strict=True)]
         written = [*contents, *own]
-        written += self._slopes(CONTENT_PARAMETERS, len(written), contents, self._by_parameter())
+        written += self._slopes(CONTENT_PARAMETERS, len(written), contents, self._index_parameters())
         self._add("contents", written)
 
     def _bristles(self) -> None:
@@ -292,7 +292,7 @@ class _Functions:
         by_speed = [self._jacobian([after[i]], [speeds[i]])[0][0] for i in range(n)]
         by_before = [self._jacobian([after[i]], [before[i]])[0][0] for i in range(n)]
         written = [*after, *by_speed, *by_before]
-        written += self._slopes(BRISTLE_PARAMETERS, len(written), after, self._by_parameter())
+        written += self._slopes(BRISTLE_PARAMETERS, len(written), after, self._index_parameters())
         self._add("bristles", written)
 
     def _valves(self) -> None:
@@ -337,7 +337,7 @@ class _Functions:
         for group, variables in (
             (PUMP_FRAME, {k: self.inputs[k] for k in places}),
             (PUMP_PILOTS, dict(enumerate(pilots))),
-            (PUMP_PARAMETERS, self._by_parameter()),
+            (PUMP_PARAMETERS, self._index_parameters()),
         ):
             written += self._slopes(group, len(written), after, variables)
         self._add("pumps", written)

@@ -14,9 +14,9 @@ from edp.networks.twin.grey.correction import (
     OutputBounds,
     RunTrace,
     correct,
-    fed_ports,
     note_bounds,
     note_slopes,
+    read_ports,
     seed,
     state_rows,
 )
@@ -318,7 +318,7 @@ def run_batch(
             copy(before[n:], y[nodes:])
             tangents_by = at.NONE
             if cell is not None:
-                fed_ports(ports, y, s, fed)
+                read_ports(ports, y, s, fed)
             if trace is not None:
                 by_weights = by_weights or not _are_finite(measured)
                 tangents_by = at.BY_STATE if by_weights else at.NONE
@@ -328,7 +328,7 @@ def run_batch(
                 note_slopes((t, run), rows, tangents, trace)
             if cell is not None:
                 correct((t, run), y, s, fed, ports, cell, trace)
-                fed_ports(ports, y, s, proposed)
+                read_ports(ports, y, s, proposed)
             clamp_outputs(ports, bounds, before, y, s, machine.tick_s)
             if trace is not None:
                 note_bounds((t, run), y, s, ports, bounds, proposed, trace)

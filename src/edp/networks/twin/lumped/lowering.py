@@ -12,7 +12,7 @@ from edp.ir import Builder
 from edp.ir.base import INPUT
 from edp.ir.layers import Activate, BinaryOperation, Clip, Function, ScaleShift
 from edp.ir.memory import Feed, Feedback
-from edp.networks.twin.lowering import stopped_strokes
+from edp.networks.twin.lowering import add_stroke_stops
 from edp.networks.twin.lumped.constants import EDGE, EMPTY, SLIP, SPILL
 from edp.networks.twin.lumped.parts import Doubles
 
@@ -96,7 +96,7 @@ def lowered_answers(build: Builder, twin: ElementsTwin, fed: str) -> str:
             columns = [twin.columns[mass.velocity] for mass in parts.masses]
             speed = tick.bounded("bounded", tick.scaled("scaled", _masses(tick), columns), columns)
             if channels.strokes:
-                speed, stroke = stopped_strokes(build, twin, fed, speed, columns)
+                speed, stroke = add_stroke_stops(build, twin, fed, speed, columns)
                 note(stroke, [len(channels.velocities) + column for column in columns])
             note(speed, columns)
     if parts.lags:
@@ -162,7 +162,7 @@ def _tanks(tick: _Tick) -> list[tuple[str, list[int]]]:
         build.start_from(slots, twin.starting_levels(twin.numbers))
         values.append(hidden)
     before = build.pick("in_order", build.join("levels", *values), [order.index(tank.name) for tank in tanks])
-    risen = _risen(tick, before)
+    risen = _add_level_changes(tick, before)
     if hidden:
         own = [i for i, tank in enumerate(tanks) if not tank.level]
         left = tick.both("left", ADD, build.pick("before", before, own), build.pick("rise", risen, own))
@@ -182,7 +182,7 @@ def _tanks(tick: _Tick) -> list[tuple[str, list[int]]]:
     return [(tick.bounded("stroke", stroke, columns), columns), (tick.bounded("bounded", speed, speeds), speeds)]
 
 
-def _risen(tick: _Tick, before: str) -> str:
+def _add_level_changes(tick: _Tick, before: str) -> str:
     """Add the changes of all levels in a sample, by the midpoint rule."""
     twin, build, tanks = tick.twin, tick.build, tick.twin.elements.tanks
     step, inflow = 1.0 / (twin.channels.rate_hz * twin.spec.steps), tick.numbers([t.name for t in tanks], "inflow")

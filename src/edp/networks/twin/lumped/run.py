@@ -55,7 +55,7 @@ def _tanh(x: Any) -> Any:
 
 
 @inner
-def _held(value: Any, low: float, high: float) -> Any:
+def _clip(value: Any, low: float, high: float) -> Any:
     """Within bounds; a slope passes where no bound acts."""
     if value.real < low:
         return value * 0.0 + low
@@ -72,7 +72,7 @@ def _move_lags(numbers: Values, command: Doubles, answer: Values, after: Values,
         which, column, at = lags[k, 0], lags[k, 1], lags[k, 2]
         goal = numbers[at] * command[which] + numbers[at + 1]
         share = 1.0 - np.exp(-1.0 / (numbers[at + 2] * rate))
-        after[column] = _held(answer[column] + share * (goal - answer[column]), low[column], high[column])
+        after[column] = _clip(answer[column] + share * (goal - answer[column]), low[column], high[column])
 
 
 @inner
@@ -93,13 +93,13 @@ def _move_masses(numbers: Values, command: Doubles, answer: Values, after: Value
             damping = viscous + leaning * side
             steep = damping + (coulomb + leaning * velocity) * (1.0 - side * side) / slip
             velocity = velocity + step * (push - damping * velocity - coulomb * side) / (1.0 + step * steep)
-        velocity = _held(velocity, low[column], high[column])
+        velocity = _clip(velocity, low[column], high[column])
         if strokes:
             end = count + column
             stroke = answer[end] + 0.5 * (answer[column] + velocity) / rate
             if (stroke.real > high[end] and velocity.real > 0.0) or (stroke.real < low[end] and velocity.real < 0.0):
                 velocity = velocity * 0.0
-            after[end] = _held(stroke, low[end], high[end])
+            after[end] = _clip(stroke, low[end], high[end])
         after[column] = velocity
 
 
@@ -144,9 +144,9 @@ def _fill_tanks(
     for k in range(len(tanks)):
         column = tanks[k, 2]
         if column >= 0:
-            after[column] = _held(now[k], low[column], high[column])
+            after[column] = _clip(now[k], low[column], high[column])
             speed = column - count
-            after[speed] = _held((after[column] - answer[column]) * rate, low[speed], high[speed])
+            after[speed] = _clip((after[column] - answer[column]) * rate, low[speed], high[speed])
         else:
             hidden[tanks[k, 3]] = now[k] * 0.0 if now[k].real < 0.0 else now[k]
 
@@ -185,7 +185,7 @@ def free_run(numbers: Values, commands: Doubles, answer: Values, hidden: Values,
 
 
 @compiled
-def measured_run(
+def simulate_measured(
     numbers: Doubles,
     commands: NDArray[np.float32],
     measured: NDArray[np.float32],

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from edp.data.episodes import by_machine
+from edp.data.episodes import group_by_machine
 from edp.data.series import Series
 from edp.data.task import Task
 from edp.networks.blocks.machine_code import CodedChannels, MachineCode
@@ -63,7 +63,7 @@ class WithCodes(StreamStrategy):
 
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
         """Return the training series, each with its machine number as the strategy column."""
-        owned = by_machine(own_series)
+        owned = group_by_machine(own_series)
         self.machines = len(owned)
         numbers = {name: np.float32(number) for number, name in enumerate(owned)}
         return [
@@ -75,7 +75,7 @@ class WithCodes(StreamStrategy):
         """Take over the start, and give the block a table of codes, which the optimiser then learns."""
         if self.start is not None:
             continue_from(net, self.start)
-        block, self.told = coded_block(net), torch.zeros(0)
+        block, self.told = find_coded_block(net), torch.zeros(0)
         draws = torch.randn(self.machines * len(block.machine_code), generator=torch.Generator().manual_seed(spec.seed))
         # A vector: optimisers that precondition matrices would need the square of the number of machines.
         block.table = nn.Parameter(SPREAD * draws)
@@ -83,7 +83,7 @@ class WithCodes(StreamStrategy):
 
     def tell(self, net: Predictor, strategy_columns: Tensor, reset: Tensor) -> None:
         """Set the code of each stream's machine, or no code for the whole stream."""
-        self.block = block = coded_block(net)
+        self.block = block = find_coded_block(net)
         drawn = (torch.rand(len(reset), 1, device=reset.device) >= UNKNOWN).float()
         # Of another size only before the first chunk, with which all streams begin.
         self.told = torch.where(reset[:, None], drawn, self.told) if len(self.told) == len(reset) else drawn
@@ -101,10 +101,10 @@ class WithCodes(StreamStrategy):
 
     def end(self, net: Predictor) -> None:
         """Drop the table: the code of any machine is found from its logs."""
-        del coded_block(net).table
+        del find_coded_block(net).table
 
 
-def coded_block(net: Predictor) -> CodedChannels:
+def find_coded_block(net: Predictor) -> CodedChannels:
     """Return the block of a network that reads a code.
 
     Raises:

@@ -167,7 +167,7 @@ SOURCES: Registry[type[LiveSource]] = Registry("live source")
 """By the name of its option."""
 
 
-def chosen_rate(options: SourceOptions, needs: Needs, what: str) -> float:
+def choose_rate(options: SourceOptions, needs: Needs, what: str) -> float:
     """Rate of a source that takes it from the models.
 
     Raises:

@@ -10,7 +10,7 @@ import numpy as np
 from edp.errors import ConfigError, DataError, brief
 from edp.signals import VOCABULARY, Channel, Kind
 from edp.workflows.live.sources.arrivals import Arrivals
-from edp.workflows.live.sources.base import SOURCES, LiveSource, Needs, Row, Sink, SourceOptions, chosen_rate
+from edp.workflows.live.sources.base import SOURCES, LiveSource, Needs, Row, Sink, SourceOptions, choose_rate
 
 JOINTS, PRESSURES = "joint_states", "pressures"
 """Topics: sensor_msgs/JointState, whose names are channels, and sensor_msgs/FluidPressure, whose frame_id is one."""
@@ -63,7 +63,7 @@ class Ros2Source(LiveSource):
     def of(cls, options: SourceOptions, needs: Needs) -> Ros2Source:
         """Return a source with the channels of the models; without a model those of Table A.1."""
         channels = tuple(needs.channels) or tuple(VOCABULARY.values())[:24]
-        source = cls(channels, chosen_rate(options, needs, "--ros2"))
+        source = cls(channels, choose_rate(options, needs, "--ros2"))
         source.machine = options.machine
         return source
 

@@ -13,13 +13,13 @@ import numpy as np
 
 from edp.errors import ConfigError, DataError
 from edp.live.addresses import LOOPBACK, resolve_bind
-from edp.logs.units import check_unit, mapped_channel, unit_for
+from edp.logs.units import channel_from_entry, check_unit, unit_for
 from edp.settings.bounds import shown
 from edp.signals import VOCABULARY, Channel, Kind, SignalMap
 from edp.storage.reading import Table, parse_json
 from edp.wording import typed
 from edp.workflows.live.sources.arrivals import Arrivals
-from edp.workflows.live.sources.base import SOURCES, LiveSource, Needs, Row, Sink, SourceOptions, chosen_rate
+from edp.workflows.live.sources.base import SOURCES, LiveSource, Needs, Row, Sink, SourceOptions, choose_rate
 
 MOST_BYTES = 16_384
 """Of a datagram: 400 channels; a network's own limit is 65,507."""
@@ -80,8 +80,8 @@ class UdpSource(LiveSource):
     @classmethod
     def of(cls, options: SourceOptions, needs: Needs) -> UdpSource:
         """`SourceOptions.value` is the port; the setting ``bind`` another address than loopback."""
-        rate, signal_map = chosen_rate(options, needs, "--udp"), options.signal_map()
-        mapped = tuple(mapped_channel(entry) for entry in signal_map.channels) if signal_map else ()
+        rate, signal_map = choose_rate(options, needs, "--udp"), options.signal_map()
+        mapped = tuple(channel_from_entry(entry) for entry in signal_map.channels) if signal_map else ()
         names = {channel.name for channel in mapped}
         channels = (*mapped, *(channel for channel in needs.channels if channel.name not in names))
         host = options.settings.get("bind", LOOPBACK)
@@ -95,7 +95,7 @@ class UdpSource(LiveSource):
             sink.note("warning", f"rows are taken from {self._bind.reach}, whoever sends them")
         arrivals = Arrivals(sink, self.rate_hz)
         while not sink.stopped:
-            message = self._received(sink)
+            message = self._receive(sink)
             if message is None:
                 arrivals.wait()
             else:
@@ -112,7 +112,7 @@ class UdpSource(LiveSource):
         except (OSError, ValueError):  # closed meanwhile
             return False
 
-    def _received(self, sink: Sink) -> Mapping[str, float] | None:
+    def _receive(self, sink: Sink) -> Mapping[str, float] | None:
         try:
             data = self._socket.recv(MOST_BYTES + 1)
         except TimeoutError:
@@ -184,7 +184,7 @@ def _conversions(signal_map: SignalMap | None) -> Callable[[str, Mapping[str, fl
     """From a channel's name and a row to its value in SI units."""
     entries: Table = {entry.name: entry for entry in (signal_map.channels if signal_map else ())}
     units = {
-        name: unit_for(check_unit(entry.unit, where), mapped_channel(entry).kind, where)
+        name: unit_for(check_unit(entry.unit, where), channel_from_entry(entry).kind, where)
         for name, entry in entries.items()
         if entry.unit is not None and (where := f"signal map, channel '{name}'")
     }

@@ -104,7 +104,7 @@ def _thesis(context: SearchContext, passed: list[str], arms: list[Table]) -> Cou
     outcomes = yield [
         order for arm in arms for seed in range(seeds) for order in context.orders(arm, range(runs), seed=seed)
     ]
-    scores = _by_metric(context, outcomes, len(arms), seeds, runs)
+    scores = _collect_scores(context, outcomes, len(arms), seeds, runs)
     evidence = thesis_confirm(scores, passed, METRICS, context.spec.confirmation.alpha)
     confirmed = tuple(name for name in passed if any(entry.confirmed for entry in evidence if entry.module == name))
     texts = (_thesis_text(name, [entry for entry in evidence if entry.module == name]) for name in passed)
@@ -112,7 +112,7 @@ def _thesis(context: SearchContext, passed: list[str], arms: list[Table]) -> Cou
     return Decision("confirmation", facts, (_headline(confirmed), *texts))
 
 
-def _by_metric(context: SearchContext, outcomes: Sequence[Outcome], arms: int, seeds: int, runs: int) -> Array:
+def _collect_scores(context: SearchContext, outcomes: Sequence[Outcome], arms: int, seeds: int, runs: int) -> Array:
     """``(metric, arm, split, seed)``; a failed training has the worst of its metric."""
     rows = [[outcome.mean(context.spec.horizon, metric) for outcome in outcomes] for metric in METRICS]
     scores = np.array(rows).reshape(len(METRICS), arms, seeds, runs).swapaxes(2, 3)

@@ -105,7 +105,7 @@ class Isolation:
             features=chosen,
             mean_scores=means,
             comparisons=self._comparisons(context, tables, chosen),
-            backbones=lowest_against_others(own, _judged(context)[0]),
+            backbones=lowest_against_others(own, _mask_sessions(context)[0]),
             variance=_proxy(context, tables, arms),
         )
         sentences = [
@@ -137,7 +137,7 @@ class Isolation:
                 continue
             reference = min(references, key=lambda name: float(np.nanmean(own[name])))
             first, second = (own[name].mean(axis=0) for name in (chosen, reference))
-            mask, _ = _judged(context)
+            mask, _ = _mask_sessions(context)
             test = clustered_t(np.where(mask, first - second, 0.0), mask)
             change = relative_change(test, float(np.nanmean(second)))
             comparisons[backbone] = FeatureComparison(**vars(change), reference=reference)
@@ -165,7 +165,7 @@ def _tables(context: SearchContext, outcomes: Sequence[Outcome], arms: int, name
     """Scores of each arm ``(seed, run, session)``; failed trainings count as the worst of all arms."""
     spec = context.spec
     size = spec.isolation.runs
-    mask, seen = _judged(context)
+    mask, seen = _mask_sessions(context)
     raw = np.stack([context.table(outcomes[at : at + size], name)[:, seen] for at in range(0, len(outcomes), size)])
     filled = fill_worst(raw, mask)
     # Cells that no run judges are no scores.
@@ -173,7 +173,7 @@ def _tables(context: SearchContext, outcomes: Sequence[Outcome], arms: int, name
     return list(filled.reshape(arms, spec.isolation.seeds, size, -1))
 
 
-def _judged(context: SearchContext) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _mask_sessions(context: SearchContext) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return a mask ``(run, session)`` of the sessions that some run judges, and those sessions."""
     mask = context.folds(context.spec.isolation.runs)
     seen = np.asarray(mask.any(axis=0))
@@ -187,7 +187,7 @@ def _proxy(context: SearchContext, tables: list[Array], arms: list[tuple[str, st
     backbone stands in for it; with one feature set, that between backbones, and with one arm, that between seeds. The
     largest of them counts.
     """
-    mask, _ = _judged(context)
+    mask, _ = _mask_sessions(context)
     pairs = [(i, j) for i in range(len(arms)) for j in range(i + 1, len(arms))]
     # Pairs of the same backbone show what a feature set changes; other pairs only where there are none.
     alike = [(i, j) for i, j in pairs if arms[i][0] == arms[j][0]] or pairs

@@ -55,7 +55,7 @@ def _sound(context: SearchContext) -> Course:
     barred = [sorted(pair) for pair in contradicting(base, free, context.channels)]
     # A design needs more runs than effects.
     design = two_level_design(free, max(spec.screening.runs, least_runs(len(free))), sorted(barred))
-    drawn = _drawn(context, window, spec.screening.repeats * len(design.levels))
+    drawn = _draw_values(context, window, spec.screening.repeats * len(design.levels))
     orders, rows = [], []
     for repeat in range(spec.screening.repeats):
         for row, levels in enumerate(design.levels):
@@ -66,10 +66,10 @@ def _sound(context: SearchContext) -> Course:
             orders += context.orders(settings, [repeat])
             rows.append(_DesignRow(levels, values, repeat))
     outcomes = yield orders
-    return _passed_by_design(context, design, rows, outcomes)
+    return _estimate_effects(context, design, rows, outcomes)
 
 
-def _drawn(context: SearchContext, window: Space, count: int) -> list[dict[str, float]]:
+def _draw_values(context: SearchContext, window: Space, count: int) -> list[dict[str, float]]:
     """Values inside the window by chance, so that effects are averages over it."""
     rng = np.random.default_rng(context.seed("screening"))
     candidates = []
@@ -98,7 +98,7 @@ class _DesignRow:
     repeat: int
 
 
-def _passed_by_design(
+def _estimate_effects(
     context: SearchContext,
     design: Factorial,
     rows: Sequence[_DesignRow],

@@ -58,7 +58,7 @@ class Synthesis:
         if facts.antagonistic:
             left = ", ".join(map(title_of, facts.antagonistic))
             sentences.append(f"Confirmed alone, but not wanted together: {left}.")
-        ours, base = (_shown(facts.test[arm]["composite"], context.unit) for arm in ("synthesis", "baseline"))
+        ours, base = (_format_score(facts.test[arm]["composite"], context.unit) for arm in ("synthesis", "baseline"))
         gain = facts.test_gain
         interval = "" if gain is None else f"; {percent(gain.change, signed=True)}, p {typed(gain.p, 2)}"
         sentences.append(
@@ -113,7 +113,7 @@ def gained(context: SearchContext, outcomes: Sequence[Outcome]) -> RelativeChang
     return relative_change(clustered_t(arms[0] - arms[1]), float(arms[1].mean()))
 
 
-def _shown(score: float | None, unit: str) -> str:
+def _format_score(score: float | None, unit: str) -> str:
     return "no score, since a training failed" if score is None else typed(score, 3) + behind(unit)
 
 
