@@ -225,15 +225,6 @@ def apply_delta(base: Predictor, delta: Delta) -> Predictor:
     return network.eval()
 
 
-def write_delta(path: str | Path, delta: Delta) -> None:
-    """Write a delta, whole or not at all.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
-    write_bytes(Path(path), delta.to_bytes())
-
-
 def read_delta(path: str | Path) -> Delta:
     """Read a delta from its file.
 
