@@ -1,6 +1,7 @@
 """The back of the bucket pushes soil: passive pressure, mass, no energy, heaps, prints of the heel, refusals."""
 
 import dataclasses
+from importlib import resources
 
 import numpy as np
 import pytest
@@ -162,7 +163,7 @@ def test_it_converges_as_the_front_does():
 
 
 def test_a_snapshot_goes_on_to_the_bit(tmp_path):
-    text = (soil.resources.files("edp.sim") / "materials" / "sandy_loam.toml").read_text()
+    text = (resources.files("edp.sim") / "materials" / "sandy_loam.toml").read_text()
     path = tmp_path / "pushed.toml"
     path.write_text(text + "\nback_push = 0.8\nback_friction_deg = 12.0\n")
     simulation = Simulation(Scenario(excitation="grading", material=str(path), duration_s=12.0, seed=4))
