@@ -24,7 +24,7 @@ from safetensors.numpy import load, save
 
 from edp.errors import BundleError
 from edp.networks.predictor import Predictor
-from edp.storage import object_with, parse_json, read_bytes, write_bytes
+from edp.storage import object_with, parse_json, read_bytes
 from edp.storage.arrays import ArrayRule, checked_arrays
 from edp.training.bundle import weights_digest
 

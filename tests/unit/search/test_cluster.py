@@ -8,8 +8,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from ray_nodes import needs_ray, three_nodes
 from noted_progress import NotedProgress
+from ray_nodes import needs_ray, three_nodes
 
 import edp.jobs.cluster
 from edp.errors import ConfigError

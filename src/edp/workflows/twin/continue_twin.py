@@ -18,8 +18,7 @@ from edp.networks.twin import TWINS, Twin
 from edp.networks.twin.model_selection import AutoTwin
 from edp.networks.twin.recurrent import RecurrentTwin, member_seed
 from edp.networks.twin.recurrent_members import replace_scales, scales_for, separated
-from edp.networks.twin.static_map import StaticMap, StaticTwin
-from edp.settings.tree import Table
+from edp.networks.twin.static_map import StaticMap
 from edp.storage.runs import PARTS, KeyedRun
 from edp.training.fitted_twin import FittedTwin
 from edp.training.free_run_members import MemberTraining, join_members
