@@ -171,14 +171,12 @@ def drawn_parts(
     def single(*shape: int) -> np.ndarray:
         return rng.normal(size=shape).astype(np.float32).astype(float)
 
-    ones = np.ones(inputs)
     widths = np.concatenate([np.ones((summaries, 1)), 0.01 * np.abs(single(summaries, points))], axis=1)
-    watches = tuple(
-        Watch(kind(0.5), single(summaries), single(summaries, directions)) for kind in (CusumSpec, EwmaSpec)
-    )
+    kinds = CusumSpec(0.5), EwmaSpec(0.5)
+    watches = tuple(Watch(kind, single(summaries), single(summaries, directions)) for kind in kinds)
     sums = BlockSummaries(
-        block=BLOCK, centre=0.1 * ones, spread=ones, scale=np.ones(residuals), change=np.ones(residuals),
-        channel=np.arange(residuals) % inputs, level=np.arange(points // 2),
+        block=BLOCK, centre=np.full(inputs, 0.1), spread=np.ones(inputs), scale=np.ones(residuals),
+        change=np.ones(residuals), channel=np.arange(residuals) % inputs, level=np.arange(points // 2),
         moving=np.arange(points - points // 2) % inputs,
         drivers=np.arange(drivers * residuals * 2).reshape(drivers, residuals, 2) % inputs,
     )  # fmt: skip
@@ -186,23 +184,18 @@ def drawn_parts(
         offset=single(points), width=np.ones(points), usual=single(summaries, points + 1),
         spread=widths.astype(np.float32).astype(float), floor=np.full(summaries, 0.25), clip=6.0,
     )  # fmt: skip
-    chain = MonitorChain(
-        sums, conditioning, SlowDrift(0.001, 0.5), watches, limit=1e9, quiet=0.0, settle=SETTLE,
-    )  # fmt: skip
-    pairs = np.stack([np.arange(residuals) % inputs, (np.arange(residuals) + 1) % inputs], axis=1)
+    chain = MonitorChain(sums, conditioning, SlowDrift(0.001, 0.5), watches, limit=1e9, quiet=0.0, settle=SETTLE)
+    pairs = (np.arange(residuals)[:, None] + np.arange(2)) % inputs
     columns = {channel.name: i for i, channel in enumerate(channels)}
     source = network or Balances(
         tuple(columns), pairs, 100.0 * np.ones(residuals), np.ones(residuals), 100.0, np.zeros(inputs, np.float32),
         ("1",) * residuals,
     )  # fmt: skip
-    nothing = GoldenChain(np.zeros((1, 2)), (-1,), (0,), np.zeros(summaries))
-    rows = GoldenResiduals(np.zeros((1, inputs), np.float32), np.zeros((1, residuals), np.float32),
-                           np.zeros(residuals, np.float32))  # fmt: skip
-    names = tuple(f"r{i}" for i in range(residuals))
-    reads = [tuple(range(inputs))] * residuals
-    return MonitorParts(
-        "drawn", "0" * 32, "drawn", channels, 100.0, names, reads, columns, (source,), chain, nothing, rows
-    )  # fmt: skip
+    golden = GoldenChain(np.zeros((1, 2)), (-1,), (0,), np.zeros(summaries))
+    rows = GoldenResiduals(*(np.zeros(shape, np.float32) for shape in ((1, inputs), (1, residuals), residuals)))
+    names, reads = tuple(f"r{i}" for i in range(residuals)), [tuple(range(inputs))] * residuals
+    about = "drawn", "0" * 32, "drawn", channels, 100.0
+    return MonitorParts(*about, names, reads, columns, (source,), chain, golden, rows)
 
 
 def fitted(rows: list[dict[str, Any]], each: float) -> dict[str, float]:

@@ -264,8 +264,7 @@ def update_ms(experiment: TwinExperiment, parts: Any, how: Callable[..., Any]) -
     twin: RecurrentTwin = formulation.start(channels, scales, data.train, 0)
     scaled = [replace(part, inputs=twin.drive(part.inputs), targets=twin.scaled(part.targets)) for part in data.train]
     windows = MeasuredWindows.read(random_windows(scaled, 100, 64, np.random.default_rng(0)), 100)
-    columns = (windows.commands, windows.outputs[:, :-1])
-    commands, truth = (torch.from_numpy(np.ascontiguousarray(values.swapaxes(0, 1))) for values in columns)
+    commands, truth = (torch.tensor(v.swapaxes(0, 1)) for v in (windows.commands, windows.outputs[:, :-1]))
     port, start = torch.zeros_like(truth), (truth[0], torch.zeros(64, twin.network.units))
     spent = []
     # As a training runs: idle threads of the linear algebra library would spin, and count, in both ways.
