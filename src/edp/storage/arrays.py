@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import StorageError
+from edp.wording import typed
 
 Arrays = Mapping[str, NDArray[Any]]
 POSITIVE = np.nextafter(0.0, 1.0)
@@ -56,9 +57,9 @@ class ArrayRule:
         parts = (f"{one} = {sizes[one]}" if isinstance(one, str) and one in sizes else str(one) for one in self.shape)
         words = [f"{np.dtype(self.dtype)} of shape ({', '.join(parts)})"] + ["finite"] * self.is_finite
         if self.low > -math.inf:
-            words.append("above 0" if self.low == POSITIVE else f"at least {self.low:g}")
+            words.append("above 0" if self.low == POSITIVE else f"at least {typed(self.low)}")
         if self.high != math.inf:
-            words.append(f"below {self.high}" if isinstance(self.high, str) else f"at most {self.high:g}")
+            words.append(f"below {self.high}" if isinstance(self.high, str) else f"at most {typed(self.high)}")
         return ", ".join(words)
 
 
