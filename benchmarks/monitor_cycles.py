@@ -22,16 +22,14 @@ from common import Bench, benchmark, option, table
 from controller_cycles import of_preset, traced_image
 from edp.evaluation.monitor_footprint import chain_cycles, chain_work
 from edp.export.c.target import CTarget
-from edp.export.monitor import (
-    BalancePart,
-    ChainPart,
-    GoldenChain,
-    GoldenResiduals,
-    MonitorParts,
-    NetworkPart,
-    WatchPart,
-    monitor_files,
-)
+from edp.export.monitor import GoldenChain, GoldenResiduals, MonitorParts, NetworkPart, monitor_files
+from edp.monitor.adaptation import SlowDrift
+from edp.monitor.chain import MonitorChain
+from edp.monitor.conditioning import Conditioning
+from edp.monitor.detectors import CusumSpec, EwmaSpec
+from edp.monitor.residuals.balances import Balances
+from edp.monitor.summaries import BlockSummaries
+from edp.monitor.watches import Watch
 from edp.signals import Channel, Kind
 
 PROGRAMS = ("arm-none-eabi-gcc", "arm-none-eabi-objdump", "qemu-system-arm")
@@ -173,31 +171,31 @@ def drawn_parts(
     def single(*shape: int) -> np.ndarray:
         return rng.normal(size=shape).astype(np.float32).astype(float)
 
-    ones = np.ones(inputs)
     widths = np.concatenate([np.ones((summaries, 1)), 0.01 * np.abs(single(summaries, points))], axis=1)
-    watches = tuple(
-        WatchPart(kind, 0.5, single(summaries), single(summaries, directions), 1.0) for kind in ("cusum", "ewma")
-    )
-    chain = ChainPart(
-        block=BLOCK, centre=0.1 * ones, spread=ones, impossible=1e5, scale=np.ones(residuals),
-        change=np.ones(residuals),
-        channel=tuple(i % inputs for i in range(residuals)), level=tuple(range(points // 2)),
-        moving=tuple(i % inputs for i in range(points - points // 2)),
-        drivers=np.arange(drivers * residuals * 2).reshape(drivers, residuals, 2) % inputs, point_offset=single(points),
-        point_width=np.ones(points), point_limit=3.0, usual=single(summaries, points + 1),
-        wide=widths.astype(np.float32).astype(float), least=np.full(summaries, 0.25), clip=6.0, gross=1e3,
-        drift_step=0.001, drift_most=0.5, watches=watches, limit=1e9, quiet=0.0, settle=SETTLE,
+    kinds = CusumSpec(0.5), EwmaSpec(0.5)
+    watches = tuple(Watch(kind, single(summaries), single(summaries, directions)) for kind in kinds)
+    sums = BlockSummaries(
+        block=BLOCK, centre=np.full(inputs, 0.1), spread=np.ones(inputs), scale=np.ones(residuals),
+        change=np.ones(residuals), channel=np.arange(residuals) % inputs, level=np.arange(points // 2),
+        moving=np.arange(points - points // 2) % inputs,
+        drivers=np.arange(drivers * residuals * 2).reshape(drivers, residuals, 2) % inputs,
     )  # fmt: skip
-    source = network or BalancePart(
-        tuple(range(inputs)), np.zeros(inputs, np.float32), tuple(i % inputs for i in range(residuals)),
-        tuple((i + 1) % inputs for i in range(residuals)), np.ones(residuals), np.full(residuals, 0.99),
+    conditioning = Conditioning(
+        offset=single(points), width=np.ones(points), usual=single(summaries, points + 1),
+        spread=widths.astype(np.float32).astype(float), floor=np.full(summaries, 0.25), clip=6.0,
     )  # fmt: skip
-    nothing = GoldenChain(np.zeros((1, 2)), (-1,), (0,), np.zeros(summaries))
-    rows = GoldenResiduals(np.zeros((1, inputs), np.float32), np.zeros((1, residuals), np.float32),
-                           np.zeros(residuals, np.float32))  # fmt: skip
-    names = tuple(f"r{i}" for i in range(residuals))
-    reads = [tuple(range(inputs))] * residuals
-    return MonitorParts("drawn", "0" * 32, "drawn", channels, 100.0, names, reads, (source,), chain, nothing, rows)
+    chain = MonitorChain(sums, conditioning, SlowDrift(0.001, 0.5), watches, limit=1e9, quiet=0.0, settle=SETTLE)
+    pairs = (np.arange(residuals)[:, None] + np.arange(2)) % inputs
+    columns = {channel.name: i for i, channel in enumerate(channels)}
+    source = network or Balances(
+        tuple(columns), pairs, 100.0 * np.ones(residuals), np.ones(residuals), 100.0, np.zeros(inputs, np.float32),
+        ("1",) * residuals,
+    )  # fmt: skip
+    golden = GoldenChain(np.zeros((1, 2)), (-1,), (0,), np.zeros(summaries))
+    rows = GoldenResiduals(*(np.zeros(shape, np.float32) for shape in ((1, inputs), (1, residuals), residuals)))
+    names, reads = tuple(f"r{i}" for i in range(residuals)), [tuple(range(inputs))] * residuals
+    about = "drawn", "0" * 32, "drawn", channels, 100.0
+    return MonitorParts(*about, names, reads, columns, (source,), chain, golden, rows)
 
 
 def fitted(rows: list[dict[str, Any]], each: float) -> dict[str, float]:

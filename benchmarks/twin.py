@@ -33,11 +33,13 @@ from edp.networks.twin.grey.fit_spec import GreyFitSpec
 from edp.networks.twin.greybox import GreyBox, GreyTwin
 from edp.networks.twin.recurrent import RecurrentTwin
 from edp.networks.twin.recurrent_cell import TwinNetwork
+from edp.networks.twin.windows import MeasuredWindows, random_windows
 from edp.settings.results import plain_value
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.testing.twin_cell import plain_steps
 from edp.training.blas import one_blas_thread
-from edp.training.free_run import FreeRunProgress, FreeRunSampler, FreeRunSpec, fit_free_runs
+from edp.training.fitted_twin import FreeRunProgress
+from edp.training.free_run import FreeRunSpec, fit_free_runs
 from edp.training.grey_fit import fit_grey_box
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 from edp.workflows.twin.train_twin import prepare_twin
@@ -260,9 +262,9 @@ def update_ms(experiment: TwinExperiment, parts: Any, how: Callable[..., Any]) -
     channels, scales, data = parts
     formulation: Any = experiment.twin  # RECURRENT says which
     twin: RecurrentTwin = formulation.start(channels, scales, data.train, 0)
-    sampler = FreeRunSampler(twin, data.train, 100)
-    rows = sampler.rows(100, 64, np.random.default_rng(0))[:-1]
-    commands, truth = (torch.from_numpy(values[rows]) for values in (sampler.commands, sampler.answers))
+    scaled = [replace(part, inputs=twin.drive(part.inputs), targets=twin.scaled(part.targets)) for part in data.train]
+    windows = MeasuredWindows.read(random_windows(scaled, 100, 64, np.random.default_rng(0)), 100)
+    commands, truth = (torch.tensor(v.swapaxes(0, 1)) for v in (windows.commands, windows.outputs[:, :-1]))
     port, start = torch.zeros_like(truth), (truth[0], torch.zeros(64, twin.network.units))
     spent = []
     # As a training runs: idle threads of the linear algebra library would spin, and count, in both ways.

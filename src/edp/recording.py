@@ -116,7 +116,7 @@ class Recording:
             part = part.base
         return False
 
-    def set_digest(self, digest: str) -> Recording:
+    def with_digest(self, digest: str) -> Recording:
         """Return a copy of the recording with a digest that was computed before.
 
         Changing the values discards the digest.

@@ -21,7 +21,7 @@ from edp.settings.tree import SettingsTree
 from edp.sim.data_set import SimulationOrder
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import MACHINE_FILE, check_machine
-from edp.sim.physics.soil import MATERIAL_FILE, Material
+from edp.sim.physics.material import MATERIAL_FILE, Material
 from edp.sim.scenario_file import ScenarioFile
 
 SLIPS = (-1e26, 1e308, math.nan, math.inf, -math.inf, 10**18)

@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from edp.errors import ExportError
-from edp.ir import base, hydraulics, layers, memory
-from edp.ir.reference import STEPS
+from edp.export.golden import random_inputs
+from edp.ir import base
+from edp.ir.reference import Reference
 from edp.testing.streaming import check_graph, check_graph_costs
 from edp.training.bundle import blank_scaler
 
@@ -57,17 +58,6 @@ def test_a_covering_set_meets_every_layer_and_every_pair_of_layers(parts, coveri
     assert len(covering) < len(parts[0]) / 2
 
 
-def test_every_kind_of_layer_has_a_reference():
-    kinds = {
-        kind
-        for module in (layers, memory, hydraulics)
-        for name, kind in vars(module).items()
-        if isinstance(kind, type) and issubclass(kind, base.Layer) and kind is not base.Layer and name[0] != "_"
-    }
-    assert kinds - {memory.PrefixCorrection, memory.Feed} == set(STEPS)
-    assert {memory.PrefixCorrection, memory.Feed} <= kinds
-
-
 def test_weights_that_are_not_finite_are_refused(predictor_of):
     predictor = predictor_of("lstm")
     broken = type(predictor)(predictor.task, predictor.spec, blank_scaler(predictor.task))
@@ -75,3 +65,17 @@ def test_weights_that_are_not_finite_are_refused(predictor_of):
         next(iter(broken.heads.weights))[0, 0, 0] = torch.nan
     with pytest.raises(ExportError, match="NaN or infinite"):
         broken.graph()
+
+
+@pytest.mark.covering
+def test_many_ticks_at_once_are_the_same_ticks_one_by_one(structure, predictor_of):
+    predictor = predictor_of(structure)
+    rows = random_inputs(predictor, 20, seed=3).astype(float)
+    run = Reference(predictor.graph())
+    one_by_one = [run.step(row) for row in rows]
+    run.reset()
+    parts = [run.values(part[:, None]) for part in np.split(rows, [1, 8])]
+    for name in one_by_one[0]:
+        together = np.concatenate([part[name] for part in parts])[:, 0]
+        expected = np.array([values[name] for values in one_by_one])
+        np.testing.assert_allclose(together, expected, rtol=1e-9, atol=1e-9 * max(1.0, np.abs(expected).max(initial=0)))

@@ -10,12 +10,10 @@ import torch
 
 from edp.data.series import Series
 from edp.errors import ExportError
-from edp.ir import base, memory
+from edp.ir.kinds import FLOAT_KINDS
 from edp.ir.reference import Reference
 from edp.ir.w8a16 import Integers, calibrate, quantise
-from edp.ir.w8a16.parts import FLOAT
-from edp.ir.w8a16.quantise import LOWER, REFUSED
-from edp.ir.w8a16.single import OVER_TIME
+from edp.ir.w8a16.quantise import LOWER
 from edp.networks.integer import IntegerPredictor
 from edp.networks.running import stream_intervals, stream_predictions
 
@@ -33,7 +31,7 @@ def network(structure, predictor_of, integers_of):
 def test_networks_without_a_form_are_refused_by_name(structure, predictor_of, rows_of):
     predictor = predictor_of(structure, dtype=torch.float32)
     graph = predictor.graph()
-    if {type(layer) for layer in graph.layers} & set(REFUSED):
+    if any("integers" in layer.without for layer in graph.layers):
         with pytest.raises(ExportError, match="no form in integer arithmetic; train with"):
             calibrate(graph, [rows_of(predictor, 5)])
     else:
@@ -110,18 +108,12 @@ def test_no_weight_stays_real(network):
     for layer in integers.integers.layers:
         weighted = [values.dtype for name, values in layer.tensors().items() if "weight" in name or name == "score"]
         assert set(weighted) <= {np.dtype(np.int8)}, layer.name
-        assert layer.macs == 0 or weighted or isinstance(layer, FLOAT), layer.name
+        assert layer.macs == 0 or weighted or layer.stays_float, layer.name
 
 
 def test_every_kind_of_layer_is_known():
-    kinds = {
-        kind
-        for kind in base.Layer.__subclasses__()
-        if kind.__module__.startswith("edp.ir.") and ".w8a16." not in kind.__module__
-    }
-    kinds |= {kind for parent in kinds for kind in parent.__subclasses__()}
-    known = {*LOWER, *OVER_TIME, *REFUSED, memory.Feed}
-    assert {kind for kind in kinds if not kind.__name__.startswith("_")} <= known
+    floats = {kind for kind in FLOAT_KINDS if kind.bit_exact or kind.stays_float}
+    assert {*LOWER, *floats, *(kind for kind in FLOAT_KINDS if "integers" in kind.without)} == FLOAT_KINDS
 
 
 def test_inputs_beyond_their_range_are_clipped_and_counted(predictor_of, rows_of):

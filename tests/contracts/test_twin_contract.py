@@ -73,6 +73,9 @@ def test_every_file_of_a_formulation_registers_it():
     shared = {
         "__init__",
         "base",
+        "descent",
+        "parameters",
+        "windows",
         "intervals",
         "model_selection",
         "lowering",

@@ -10,15 +10,13 @@ import pytest
 
 from edp.errors import ConfigError, ExportError
 from edp.export import TARGETS
-from edp.export.c.calls import CALLS, Calls
-from edp.export.c.integer_calls import INTEGER_CALLS
+from edp.export.c.calls import Calls
 from edp.export.c.plan import plan
 from edp.export.c.target import CTarget
 from edp.export.c.text import number
 from edp.export.escape import c_names
 from edp.export.golden import SHARE, random_inputs, stream, tolerance
-from edp.ir import Graph, Layer, memory
-from edp.ir.reference import STEPS
+from edp.ir import Graph, Layer
 from edp.networks.input_range import LIMIT, usual_range
 
 
@@ -164,10 +162,6 @@ def test_values_do_not_lie_over_values_that_are_still_read(structure, whole, bun
             assert all(last.get(owner.get(i, ""), -1) < at for i in taken)
             owner |= dict.fromkeys(taken, layer.name)
     assert sum(made.sizes.values()) <= sum(layer.width for layer in graph.layers) + 4000
-
-
-def test_every_kind_of_layer_has_calls():
-    assert set(CALLS) - set(INTEGER_CALLS) == set(STEPS) | {memory.Feed, memory.PrefixCorrection}
 
 
 def test_what_cannot_be_written_is_refused_by_name(bundle_of, tmp_path):

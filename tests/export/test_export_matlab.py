@@ -17,10 +17,7 @@ from edp.export.escape import matlab_names
 from edp.export.golden import random_inputs, stream, tolerance
 from edp.export.simulink import native as native_file
 from edp.export.simulink.folder import Folder
-from edp.export.simulink.native import WRITERS, functions_for
-from edp.ir import memory
-from edp.ir.hydraulics import HydraulicTick
-from edp.ir.reference import STEPS
+from edp.export.simulink.native import functions_for
 
 TICKS = 24
 """More than two windows of the small networks."""
@@ -72,10 +69,6 @@ def test_matlab_code_follows_pytorch_for_a_long_time(network, matlab_folder_of, 
     octave(f"addpath('{matlab_folder_of(network)}'); {program}", tmp_path)
     found, wanted = scipy.io.loadmat(tmp_path / "found.mat")["found"], stream(predictor, inputs)
     assert (np.abs(found - wanted) <= tolerance(predictor, inputs, wanted)).all()
-
-
-def test_every_kind_of_layer_has_matlab_code():
-    assert set(WRITERS) == set(STEPS) - {HydraulicTick} | {memory.Feed, memory.PrefixCorrection}
 
 
 def test_names_of_matlab_are_their_own():

@@ -14,6 +14,7 @@ from edp.data.twin_channels import TwinChannels
 from edp.errors import ExportError
 from edp.export import make_target
 from edp.export.c import model
+from edp.export.c.parameter_index import index_header
 from edp.export.c.sizes import constant_bytes
 from edp.export.golden import grown_tolerance, random_inputs, stream
 from edp.ir.hydraulics import NONE, HydraulicTick
@@ -102,34 +103,13 @@ def front_bench():
     return plant_bundle(TwinBundle(spec, sample_twin(spec, sample_front())[0]))
 
 
-def enumerated(first, code=C):
-    """Names and numbers of the C enumeration that begins so."""
-    body = next(text for text in re.findall(r"enum \{(.*?)\}", code, re.S) if text.split(",")[0].split()[0] == first)
-    rows, at = {}, 0
-    for entry in re.sub(r"\s+", " ", body).split(","):
-        name, _, value = entry.strip().partition(" = ")
-        at = int(value) if value else at
-        rows[name] = at
-        at += 1
-    return rows
-
-
-@pytest.mark.parametrize("first", ["HEAD_AREA", "FLOW", "BULK", "DELAY", "PILOT_1"])
-def test_tables_of_places_are_those_of_the_kernel(first):
-    rows = enumerated(first)
-    assert len(rows) >= 6
-    assert rows == {name: getattr(parameter_index, name) for name in rows}
-
-
-def test_places_and_constants_of_a_linkage_are_those_of_the_kernel():
-    code, header = LINKAGE, (RUNTIME / "edp_linkage.h").read_text()
-    for first in ("MASS", "GRAVITY", "ACTUATOR"):
-        rows = enumerated(first, code)
-        assert rows == {name: getattr(parameter_index, name) for name in rows}
-    assert list(enumerated("STROKE", code).values()) == list(range(parameter_index.KNOT_VALUES + 1))
-    assert float(re.search(r"#define BEYOND ([0-9.]+)", code)[1]) == linkage.BEYOND
-    counts = {name: int(value) for name, value in re.findall(r"#define EDP_(\w+) (\d+)u", header)}
-    assert counts == {"BODIES": parameter_index.BODIES, "LINKAGE_KNOTS": parameter_index.LINKAGE_KNOTS}
+def test_the_header_of_positions_has_those_that_the_equations_read():
+    positions = {name: int(value) for name, value in re.findall(r"\b([A-Z]\w+) = (\d+)", index_header())}
+    assert positions == {name: getattr(parameter_index, name) for name in positions}
+    read = set(re.findall(r"\b[A-Z][A-Z0-9_]+\b", C + LINKAGE)) & set(vars(parameter_index))
+    assert read - set(positions) == {"ATMOSPHERE", "LEAST_ABSOLUTE"}
+    assert re.search(r"enum \{ STROKE, (\w+, ){2}\w+ \};", LINKAGE)
+    assert parameter_index.KNOT_VALUES == 4
 
 
 @pytest.mark.parametrize("mixed", [True, False], ids=["mixed", "free"])
@@ -153,6 +133,7 @@ def test_constants_are_those_of_the_kernel():
     theirs = dict.fromkeys(("ATMOSPHERE", "LEAST_ABSOLUTE"), parameter_index)
     theirs |= dict.fromkeys(("SMOOTH2", "CHECK", "IDLE", "GAMMA"), equations)
     theirs |= dict.fromkeys(("TOLERANCE", "LARGEST", "STAGE_RATIO"), tick)
+    assert float(re.search(r"#define BEYOND ([0-9.]+)", LINKAGE)[1]) == linkage.BEYOND
     assert defined == pytest.approx({name: getattr(room, name) for name, room in theirs.items()}, rel=1e-15)
     assert f"#define EDP_MOST_ITERATIONS {tick.ITERATIONS}u" in HEADER
     assert f"#define EDP_NONE {NONE}u" in HEADER

@@ -32,7 +32,7 @@ from edp.testing.twins import RATE_HZ, sample_actuators, sample_twin
 from edp.training.bundle import Bundle
 from edp.training.twin_bundle import TwinBundle
 from edp.workflows.monitor import fit_to_recordings
-from edp.workflows.monitor.export_monitor import chain_part, export_monitor, monitor_parts
+from edp.workflows.monitor.export_monitor import export_monitor, monitor_parts
 
 OK, WARMING, HELD, RESTARTED, NOT_RESET = range(5)
 M4 = ("-mthumb", "-mcpu=cortex-m4", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16")
@@ -108,7 +108,7 @@ def test_a_recording_with_a_fault_gives_the_bits_of_python(c, program, rig_monit
 
 def test_any_residuals_and_inputs_give_the_bits_of_python(c, program, rig_monitor):
     rng = np.random.default_rng(5)
-    inputs, residuals = drawn_rows(chain_part(rig_monitor.chain))
+    inputs, residuals = drawn_rows(rig_monitor.chain)
     inputs, residuals = inputs.copy(), residuals.copy()
     for rows in (inputs, residuals):
         rows *= np.exp(rng.normal(0.0, 1.5, (len(rows), 1))).astype(np.float32)

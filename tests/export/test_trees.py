@@ -14,7 +14,6 @@ from edp.export.c.integer_calls import tables_header
 from edp.ir.descent import find_leaves, summed
 from edp.ir.layers import NEVER
 from edp.ir.w8a16.layers import QTreeSums
-from edp.ir.w8a16.reference import INTEGER_STEPS
 
 SIZES = st.tuples(st.integers(1, 40), st.integers(1, 4), st.integers(1, 60), st.integers(1, 8))
 """Width, outputs, trees, depth."""
@@ -79,7 +78,7 @@ def test_integers_are_those_of_the_reference(runtime):
         layer = QTreeSums(name="t", inputs=(), frac=0, right=right, feature=feature, threshold=threshold, leaf=leaf)
         numbers = (outputs, trees, depth, right)
         found = called(runtime.edp_q_trees, rows, (feature, threshold, leaf), numbers, outputs)
-        np.testing.assert_array_equal(found, INTEGER_STEPS[QTreeSums](layer, {}, rows.astype(np.int64)))
+        np.testing.assert_array_equal(found, layer.over_time(None, rows.astype(np.int64)))
 
     check()
 

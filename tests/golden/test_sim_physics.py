@@ -9,6 +9,7 @@ from edp.sim import Scenario, load_machine, plan_data_set, simulate
 from edp.sim.machine import layout as at
 from edp.sim.machine.layout import LOG_STROKE, LOG_VELOCITY
 from edp.sim.physics import dynamics, friction, linkage, soil, terramechanics
+from edp.sim.physics.material import load_material
 from edp.sim.physics.plant import Plant
 
 CYLINDERS = range(3)
@@ -91,7 +92,7 @@ def test_five_minute_drift(strokes, name):
 @machines
 def test_five_minute_drift_with_a_full_bucket(name):
     machine = load_machine(name)
-    own = soil.Ground(soil.load_material("sandy_loam"), machine, np.random.default_rng(0))
+    own = soil.Ground(load_material("sandy_loam"), machine, np.random.default_rng(0))
     own.memory[at.PAYLOAD] = load = own.numbers[terramechanics.CAPACITY]
     plant = Plant(machine, np.array([0.85, 0.5, 0.95]), ground=own)
     found = drift_mm(plant)

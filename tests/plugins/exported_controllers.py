@@ -25,7 +25,7 @@ def control_run(folder: Path, kind: str, options: dict | None = None, grey: bool
     """A finished run of one loop on the simulator; `grey`: a plan on a grey box."""
     twin = None
     if kind == "nmpc":
-        twin = save_twin(sample_grey_box() if grey else sample_recurrent_twin(UNITS), folder / "twin")
+        twin = save_twin(sample_grey_box(is_fitted=True) if grey else sample_recurrent_twin(UNITS), folder / "twin")
     settings = {"controller": {"kind": kind, **(options or {})}, "loops": 1, "task": TASK}
     control_loops(load_control_experiment(None, [], settings), folder / "run", ControlSources(twin=twin))
     return folder / "run"

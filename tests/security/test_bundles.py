@@ -246,7 +246,7 @@ def replace(change_one):
 )
 def test_weights_that_are_not_those_of_the_header_are_refused(folder, change):
     reweighted(folder, change)
-    refused(folder, "its weights are")
+    refused(folder, "its weights: array '.*: got .*, expected")
 
 
 @pytest.fixture
@@ -260,10 +260,10 @@ def folder_with_trees(tmp_path):
         (spoil("trees.feature", 6), "a node reads column 6; 0 to 5 must hold"),
         (spoil("trees.feature", -1), "a node reads column -1; 0 to 5 must hold"),
         (spoil("trees.feature", 2**40), "a node reads column 1099511627776; 0 to 5"),
-        (spoil("trees.threshold", float("nan")), "threshold' holds a number that is not finite"),
-        (spoil("trees.leaf", float("inf")), "leaf' holds a number that is not finite"),
-        (resize("trees.threshold", (2, 2, 7)), r"threshold' is \(2, 2, 7\) .*, not \(2, 2, 3\)"),
-        (resize("trees.leaf", (2, 1, 4)), r"leaf' is \(2, 1, 4\) .*, not \(2, 2, 4\)"),
+        (spoil("trees.threshold", float("nan")), "threshold': got nan at"),
+        (spoil("trees.leaf", float("inf")), "leaf': got inf at"),
+        (resize("trees.threshold", (2, 2, 7)), r"threshold': got .* \(2, 2, 7\), expected .* \(2, 2, 3\)"),
+        (resize("trees.leaf", (2, 1, 4)), r"leaf': got .* \(2, 1, 4\), expected .* \(2, 2, 4\)"),
     ],
 )
 def test_tables_of_trees_that_cannot_be_are_refused(folder_with_trees, change, match):
@@ -295,7 +295,7 @@ def test_a_safetensors_header_that_lies_is_refused(folder):
 def test_a_network_that_its_weights_cannot_fill_is_refused(tmp_path):
     folder = save_bundle(bundle_of(TcnSpec(channels=(4, 4), kernel=3)), tmp_path)
     changed(folder, put("model", "backbone", "channels", [400, 400]), hashed=True)
-    refused(folder, "its weights are not those of its header")
+    refused(folder, "its weights: array '.*: got .*, expected")
 
 
 @pytest.mark.parametrize("schema", UNHASHED)

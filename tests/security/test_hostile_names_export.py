@@ -354,7 +354,8 @@ def test_every_template_is_filled_by_that_one_function():
                 if isinstance(node, ast.FormattedValue) and isinstance(node.value, ast.Attribute):
                     # Text of the author may be formatted into messages of errors only.
                     assert node.value.attr not in ("description", "descriptions", "unit", "provenance") or (
-                        path.name == "model.py" and node.value.attr in ("unit", "description")  # `_listed` escapes it
+                        path.name == "text.py"
+                        and node.value.attr in ("unit", "description")  # `enumeration` escapes it
                     ), f"{path}:{node.lineno}"
 
 

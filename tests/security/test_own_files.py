@@ -13,7 +13,7 @@ import pytest
 from browser import long_numbers
 
 from edp.errors import StorageError
-from edp.report.run.facts import read_history
+from edp.report.run.facts import HistoryRow, read_history
 from edp.storage import read_json, write_bytes, write_json
 from edp.storage.headers import check_files, digests_of
 from edp.storage.runs import Run
@@ -129,7 +129,8 @@ def test_a_file_without_a_hash_is_read_and_told(tmp_path):
     assert files_without_seal() == []
 
 
-EPOCHS = [{"epoch": 1, "loss": 0.5, "best": True}, {"epoch": 2, "loss": float("nan"), "best": False}]
+EPOCHS = [{"epoch": 1, "train_loss": 0.5, "best": True}, {"epoch": 2, "train_loss": float("nan"), "best": False}]
+ROWS = (HistoryRow(epoch=1, train_loss=0.5, best=True), HistoryRow(epoch=2))
 
 
 @pytest.fixture
@@ -140,12 +141,12 @@ def history(tmp_path):
 
 
 def test_every_flipped_bit_of_a_history_is_refused_with_its_line(history):
-    assert str(read_history(history)) == str(tuple(EPOCHS))
+    assert read_history(history) == ROWS
     whole = history.read_bytes()
     for place in range(len(whole)):
         history.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
         if whole[place : place + 1] == b"\n":
-            assert str(read_history(history)) == str(tuple(EPOCHS))  # another kind of line end
+            assert read_history(history) == ROWS  # another kind of line end
             continue
         with pytest.raises(StorageError, match=r"history\.jsonl' line \d was changed"):
             read_history(history)
@@ -153,7 +154,7 @@ def test_every_flipped_bit_of_a_history_is_refused_with_its_line(history):
 
 def test_a_history_of_an_earlier_version_is_read(history):
     history.write_text("".join(json.dumps(row) + "\n" for row in EPOCHS))
-    assert str(read_history(history)) == str(tuple(EPOCHS))
+    assert read_history(history) == ROWS
 
 
 def test_arrays_beside_a_result_are_bound_to_it(tmp_path):

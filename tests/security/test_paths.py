@@ -37,7 +37,7 @@ ALLOWED = {
     "storage/machine_code.py": "files of the package itself",
     "storage/ledger/record.py": "files of the package itself",
     "sim/machine/machine_files.py": "names the machine file itself; files of the package",
-    "sim/physics/soil.py": "files of the package",
+    "sim/physics/material.py": "files of the package",
     "logs/detect.py": "names the log itself",
     "logs/store/opening.py": "names the rows itself",
     "control/fmu/archive.py": "names the archive itself, and looks at entries of a ZIP file",

@@ -21,7 +21,7 @@ from edp.report.run.facts import read_limit
 from edp.report.transfer.facts import read_transfer
 from edp.settings.provenance import read_provenance
 from edp.sim.machine.machine_files import load_machine
-from edp.sim.physics.soil import load_material
+from edp.sim.physics.material import load_material
 from edp.sim.scenario_file import read_scenario_file
 from edp.storage.ledger import Ledger, read_records
 from edp.storage.runs import Run

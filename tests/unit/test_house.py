@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-OPEN_DICTIONARIES = 165
+OPEN_DICTIONARIES = 155
 WIDE_FUNCTIONS = 1
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 

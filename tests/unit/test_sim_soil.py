@@ -1,6 +1,7 @@
 """Soil: published figures, mass, passivity, bounds, and what a bad material file says."""
 
 import itertools
+from importlib import resources
 
 import numpy as np
 import pytest
@@ -10,13 +11,14 @@ from edp.sim import Scenario, load_machine, simulate
 from edp.sim.machine import layout as at
 from edp.sim.physics import soil
 from edp.sim.physics import terramechanics as tm
+from edp.sim.physics.material import load_material, material_names, parse_material
 from edp.sim.physics.plant import Plant
 
-MATERIALS = soil.material_names()
+MATERIALS = material_names()
 
 
 def ground(name, seed=0, machine="M22"):
-    return soil.Ground(soil.load_material(name), load_machine(machine), np.random.default_rng(seed))
+    return soil.Ground(load_material(name), load_machine(machine), np.random.default_rng(seed))
 
 
 def dig(name, seconds=20.0, seed=0, step_s=1e-3):
@@ -43,7 +45,7 @@ def test_cutting_forces_meet_the_earthmoving_equation(name, expected_kn):
 
 @pytest.mark.parametrize("name", MATERIALS)
 def test_cutting_factors_are_positive_at_every_rake(name):
-    table = tm.cutting_table(soil.load_material(name))
+    table = tm.cutting_table(load_material(name))
     assert np.isfinite(table).all()
     assert table[:, :2].min() > 0.5
     assert table[:, 2].min() >= 0.0
@@ -124,10 +126,10 @@ def test_a_load_is_felt_and_spilled():
 
 
 def test_a_new_material_is_a_file(tmp_path):
-    text = (soil.resources.files("edp.sim") / "materials" / "clay.toml").read_text()
+    text = (resources.files("edp.sim") / "materials" / "clay.toml").read_text()
     path = tmp_path / "mud.toml"
     path.write_text(text.replace('"clay"', '"mud"').replace("cohesion = 25e3", "cohesion = 4.1e3"))
-    mud = soil.load_material(str(path))
+    mud = load_material(str(path))
     assert (mud.name, mud.cohesion) == ("mud", 4.1e3)
 
 
@@ -148,12 +150,12 @@ def test_a_new_material_is_a_file(tmp_path):
     ],
 )
 def test_bad_materials_are_refused(change, says):
-    text = (soil.resources.files("edp.sim") / "materials" / "clay.toml").read_text()
+    text = (resources.files("edp.sim") / "materials" / "clay.toml").read_text()
     with pytest.raises(ConfigError, match=r"mud\.toml") as refused:
-        soil.parse_material(text.replace(*change), "mud.toml")
+        parse_material(text.replace(*change), "mud.toml")
     assert says in str(refused.value)
 
 
 def test_unknown_material_offers_the_closest():
     with pytest.raises(ConfigError, match="sandy_loam"):
-        soil.load_material("sandy_loan")
+        load_material("sandy_loan")

@@ -56,10 +56,11 @@ def interface_of(env: Any) -> PlantInterface:
     """Return the controller's view of an environment.
 
     Args:
-        env: a gymnasium environment with `channels`, `rate_hz`, `machine` and `commands` to the channels `PILOTS`, such
-            as `edp.sim.environment.ExcavatorEnv` or `edp.control.twin_environment.TwinEnvironment`.
+        env: a gymnasium environment, or a batch of plants, with `channels`, `rate_hz`, `machine` and `commands` to the
+            channels `PILOTS`, such as `edp.sim.environment.ExcavatorEnv` or
+            `edp.control.twin_environment.TwinEnvironment`.
     """
-    plain = env.unwrapped
+    plain = getattr(env, "unwrapped", env)
     source = getattr(plain, "source", "the simulator")
     commands = tuple(TABLE_A1[name] for name in PILOTS)
     geometry = TipGeometry(plain.machine)

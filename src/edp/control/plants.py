@@ -27,6 +27,16 @@ def is_fmu(plant: str | Path) -> bool:
     return Path(plant).suffix.lower() == FMU
 
 
+def check_trusted(fmu: str | Path, trusted: bool) -> None:
+    """Refuse an FMU that the caller does not trust.
+
+    Raises:
+        ConfigError: it is not trusted.
+    """
+    if not trusted:
+        raise ConfigError(f"FMU '{fmu}' is native code, which runs with your rights; pass trusted=True if you do")
+
+
 def plant_of(
     machine: str, duration_s: float, rate_hz: float, plant: str | Path | None = None, trusted: bool = False
 ) -> Any:
@@ -45,8 +55,7 @@ def plant_of(
     if plant is None:
         return ExcavatorEnv(EnvironmentSpec(machine=machine, duration_s=duration_s, rate_hz=rate_hz))
     if is_fmu(plant):
-        if not trusted:
-            raise ConfigError(f"FMU '{plant}' is native code, which runs with your rights; pass trusted=True if you do")
+        check_trusted(plant, trusted)
         return FmuEnvironment(plant, machine, duration_s, rate_hz)
     bundle = bundle_of(plant, load_machine(machine), rate_hz)
     return TwinEnvironment(bundle.twin, machine, duration_s, bundle.ground)

@@ -29,6 +29,7 @@ from edp.evaluation.free_run_parts import (
     stroke_errors,
 )
 from edp.networks.twin import FreeRunIntervals, Twin, TwinScales, calibrate, even_starts, starts_within
+from edp.networks.twin.windows import MeasuredWindows
 from edp.settings.bounds import MOST_BATCH, MOST_NAMES, MOST_TICKS, above, between, check_bounds, check_count, integer
 from edp.wording import figure
 
@@ -171,13 +172,11 @@ def free_runs(twin: Twin, series: Sequence[Series], seconds: float, starts: int)
     runs = even_starts(twin, series, length, starts)
     answers, truths = [], []
     for first in range(0, len(runs), LANES):
-        lanes = runs[first : first + LANES]
-        commands = np.stack([part.inputs[at : at + length - 1] for part, at in lanes])
-        truth = np.stack([part.targets[at : at + length] for part, at in lanes])
+        lanes = MeasuredWindows.read(runs[first : first + LANES], length - 1)
         with threadpool_limits(limits=1, user_api="blas"):  # see `fit_free_runs`
-            state = twin.reset(commands[:, :prefix], truth[:, :prefix])
-            answers.append(twin.rollout(commands[:, prefix:], state)[0])
-        truths.append(truth[:, prefix:])
+            state = twin.reset(lanes.commands[:, :prefix], lanes.outputs[:, :prefix])
+            answers.append(twin.rollout(lanes.commands[:, prefix:], state)[0])
+        truths.append(lanes.outputs[:, prefix:])
     whole_truth = np.concatenate(truths)
     names = tuple(part.name for part, _ in runs)
     return runs_of(twin, names, np.concatenate(answers), whole_truth)

@@ -7,16 +7,7 @@ from dataclasses import asdict, dataclass
 
 from edp.evaluation.controller import BOARD_SLOW, BOARD_TYPICAL, CORES, STACK_BYTES, Budget, Estimate, LimitCheck
 from edp.evaluation.footprint import Footprint, footprint
-from edp.export.monitor import (
-    BalancePart,
-    FlowPart,
-    MonitorParts,
-    NetworkPart,
-    SourcePart,
-    TwinPart,
-    WatchPart,
-    monitor_files,
-)
+from edp.export.monitor import MonitorParts, NetworkPart, TwinPart, WatchCode, monitor_files
 from edp.export.monitor.parts import PIECE, ROW, pieces
 from edp.networks.integer import IntegerPredictor
 from edp.networks.twin import TwinPlant
@@ -58,29 +49,29 @@ class ChainCycles:
 
 def chain_work(parts: MonitorParts) -> dict[str, float]:
     """Return the average operations of the chain per sample, by the names of `CORE_COSTS`."""
-    chain, summaries, points = parts.chain, parts.summaries, parts.points
-    products = 2.0 * summaries * points + sum(watch.matrix.size for watch in chain.watches)
-    doubles = sum(map(_watch_doubles, chain.watches)) + VERDICT * summaries + POINT * points
+    summaries, points = parts.chain.summaries, parts.points
+    products = 2.0 * summaries.width * points + sum(view.watch.matrix.size for view in parts.watches)
+    doubles = sum(map(_watch_doubles, parts.watches)) + VERDICT * summaries.width + POINT * points
     return {
-        "residual": float(len(chain.scale)),
-        "driver": float(len(chain.scale) * len(chain.drivers)),
-        "input": float(len(chain.centre) + len(chain.level) + len(chain.moving)),
-        "product": products / chain.block,
-        "double": doubles / chain.block,
-        "summary": summaries / chain.block,
+        "residual": float(summaries.residuals),
+        "driver": float(summaries.residuals * len(summaries.drivers)),
+        "input": float(len(summaries.centre) + len(summaries.level) + len(summaries.moving)),
+        "product": products / summaries.block,
+        "double": doubles / summaries.block,
+        "summary": summaries.width / summaries.block,
         "tick": 1.0,
     }
 
 
-def _watch_doubles(watch: WatchPart) -> float:
-    summaries, directions = len(watch.mean), watch.directions
-    each = DETECTOR[watch.detector] * (watch.rows if watch.detector == "glr" else 1)
+def _watch_doubles(view: WatchCode) -> float:
+    summaries, directions = len(view.watch.mean), view.directions
+    each = DETECTOR[view.detector] * (view.rows if view.detector == "glr" else 1)
     return float(CENTRE * summaries + each * directions)
 
 
 def chain_cycles(parts: MonitorParts) -> ChainCycles:
     """Cycles of the chain of a monitor."""
-    work, block = chain_work(parts), parts.chain.block
+    work, block = chain_work(parts), parts.chain.summaries.block
     flows = flow_cycles(parts)
     every = flows + sum(CORE_COSTS[name] * work[name] for name in ("residual", "driver", "input", "tick"))
     costs = _slices(parts)
@@ -93,35 +84,34 @@ def chain_cycles(parts: MonitorParts) -> ChainCycles:
 def flow_cycles(parts: MonitorParts) -> float:
     """Cycles of the balances of flow of a monitor at a tick; they are counted with the chain, since no network runs."""
     cycles = 0.0
-    for part in parts.sources:
-        if isinstance(part, FlowPart):
-            paths = sum(len(chamber.values) for chamber in part.chambers)
-            cycles += FLOW_COSTS["path"] * paths + FLOW_COSTS["chamber"] * len(part.chambers)
-            cycles += FLOW_COSTS["spool"] * len(part.gain)
+    for flows in parts.flows:
+        paths = sum(len(chamber.values) for chamber in flows.chambers)
+        cycles += FLOW_COSTS["path"] * paths + FLOW_COSTS["chamber"] * len(flows.chambers)
+        cycles += FLOW_COSTS["spool"] * len(flows.spools.gain)
     return cycles
 
 
 def _slices(parts: MonitorParts) -> list[float]:
     """Cycles of each part of the work on a block, in its order."""
-    product, double, summaries = CORE_COSTS["product"], CORE_COSTS["double"], parts.summaries
+    product, double, summaries = CORE_COSTS["product"], CORE_COSTS["double"], parts.chain.summaries.width
     costs = [POINT * double * parts.points]
     of_summary = 2.0 * product * parts.points + 6.0 * double
     costs += len(parts.residuals) * [parts.each * CORE_COSTS["summary"], *(parts.each * [of_summary])]
-    for watch in parts.chain.watches:
+    for view in parts.watches:
         costs += [CENTRE * double * size for size in pieces(summaries, ROW)]
-        if watch.own:
-            costs += [product * size for size in pieces(watch.directions, ROW)]
+        if view.watch.own:
+            costs += [product * size for size in pieces(view.directions, ROW)]
         else:
-            costs += watch.directions * [product * summaries]
-        once = [double * size for size in pieces(watch.directions, PIECE)]
-        costs += [share * cycles for share in _shares(watch) for cycles in once]
+            costs += view.directions * [product * summaries]
+        once = [double * size for size in pieces(view.directions, PIECE)]
+        costs += [share * cycles for share in _shares(view) for cycles in once]
     return [*costs, 0.0, *(VERDICT * double * size for size in pieces(summaries, ROW))]
 
 
-def _shares(watch: WatchPart) -> list[float]:
+def _shares(view: WatchCode) -> list[float]:
     """Return the cost of each pass of a detector through its directions; the second CUSUM pass is one product."""
-    each = DETECTOR[watch.detector]
-    return [0.75 * each, 0.25 * each] if watch.detector == "cusum" else watch.passes * [each]
+    each = DETECTOR[view.detector]
+    return [0.75 * each, 0.25 * each] if view.detector == "cusum" else view.passes * [each]
 
 
 @dataclass(frozen=True)
@@ -164,7 +154,7 @@ class MonitorFootprint:
         constants: bytes in read-only memory.
         ram_bytes: state, working memory and stack.
         program_bytes: code, an estimate.
-        state_bytes: state of the chain without networks, bytes.
+        state_bytes: state of the chain and of the sources without their networks, bytes.
     """
 
     networks: tuple[NetworkCost, ...]
@@ -219,7 +209,7 @@ def monitor_footprint(parts: MonitorParts) -> MonitorFootprint:
     """
     files = monitor_files(parts, "monitor")
     networks = tuple(_network(part) for part in parts.sources if isinstance(part, NetworkPart | TwinPart))
-    chain, state = chain_cycles(parts), state_bytes(parts)
+    chain, state = chain_cycles(parts), chain_bytes(parts) + sum(source.bytes for source in files.sources)
     cycles = {}
     for name, core in CORES.items():
         low, typical, high = _network_cycles(networks, name)
@@ -265,37 +255,15 @@ def _network(part: NetworkPart | TwinPart) -> NetworkCost:
     return NetworkCost(footprint(counted), form, every=part.every, first=part.first)
 
 
-def state_bytes(parts: MonitorParts) -> int:
-    """Return the state size of the chain and the sources.
+def chain_bytes(parts: MonitorParts) -> int:
+    """Return the state size of the chain.
 
-    The chain holds sums of two blocks, summaries, drift, evidence and detectors in double precision; the sources hold
-    values and due predictions in addition to their networks.
+    It holds sums of two blocks, summaries, drift, evidence and detectors in double precision.
     """
-    chain, summaries, inputs, residuals = parts.chain, parts.summaries, len(parts.inputs), len(parts.residuals)
-    sums = (8 + 2 * len(chain.drivers)) * residuals + len(chain.level) + len(chain.moving)
-    detectors = sum(w.directions * w.rows for w in chain.watches)
-    widest = max(w.directions for w in chain.watches)
-    doubles = (
-        2 * sums + 5 * summaries + inputs + parts.points + widest + detectors + 3 * len(chain.watches) + parts.each
-    )
-    own = 8 * doubles + 4 * summaries + 5 * inputs + 4 * residuals + 4 * len(chain.watches) + 80
-    return int(own + sum(map(_source_bytes, parts.sources)))
-
-
-def _source_bytes(part: SourcePart) -> int:
-    buffers = 4 * len(part.reads)
-    if isinstance(part, BalancePart):
-        return buffers + 17 * len(part.levels) + 7
-    if isinstance(part, FlowPart):
-        # Rows that are remembered, memories of both stages and the play of each spool, and where it stands.
-        return buffers + 4 * ((part.memory + 1) * len(part.reads) + 5 * len(part.gain)) + 8
-    task = part.bundle.task
-    # Counters and the last inputs, which the state of every network has beside what its layers remember.
-    network = 4 * (8 + len(part.bundle.inputs))
-    if isinstance(part, TwinPart):
-        return buffers + len(part.groups) * network + 4 * sum(map(len, part.groups)) + 4
-    coverages = len(part.bundle.predictor.output.coverages)
-    out = len(task.targets) * len(task.horizons) * (1 + 2 * coverages)
-    rings = 0 if max(part.delays) == 0 else (max(part.delays) + 1) * len(part.judged) * (2 if part.scaled else 1)
-    last = 0 if part.every == 1 else 1 + len(part.judged)
-    return buffers + network + 4 * (out + rings + last)
+    summaries, inputs, residuals = parts.chain.summaries, len(parts.inputs), len(parts.residuals)
+    sums = (8 + 2 * len(summaries.drivers)) * residuals + len(summaries.level) + len(summaries.moving)
+    detectors = sum(view.memory for view in parts.watches)
+    widest, views = max(view.directions for view in parts.watches), len(parts.watches)
+    doubles = 2 * sums + 5 * summaries.width + inputs + parts.points + widest + detectors + 3 * views + parts.each
+    own = 8 * doubles + 4 * summaries.width + 5 * inputs + 4 * residuals + 4 * views + 80
+    return int(own)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping
 from html import escape as html_escape
+from importlib import resources
 from string import Template
 
 from edp.errors import ExportError
@@ -202,6 +203,16 @@ def fill(template: str, values: Mapping[str, object]) -> Code:
                 "goes into; nothing was written. Export another bundle, and report this one"
             )
     return Code(Template(template).substitute(values))
+
+
+def package_text(path: str) -> str:
+    """Return the text of a file of `edp.export`, such as ``c/runtime/edp_runtime.c``."""
+    return resources.files("edp.export").joinpath(path).read_text(encoding="utf-8")
+
+
+def fill_file(path: str, values: Mapping[str, object]) -> Code:
+    """Fill in the blanks of a file of `edp.export`; see `fill`."""
+    return fill(package_text(path), values)
 
 
 _HARMLESS: Callable[[str], re.Match[str] | None] = re.compile(r"[A-Za-z0-9_ .,:+\-]*").fullmatch

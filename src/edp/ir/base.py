@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
 Indices = NDArray[np.uint16]
+Values = NDArray[Any]
+"""Values of a layer at several ticks of several streams, ``(time, stream, number)``."""
+Memory = dict[str, Any]
+"""What a layer remembers, by slot: ``(stream, ...)``, rings ``(tick, stream, ...)``; an age is one for all streams."""
 
 INPUT = "input"
 """The value that holds the inputs of the tick, SI units, in the order in which they are fed."""
@@ -54,6 +58,61 @@ class Slot:
         return int(np.prod(self.shape))
 
 
+class Arithmetic(ABC):
+    """Float arithmetic of an interpreter: element-wise functions and the order of sums."""
+
+    @abstractmethod
+    def apply(self, function: str, x: Values) -> Values:
+        """Return a function of each number; see `edp.ir.layers.Function`."""
+
+    @abstractmethod
+    def combine(self, operation: str, a: Values, b: Values) -> Values:
+        """Combine two values number by number; see `edp.ir.layers.BinaryOperation`."""
+
+    @abstractmethod
+    def total(self, x: Values, axis: int = -1) -> Values:
+        """Return sums over an axis."""
+
+    def softmax(self, scores: Values) -> Values:
+        """Return weights that sum to 1 over the last axis."""
+        # Subtracting the largest score keeps exp below one; the weights do not change.
+        raised = self.apply("exp", scores - scores.max(axis=-1, keepdims=True))
+        return np.asarray(raised / self.total(raised)[..., None])
+
+    def normed(self, x: Values, epsilon: float) -> Values:
+        """Return each row less its mean, over the root of its variance plus `epsilon`."""
+        count = x.dtype.type(x.shape[-1])
+        middle = x - (self.total(x) / count)[..., None]
+        scale = x.dtype.type(1.0) / np.sqrt(self.total(middle * middle) / count + x.dtype.type(epsilon))
+        return np.asarray(middle * scale[..., None])
+
+
+@dataclass(frozen=True, eq=False)
+class LayerRun:
+    """What the equations of a layer read and change in addition to its inputs.
+
+    Attributes:
+        constants: of the layer, in the number type of the interpreter.
+        memory: what the layer remembers; it is brought on.
+        others: what all layers remember, by their names.
+        arithmetic: functions and sums.
+    """
+
+    constants: Mapping[str, Values]
+    memory: Memory
+    others: Mapping[str, Memory]
+    arithmetic: Arithmetic
+
+
+def _refuse_equations(layer: Layer, run: LayerRun, *inputs: Values) -> Values:
+    """Refuse to compute a kind of layer without equations.
+
+    Raises:
+        NotImplementedError: always.
+    """
+    raise NotImplementedError(f"layer '{layer.name}' is a {type(layer).__name__}, which has no equations")
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Layer(ABC):
     """One computation of a tick: vectors in, one vector out.
@@ -61,7 +120,25 @@ class Layer(ABC):
     Attributes:
         name: of the layer and of the value that it gives; unique in its graph, lower case, parts joined by dots.
         inputs: values that it reads.
+        matrices: constants that the C runtime multiplies with, which lie in panels there.
+        counted: whether its C state has a ring or a counter.
+        stays_float: whether it stays in single precision in an integer network: it has no weights, or a few gains.
+        bit_exact: whether its equations in the arithmetic of the C runtime give the bits of the C code.
+        tick_by_tick: whether its equations compute one tick at a time, since other layers wait for what they change.
+        without: forms that this kind of layer does not have (``integers``, ``tangent``, ``onnx``, ``matlab``), each
+            with what to do instead.
     """
+
+    matrices: ClassVar[tuple[str, ...]] = ()
+    counted: ClassVar[bool] = False
+    stays_float: ClassVar[bool] = False
+    bit_exact: ClassVar[bool] = False
+    tick_by_tick: ClassVar[bool] = False
+    without: ClassVar[Mapping[str, str]] = {}
+
+    over_time: ClassVar[Callable[..., Any]] = _refuse_equations
+    """The equations: a method ``over_time(run, *inputs)`` from the values of the inputs, ``(time, stream, number)``, to
+    those of the layer; `run` is a `LayerRun`."""
 
     name: str
     inputs: tuple[str, ...]
@@ -90,6 +167,25 @@ class Layer(ABC):
     def macs(self) -> int:
         """Multiply-accumulates per sample with weights or state; element-wise work is not counted."""
         return 0
+
+    @property
+    def scratch(self) -> int:
+        """Number of work elements that its C function needs while it runs."""
+        return 0
+
+    @property
+    def tangent_scratch(self) -> int:
+        """Number of work elements of its tangent along one direction; the first direction includes the common part."""
+        return self.scratch
+
+    def products(self, x: Values, y: Values) -> dict[str, Values]:
+        """Return what its 8-bit matrices are multiplied by, ``(time, row, terms)``, by matrix.
+
+        Args:
+            x: its first input since a reset, ``(time, number)``.
+            y: its value, ``(time, number)``.
+        """
+        return {}
 
     def tensors(self) -> dict[str, NDArray[Any]]:
         """Its constant arrays by name within the layer."""

@@ -8,7 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.ir.base import Indices
-from edp.ir.layers import depth_of
+
+
+def depth_of(leaves: int) -> int:
+    """Return the depth of a complete binary tree with the given number of leaves."""
+    return leaves.bit_length() - 1
 
 
 def find_leaves(feature: Indices, threshold: NDArray[Any], leaf: NDArray[Any], x: NDArray[Any]) -> NDArray[Any]:

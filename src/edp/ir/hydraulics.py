@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
-from edp.ir.base import Array, Indices, Layer, Slot
+import numpy as np
+
+from edp.ir.base import Array, Indices, Layer, LayerRun, Memory, Slot, Values
 
 NONE = 2**16 - 1
 """Entry of a table of places: there is no such thing."""
@@ -43,6 +47,14 @@ class HydraulicTick(Layer):
         steps: implicit steps in a tick.
         tick_s: length of a tick.
     """
+
+    tick_by_tick = True
+    without: ClassVar[Mapping[str, str]] = {
+        "integers": "its equations need double precision: export in float32",
+        "tangent": "export it to casadi, whose equations have derivatives",
+        "onnx": "export it to c, fmu, casadi, simulink or ros2",
+        "matlab": "export it to c, fmu, casadi, simulink or ros2",
+    }
 
     numbers: Array
     full: Array
@@ -119,3 +131,18 @@ class HydraulicTick(Layer):
         network = 4 * self.unknown + self.unknown**2 + 2 * nodes + nodes**2
         load = 12 * n + 4 * n**2 + n**3 + terms * (1 + n) + 2 * n * self.powers
         return network + load + valves * (1 + VALVE_STATES) + 2 * pumps
+
+    def over_time(self, run: LayerRun, commands: Values, fed: Values) -> Values:
+        if not SOLVERS:
+            raise NotImplementedError("the equations of a grey box are solved by edp.networks.twin.grey: import it")
+        if commands.shape[1] != 1:
+            raise ValueError(f"layer '{self.name}' computes one stream at a time, not {commands.shape[1]}")
+        (solve,) = SOLVERS
+        memory = {slot: values[0] for slot, values in run.memory.items()}
+        answers = solve(self, run.constants, memory, commands[0, 0], fed[0, 0])
+        run.memory.update({slot: values[None] for slot, values in memory.items()})
+        return np.asarray(answers[None, None])
+
+
+SOLVERS: list[Callable[[HydraulicTick, Mapping[str, Values], Memory, Values, Values], Values]] = []
+"""The solver of one tick (layer, constants, memory, commands, ports), entered by the equations' own room."""

@@ -11,10 +11,21 @@ from enum import StrEnum
 
 import numpy as np
 
-from edp.ir.base import Array, Indices, Layer
+from edp.ir.base import Array, Indices, Layer, LayerRun, Values
+from edp.ir.descent import depth_of, find_leaves, summed
 
 LEAST = float(np.finfo(np.float32).tiny)
 """The least normal number of single precision."""
+
+
+def split(x: Values, rows: int) -> Values:
+    """Split the last dimension into the given number of rows."""
+    return x.reshape(*x.shape[:-1], rows, -1)
+
+
+def flat(x: Values) -> Values:
+    """Merge the last two dimensions."""
+    return x.reshape(*x.shape[:-2], -1)
 
 
 class Function(StrEnum):
@@ -50,11 +61,16 @@ class BinaryOperation(StrEnum):
 class Gather(Layer):
     """Selected elements of the concatenated inputs: selects, joins, repeats and transposes."""
 
+    bit_exact = True
+
     columns: tuple[int, ...]
 
     @property
     def width(self) -> int:
         return len(self.columns)
+
+    def over_time(self, run: LayerRun, *inputs: Values) -> Values:
+        return np.concatenate(inputs, axis=-1)[..., list(self.columns)]
 
 
 def runs(columns: Sequence[int], widths: Sequence[int]) -> list[tuple[int, int, int]]:
@@ -75,6 +91,8 @@ def runs(columns: Sequence[int], widths: Sequence[int]) -> list[tuple[int, int, 
 class Standardise(Layer):
     """``(x - offset) / scale``, in this order: offsets may be large."""
 
+    bit_exact = True
+
     offset: Array
     scale: Array
 
@@ -82,10 +100,15 @@ class Standardise(Layer):
     def width(self) -> int:
         return len(self.offset)
 
+    def over_time(self, run: LayerRun, x: Values) -> Values:
+        return np.asarray((x - run.constants["offset"]) / run.constants["scale"])
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScaleShift(Layer):
     """``gain x + shift``, each ``(width,)``."""
+
+    bit_exact = True
 
     gain: Array
     shift: Array
@@ -94,10 +117,16 @@ class ScaleShift(Layer):
     def width(self) -> int:
         return len(self.gain)
 
+    def over_time(self, run: LayerRun, x: Values) -> Values:
+        return np.asarray(run.constants["gain"] * x + run.constants["shift"])
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Clip(Layer):
     """Each number, but no less than its own of `low` and no more than its own of `high`, each ``(width,)``."""
+
+    bit_exact = True
+    stays_float = True
 
     low: Array
     high: Array
@@ -106,10 +135,16 @@ class Clip(Layer):
     def width(self) -> int:
         return len(self.low)
 
+    def over_time(self, run: LayerRun, x: Values) -> Values:
+        below = run.arithmetic.combine(BinaryOperation.MINIMUM, x, run.constants["high"])
+        return run.arithmetic.combine(BinaryOperation.MAXIMUM, below, run.constants["low"])
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Elementwise(Layer):
     """Element-wise operation on two values of `size` elements."""
+
+    bit_exact = True
 
     operation: BinaryOperation
     size: int
@@ -126,10 +161,15 @@ class Elementwise(Layer):
     def width(self) -> int:
         return self.size
 
+    def over_time(self, run: LayerRun, a: Values, b: Values) -> Values:
+        return run.arithmetic.combine(self.operation, a, b)
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Activate(Layer):
     """A function of each number."""
+
+    bit_exact = True
 
     function: Function
     size: int
@@ -138,10 +178,19 @@ class Activate(Layer):
     def width(self) -> int:
         return self.size
 
+    @property
+    def tangent_scratch(self) -> int:
+        return self.size
+
+    def over_time(self, run: LayerRun, x: Values) -> Values:
+        return run.arithmetic.apply(self.function, x)
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Glu(Layer):
     """First half of each row times the sigmoid of its second half; a row of `size` elements gives ``size / 2``."""
+
+    bit_exact = True
 
     rows: int
     size: int
@@ -150,10 +199,17 @@ class Glu(Layer):
     def width(self) -> int:
         return self.rows * self.size // 2
 
+    def over_time(self, run: LayerRun, x: Values) -> Values:
+        halves = x.reshape(*x.shape[:-1], self.rows, 2, -1)
+        return flat(halves[..., 0, :] * run.arithmetic.apply(Function.SIGMOID, halves[..., 1, :]))
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Accumulate(Layer):
     """Cumulative sums over `rows` rows of `size` elements: row i is the sum of rows 0 to i."""
+
+    bit_exact = True
+    stays_float = True
 
     rows: int
     size: int
@@ -162,10 +218,15 @@ class Accumulate(Layer):
     def width(self) -> int:
         return self.rows * self.size
 
+    def over_time(self, run: LayerRun, x: Values) -> Values:
+        return flat(np.add.accumulate(split(x, self.rows), axis=-2))
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Dense(Layer):
     """``W x + b`` on each row; `weight` ``(out, in)``, `bias` ``(out,)``, zeros if the network has no bias."""
+
+    matrices = ("weight",)
 
     weight: Array
     bias: Array
@@ -179,10 +240,18 @@ class Dense(Layer):
     def macs(self) -> int:
         return self.rows * self.weight.size
 
+    def over_time(self, run: LayerRun, x: Values) -> Values:
+        return flat(split(x, self.rows) @ run.constants["weight"].T + run.constants["bias"])
+
+    def products(self, x: Values, y: Values) -> dict[str, Values]:
+        return {self.name: split(x, self.rows)}
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GroupedDense(Layer):
     """``W_i x_i + b_i``, row i with its own `weight` ``(rows, out, in)`` and `bias` ``(rows, out)``."""
+
+    matrices = ("weight",)
 
     weight: Array
     bias: Array
@@ -194,6 +263,13 @@ class GroupedDense(Layer):
     @property
     def macs(self) -> int:
         return self.weight.size
+
+    def over_time(self, run: LayerRun, x: Values) -> Values:
+        rows = split(x, len(self.bias))
+        return flat(np.einsum("roi,...ri->...ro", run.constants["weight"], rows) + run.constants["bias"])
+
+    def products(self, x: Values, y: Values) -> dict[str, Values]:
+        return {self.name: split(x, len(self.bias))}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -211,6 +287,8 @@ class TreeSums(Layer):
         leaf: ``(output, tree, 2^D)``.
     """
 
+    bit_exact = True
+
     feature: Indices
     threshold: Array
     leaf: Array
@@ -224,19 +302,20 @@ class TreeSums(Layer):
         """Comparisons from the root to a leaf."""
         return depth_of(self.leaf.shape[2])
 
+    def over_time(self, run: LayerRun, x: Values) -> Values:
+        return summed(find_leaves(self.feature, run.constants["threshold"], run.constants["leaf"], x))
+
 
 NEVER = float(np.finfo(np.float32).max)
 """A threshold that no number of single precision exceeds, and that every target can write: it is no infinity."""
 
 
-def depth_of(leaves: int) -> int:
-    """Return the depth of a complete binary tree with the given number of leaves."""
-    return leaves.bit_length() - 1
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LayerNorm(Layer):
     """Each row less its mean, over the root of its variance plus `epsilon`, times `gain` plus `shift`."""
+
+    bit_exact = True
+    stays_float = True
 
     gain: Array
     shift: Array
@@ -247,10 +326,17 @@ class LayerNorm(Layer):
     def width(self) -> int:
         return self.rows * len(self.gain)
 
+    def over_time(self, run: LayerRun, x: Values) -> Values:
+        rows = run.arithmetic.normed(split(x, self.rows), self.epsilon)
+        return flat(rows * run.constants["gain"] + run.constants["shift"])
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RowAttention(Layer):
     """Each row of queries attends to all rows of keys and values (the three inputs), one head."""
+
+    bit_exact = True
+    stays_float = True
 
     rows: int
     size: int
@@ -262,3 +348,13 @@ class RowAttention(Layer):
     @property
     def macs(self) -> int:
         return 2 * self.rows * self.rows * self.size
+
+    @property
+    def scratch(self) -> int:
+        return self.rows
+
+    def over_time(self, run: LayerRun, *inputs: Values) -> Values:
+        q, k, v = (split(x, self.rows) for x in inputs)
+        scores = run.arithmetic.total(q[..., :, None, :] * k[..., None, :, :]) / np.sqrt(q.dtype.type(self.size))
+        weights = run.arithmetic.softmax(scores)
+        return flat(run.arithmetic.total(weights[..., None] * v[..., None, :, :], axis=-2))

@@ -19,11 +19,14 @@ from edp.monitor.detectors.base import DETECTORS, Detector
 from edp.monitor.summaries import BlockSummaries, SummaryState
 from edp.monitor.watches import BankSpec, Watch
 from edp.settings.tree import SettingsTree
+from edp.storage.arrays import ArrayRule, arrays_under, checked_arrays
 from edp.storage.reading import Table
 
 Array = NDArray[np.float64]
 MOST_SUMMARIES = 5_000
 MOST_WATCHES = 16
+MEAN, WIDTHS, MATRIX = (ArrayRule(shape) for shape in (("summaries",), ("summaries",), ("summaries", "columns")))
+"""Arrays of a watch in a file: its mean, and a width of each summary or a matrix."""
 _TREE = SettingsTree({"detector": DETECTORS}, what="monitor")
 
 
@@ -194,15 +197,11 @@ class MonitorChain:
         Raises:
             ValueError: values that cannot be; files are data from outside.
         """
-        parts = {
-            part: {k.removeprefix(f"{part}."): v for k, v in arrays.items() if k.startswith(f"{part}.")}
-            for part in ("summaries", "conditioning")
-        }
-        summaries = BlockSummaries.of(plain["summaries"], parts["summaries"])
+        summaries = BlockSummaries.of(plain["summaries"], arrays_under(arrays, "summaries."))
         if summaries.width > MOST_SUMMARIES:
             raise ValueError(f"it has {summaries.width} summaries; at most {MOST_SUMMARIES} must hold")
         clip = _number(plain["clip"], "clip")
-        conditioning = Conditioning.of(parts["conditioning"], clip, summaries.width, summaries.points)
+        conditioning = Conditioning.of(arrays_under(arrays, "conditioning."), clip, summaries.width, summaries.points)
         watches = _watches(plain["watches"], arrays, summaries.width)
         settle = plain["settle"]
         if isinstance(settle, bool) or not isinstance(settle, int) or not 0 <= settle <= 1_000_000:
@@ -217,14 +216,13 @@ def _watches(entries: Sequence[Any], arrays: Mapping[str, NDArray[Any]], summari
     watches = []
     for index, entry in enumerate(entries):
         spec = _TREE.build(_Form, {"detector": entry["detector"]}, "of its watches").detector
-        mean = np.asarray(arrays[f"watch.{index}.mean"], np.float64)
-        matrix = np.asarray(arrays[f"watch.{index}.matrix"], np.float64)
-        scale = _number(entry["scale"], "scale")
-        if mean.shape != (summaries,) or matrix.ndim not in (1, 2) or len(matrix) != summaries:
-            raise ValueError(f"arrays of watch {index} have other shapes than the summaries")
-        if not (np.isfinite(mean).all() and np.isfinite(matrix).all() and scale > 0.0):
-            raise ValueError(f"a number of watch {index} is not finite, or its scale is not positive")
-        watches.append(Watch(spec, mean, matrix, scale))
+        own, scale = arrays_under(arrays, f"watch.{index}."), _number(entry["scale"], "scale")
+        # A matrix, or its diagonal.
+        matrix = WIDTHS if own["matrix"].ndim == 1 else MATRIX
+        numbers = checked_arrays(own, {"mean": MEAN, "matrix": matrix}, f"watch {index}", {"summaries": summaries})
+        if not scale > 0.0:
+            raise ValueError(f"scale of watch {index} is {scale}; above 0 must hold")
+        watches.append(Watch(spec, numbers["mean"], numbers["matrix"], scale))
     return tuple(watches)
 
 

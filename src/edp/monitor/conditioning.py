@@ -10,8 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError
+from edp.storage.arrays import POSITIVE, ArrayRule, checked_arrays
 
 Array = NDArray[np.float64]
+ARRAYS = {
+    "offset": ArrayRule(("numbers",)),
+    "width": ArrayRule(("numbers",), low=POSITIVE),
+    "usual": ArrayRule(("summaries", "points")),
+    "spread": ArrayRule(("summaries", "points")),
+    "floor": ArrayRule(("summaries",), low=POSITIVE),
+}
+"""Of its file."""
 POINT_LIMIT = 3.0
 """Limit of levels and sizes, in healthy standard deviations. Regression lines are constant beyond it."""
 RIDGE = 1e-3
@@ -67,7 +76,7 @@ class Conditioning:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Numbers of its file."""
-        return {name: getattr(self, name) for name in ("offset", "width", "usual", "spread", "floor")}
+        return {name: getattr(self, name) for name in ARRAYS}
 
     @staticmethod
     def of(arrays: Mapping[str, NDArray[Any]], clip: float, summaries: int, points: int) -> Conditioning:
@@ -76,15 +85,10 @@ class Conditioning:
         Raises:
             ValueError: values that cannot be.
         """
-        names = ("offset", "width", "usual", "spread", "floor")
-        values = {name: np.asarray(arrays[name], np.float64) for name in names}
-        shapes = ((points - 1,), (points - 1,), (summaries, points), (summaries, points), (summaries,))
-        if tuple(values[name].shape for name in names) != shapes:
-            raise ValueError("arrays of the conditioning have other shapes than its header says")
-        if not all(np.isfinite(array).all() for array in values.values()):
-            raise ValueError("a number of the conditioning is not finite")
-        if not ((values["width"] > 0.0).all() and (values["floor"] > 0.0).all() and 0.0 < clip <= 1e6):
-            raise ValueError("a width of the conditioning is not positive")
+        sizes = {"numbers": points - 1, "summaries": summaries, "points": points}
+        values = checked_arrays(arrays, ARRAYS, "the conditioning", sizes)
+        if not 0.0 < clip <= 1e6:
+            raise ValueError(f"clip of the conditioning is {clip}; above 0 and at most 1e6 must hold")
         return Conditioning(**values, clip=clip)
 
 

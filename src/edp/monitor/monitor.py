@@ -224,7 +224,7 @@ class Monitor:
         shape = (len(rows), len(self.chain.watches))
         return Watched(tuple(alarms), np.array(statistics).reshape(shape), table)
 
-    def condition_rows(self, recording: Recording) -> Array:
+    def conditioned_rows(self, recording: Recording) -> Array:
         """Conditioned summaries of each block, NaN where missing, shape (blocks, summaries); see `summary_names`."""
         return self._condition(recording)[0]
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from safetensors.numpy import load as load_arrays
 from safetensors.numpy import save as save_arrays
 
@@ -22,8 +21,8 @@ from edp.monitor.chain import MonitorChain
 from edp.monitor.diagnosis.signatures import load_dictionary, remove_dictionary, save_dictionary
 from edp.monitor.monitor import Monitor
 from edp.monitor.residuals.base import RESIDUALS, ResidualSource, SourceParts
-from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, write_json
+from edp.storage.arrays import ArrayRule, arrays_under, checked_arrays
 from edp.storage.headers import read_header
 from edp.storage.paths import entries_of, is_entry_at, is_folder_at, is_link_at, is_there
 from edp.storage.reading import Table
@@ -32,11 +31,15 @@ from edp.training.bundle import HEADER as BUNDLE_HEADER
 from edp.training.bundle import (
     Bundle,
     add_plugins,
-    check_hash,
+    channel_from_plain,
+    channel_to_plain,
+    checked_text,
     convert_damage,
     load_bundle,
     read_arrays,
+    remove_old_arrays,
     save_bundle,
+    sealed_header,
     write_arrays,
 )
 from edp.training.twin_bundle import HEADER as TWIN_HEADER
@@ -48,6 +51,11 @@ NETWORKS = "networks"
 """Folder of the networks that residuals are made with, a bundle or a twin each."""
 _FOLDER = re.compile(r"[a-z0-9]{1,32}-[a-z0-9]{1,32}")
 MOST_CHANNELS, MOST_SOURCES, MOST_NETWORKS = 2_000, 64, 256
+ARRAYS = {
+    "session_means": ArrayRule((2, "channels")),
+    "scatter": ArrayRule(("summaries",), low=0.0),
+}
+"""Besides those of the chain (``chain.``) and of each source (``source.0.``, ...)."""
 LIMIT = ("limit", "alarms", "hours", "promised_hours", "low_hours", "high_hours")
 
 
@@ -77,10 +85,7 @@ def save_monitor(monitor: Monitor, folder: str | Path) -> Path:
         "schema": SCHEMA,
         "edp": __version__,
         "rate_hz": monitor.rate_hz,
-        "channels": [
-            {"name": c.name, "kind": str(c.kind), "unit": c.unit, "description": c.description}
-            for c in monitor.channels
-        ],
+        "channels": [channel_to_plain(channel) for channel in monitor.channels],
         "sources": sources,
         "chain": monitor.chain.to_plain(),
         "limit": facts,
@@ -123,9 +128,7 @@ def write_network(path: Path, bundle: Bundle | TwinBundle) -> dict[str, str]:
 
 def _remove_old(path: Path, arrays: str, networks: set[str]) -> None:
     """Remove the files of an earlier monitor. A kill before that leaves extra files but a valid monitor."""
-    for old in entries_of(path, "monitor-*.safetensors"):
-        if old.name != arrays:
-            old.unlink(missing_ok=True)
+    remove_old_arrays(path, ("monitor",), (arrays,))
     for folder in entries_of(path / NETWORKS, "*"):
         if folder.name not in networks and _FOLDER.fullmatch(folder.name) and not is_link_at(folder):
             shutil.rmtree(folder, ignore_errors=True)
@@ -142,14 +145,7 @@ def load_monitor(folder: str | Path) -> Monitor:
     if not is_entry_at(path / HEADER):
         raise BundleError(f"'{path}' is not a monitor: it has no {HEADER}; give the folder that edp monitor fit wrote")
     with convert_damage(path):
-        header = read_header(path / HEADER, ("schema",))
-        schema = header["schema"]
-        if isinstance(schema, bool) or schema != SCHEMA:
-            raise BundleError(
-                f"monitor '{path}' has schema {str(schema)[:40]}, this EDP ({__version__}) reads {SCHEMA}; install a "
-                "newer one, or fit it again"
-            )
-        check_hash(header, path / HEADER)
+        header = sealed_header(path / HEADER, "monitor", (SCHEMA,), "fit it again")
         monitor = _assembled(header, path)
     return replace(monitor, diagnosis=load_dictionary(path, monitor.summary_names))
 
@@ -158,35 +154,25 @@ def _assembled(header: Table, path: Path) -> Monitor:
     entries = header["channels"]
     if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_CHANNELS:
         raise ValueError(f"it has no list of 1 to {MOST_CHANNELS:,} channels")
-    channels = tuple(_channel(entry) for entry in entries)
+    channels = tuple(channel_from_plain(entry) for entry in entries)
     names = [channel.name for channel in channels]
     if len(set(names)) < len(names):
         raise ValueError("a channel stands twice")
-    rate_hz = header["rate_hz"]
-    if isinstance(rate_hz, bool) or not isinstance(rate_hz, int | float) or not 0.0 < rate_hz <= 1e6:
-        raise ValueError(f"its rate_hz is {str(rate_hz)[:40]}; above 0 and at most 1e6 must hold")
     arrays = load_arrays(read_arrays(path, header["arrays"]))
     sources = _sources(header["sources"], arrays, path)
-    chain_arrays = {k.removeprefix("chain."): v for k, v in arrays.items() if k.startswith("chain.")}
-    chain = MonitorChain.of(object_with(header["chain"], (), "its chain"), chain_arrays)
+    chain = MonitorChain.of(object_with(header["chain"], (), "its chain"), arrays_under(arrays, "chain."))
     _check_fit(sources, chain, names)
-    means = np.asarray(arrays["session_means"], np.float64)
-    if means.shape != (2, len(channels)) or not np.isfinite(means).all() or not (means[1] > 0.0).all():
-        raise ValueError("the means of its sessions have another shape, are not finite, or have no width")
+    own = {name: values for name, values in arrays.items() if not name.startswith(("chain.", "source."))}
+    # Files of earlier versions have no scatter of healthy session means.
+    rules = {name: rule for name, rule in ARRAYS.items() if name in own or name != "scatter"}
+    sizes = {"channels": len(channels), "summaries": chain.summaries.width}
+    own = checked_arrays(own, rules, "its sessions", sizes)
+    means, scatter = own["session_means"], own.get("scatter")
+    if not (means[1] > 0.0).all():
+        raise ValueError("the means of its sessions have a width that is not above 0")
     provenance = object_with(header["provenance"], (), "its provenance")
     limit = _limit(object_with(header["limit"], LIMIT, "its limit"))
-    scatter = _scatter(arrays.get("scatter"), chain)
-    return Monitor(channels, float(rate_hz), sources, chain, limit, means, None, provenance, scatter)
-
-
-def _scatter(values: Any, chain: MonitorChain) -> NDArray[np.float64] | None:
-    """Read the scatter of healthy session means; files of earlier versions have none."""
-    if values is None:
-        return None
-    scatter = np.asarray(values, np.float64)
-    if scatter.shape != (chain.summaries.width,) or not np.isfinite(scatter).all() or not (scatter >= 0.0).all():
-        raise ValueError("the scatter of its sessions has another shape, is not finite, or below zero")
-    return scatter
+    return Monitor(channels, float(header["rate_hz"]), sources, chain, limit, means, None, provenance, scatter)
 
 
 def _check_fit(sources: tuple[ResidualSource, ...], chain: MonitorChain, names: list[str]) -> None:
@@ -206,15 +192,13 @@ def _sources(entries: Any, arrays: Table, path: Path) -> tuple[ResidualSource, .
         raise ValueError(f"it has no list of 1 to {MOST_SOURCES} sources of residuals")
     sources = []
     for index, entry in enumerate(entries):
-        spec = RESIDUALS[_text(entry["kind"])]
-        prefix = f"source.{index}."
-        own = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+        spec = RESIDUALS[checked_text(entry["kind"])]
         networks = object_with(entry["networks"], (), "its networks")
         if len(networks) > MOST_NETWORKS:
             raise ValueError(f"a source has {len(networks)} networks; at most {MOST_NETWORKS} must hold")
         bundles = {name: read_network(path, value) for name, value in networks.items()}
         plain = object_with(entry["plain"], (), "a source")
-        sources.append(spec.source.of_parts(SourceParts(plain, own, bundles)))
+        sources.append(spec.source.of_parts(SourceParts(plain, arrays_under(arrays, f"source.{index}."), bundles)))
     return tuple(sources)
 
 
@@ -225,7 +209,7 @@ def read_network(path: Path, entry: Mapping[str, Any]) -> Bundle | TwinBundle:
         BundleError: the network is missing or damaged.
         ValueError: an entry that names no network of the monitor.
     """
-    folder = _text(entry["folder"])
+    folder = checked_text(entry["folder"])
     # Never a path out of the monitor.
     if not _FOLDER.fullmatch(folder):
         raise ValueError(f"'{folder[:80]}' is no folder of a network")
@@ -249,16 +233,3 @@ def _limit(entry: Table) -> AlarmLimit:
         if isinstance(value, bool) or not isinstance(value, int | float) or np.isnan(value):
             raise ValueError(f"{name} of its limit is {str(value)[:40]}; a number must hold")
     return AlarmLimit(alarms=count, **values)
-
-
-def _channel(entry: Table) -> Channel:
-    channel = Channel(_text(entry["name"]), Kind(entry["kind"]), _text(entry["description"]))
-    if entry["unit"] != channel.unit:
-        raise ValueError(f"channel '{channel.name[:80]}' is in {str(entry['unit'])[:20]}, {channel.unit} must hold")
-    return channel
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str) or len(value) > 4096:
-        raise TypeError(f"{str(value)[:40]!r} stands where a text must be")
-    return value

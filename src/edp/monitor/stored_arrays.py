@@ -55,15 +55,3 @@ def read_stored(folder: Path, name: str, schema: int) -> tuple[Table, dict[str, 
     except (SafetensorError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise StorageError(f"'{folder / name}.safetensors' is damaged: {brief(error)}; write it anew") from error
     return header, arrays
-
-
-def shaped(arrays: Arrays, name: str, shape: tuple[int, ...], where: str) -> NDArray[np.float64]:
-    """One array as float64, checked for its shape and for values that are not finite.
-
-    Raises:
-        StorageError: it is missing, of another shape, no floats, or not finite.
-    """
-    values = arrays.get(name)
-    if values is None or values.shape != shape or values.dtype.kind != "f" or not np.isfinite(values).all():
-        raise StorageError(f"{where}: array '{name}' must hold finite numbers of shape {shape}; write it anew")
-    return values.astype(np.float64)

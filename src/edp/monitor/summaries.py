@@ -12,7 +12,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.storage.arrays import POSITIVE, ArrayRule, checked_arrays
+
 Array = NDArray[np.float64]
+ARRAYS = {
+    "centre": ArrayRule(("inputs",)),
+    "spread": ArrayRule(("inputs",), low=POSITIVE),
+    "scale": ArrayRule(("residuals",), low=POSITIVE),
+    "change": ArrayRule(("residuals",), low=POSITIVE),
+    "channel": ArrayRule(("residuals",), np.int64, low=0, high="inputs"),
+    "moving": ArrayRule(("moving",), np.int64, low=0, high="inputs"),
+    "level": ArrayRule(("level",), np.int64, low=0, high="inputs"),
+    "drivers": ArrayRule(("drivers", "residuals", 2), np.int64, low=-1, high="inputs"),
+}
+"""Of its file."""
 SUMMARIES = ("mean", "spread", "gain", "lag", "peak")
 """Summaries of each residual and block, in this order, followed by one for each driver."""
 MOST_DRIVERS = 8
@@ -183,8 +196,7 @@ class BlockSummaries:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Numbers of its file."""
-        names = ("scale", "channel", "centre", "spread", "change", "moving", "level", "drivers")
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in ARRAYS}
 
     @staticmethod
     def of(plain: Mapping[str, object], arrays: Mapping[str, NDArray[Any]]) -> BlockSummaries:
@@ -196,30 +208,11 @@ class BlockSummaries:
         block = plain["block"]
         if isinstance(block, bool) or not isinstance(block, int) or not 1 <= block <= MOST_BLOCK:
             raise ValueError(f"a block has {str(block)[:40]} ticks; 1 to {MOST_BLOCK:,} must hold")
-        numbers = {name: np.asarray(arrays[name], np.float64) for name in ("scale", "centre", "spread", "change")}
-        places = {name: np.asarray(arrays[name], np.int64) for name in ("channel", "moving", "level")}
-        drivers = np.asarray(arrays["drivers"], np.int64)
-        inputs, residuals = numbers["centre"].shape, numbers["scale"].shape
-        if any(values.ndim != 1 for values in (*numbers.values(), *places.values())):
-            raise ValueError("arrays of the summaries are no lists of numbers")
-        if numbers["spread"].shape != inputs or places["channel"].shape != residuals != numbers["change"].shape:
-            raise ValueError("arrays of the summaries have other lengths than each other")
-        if numbers["change"].shape != residuals:
-            raise ValueError("arrays of the summaries have other lengths than each other")
-        if any(((p < 0) | (p >= inputs[0])).any() for p in places.values()):
-            raise ValueError("summaries name an input that there is not")
-        if drivers.ndim != 3 or drivers.shape[1:] != (*residuals, 2) or len(drivers) > MOST_DRIVERS:
-            raise ValueError("drivers of the summaries have another shape")
-        if ((drivers < [0, -1]) | (drivers >= inputs[0])).any():
-            raise ValueError("drivers of the summaries name an input that there is not")
-        if not all(np.isfinite(values).all() for values in numbers.values()):
-            raise ValueError("a number of the summaries is not finite")
-        if not all((numbers[name] > 0.0).all() for name in ("scale", "spread", "change")):
-            raise ValueError("a width of the summaries is not positive")
-        centre, spread = numbers["centre"], numbers["spread"]
-        moving, level = places["moving"], places["level"]
-        channel, change = places["channel"], numbers["change"]
-        return BlockSummaries(block, numbers["scale"], channel, centre, spread, change, moving, level, drivers)
+        values = checked_arrays(arrays, ARRAYS, "the summaries")
+        drivers = values["drivers"]
+        if len(drivers) > MOST_DRIVERS or (drivers[..., 0] < 0).any():
+            raise ValueError(f"the summaries have more than {MOST_DRIVERS} drivers, or one without its first input")
+        return BlockSummaries(block, **values)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from edp.sim.excitation import EXCITATIONS
 from edp.sim.faults import FaultSpec, faults_of
 from edp.sim.machine.family import MASSES_T, WIDEST, member_mass, member_name
 from edp.sim.machine.machine_files import load_machine
-from edp.sim.physics import soil
+from edp.sim.physics.material import load_material
 from edp.sim.scenario import LARGEST_STEP_S, START_STROKES, Scenario, plain
 from edp.sim.simulate import simulate
 from edp.storage.ledger import TrainingIdentity, WithState
@@ -112,7 +112,7 @@ class DataSetSpec:
         _check_shares("mix", self.mix)
         for name in self.materials:
             if name != AIR:
-                soil.load_material(name)
+                load_material(name)
         if self.materials:
             _check_shares("materials", self.materials)
             if not any(EXCITATIONS[name].works_ground and share > 0 for name, share in self.mix.items()):

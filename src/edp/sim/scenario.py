@@ -12,7 +12,7 @@ from edp.sim.faults import FaultSpec, faults_of
 from edp.sim.machine.machine import Machine, Sensors
 from edp.sim.machine.machine_checks import MACHINE_FILE, check_machine
 from edp.sim.machine.machine_files import load_machine
-from edp.sim.physics import soil
+from edp.sim.physics.material import load_material
 from edp.sim.physics.motor_circuit import motors_of
 from edp.sim.physics.plant import steps_per_sample
 
@@ -37,7 +37,7 @@ class Scenario:
         rate_hz: samples per second, also the rate of commands.
         step_s: integration step; cut in four near the ends of the stroke.
         sensor_noise: False logs the truth.
-        material: soil that the bucket works in, see `soil.material_names`; empty for free air.
+        material: soil that the bucket works in, see `edp.sim.physics.material.material_names`; empty for free air.
         start_strokes: range of the strokes to start from, as shares of full.
         sensors: values that replace those of the machine's ``[sensors]``, by key: to switch faults on or off.
         seed: random seed. Equal seeds give equal bits on the same machine.
@@ -69,7 +69,7 @@ class Scenario:
             # For its refusal only: the plant asks for the motors again.
             motors_of(machine)
         if self.material:
-            soil.load_material(self.material)
+            load_material(self.material)
         for key in ("duration_s", "rate_hz", "step_s"):
             value = getattr(self, key)
             if not (math.isfinite(value) and value > 0):

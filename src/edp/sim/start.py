@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.parameters import pack
 from edp.sim.physics import pose, soil
+from edp.sim.physics.material import load_material
 from edp.sim.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -26,7 +27,7 @@ def start_of(scenario: Scenario, machine: Machine) -> tuple[soil.Ground | None, 
     start, _, _, course, _ = seeds_of(scenario)
     ground = None
     if scenario.material:
-        material = soil.load_material(scenario.material)
+        material = load_material(scenario.material)
         ground = soil.Ground(material, machine, np.random.default_rng(course))
     return ground, _start_strokes(scenario, machine, ground, np.random.default_rng(start))
 

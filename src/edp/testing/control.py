@@ -11,11 +11,13 @@ from edp.control.plant import STROKES
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels, twin_channels
 from edp.networks.twin import TWINS, Twin, TwinScales, fit_scales
+from edp.networks.twin.grey.fit_spec import GreyFitSpec
 from edp.networks.twin.greybox import GreyBox
 from edp.networks.twin.recurrent import Recurrent
 from edp.sim.machine.machine_files import load_machine
 from edp.sim.scenario import Scenario
 from edp.sim.simulate import simulate
+from edp.training.grey_fit import fit_grey_box
 from edp.training.twin_bundle import TwinBundle
 
 WAYS = ("combined", "isolated", "end_stops")
@@ -49,11 +51,13 @@ def sample_recurrent_twin(units: int, machine: str = "M22") -> TwinBundle:
     return TwinBundle(spec, twin)
 
 
-def sample_grey_box(machine: str = "M22") -> TwinBundle:
-    """Return an unfitted grey box with the linkage of a machine, as at the start of a fit."""
+def sample_grey_box(machine: str = "M22", is_fitted: bool = False) -> TwinBundle:
+    """Return a grey box with the linkage of a machine, as at the start of a fit, or fitted in a few seconds."""
     channels, scales, series = _sample(machine)
-    spec = GreyBox(linkage=machine)
-    return TwinBundle(spec, spec.start(channels, scales, series, 0))
+    fit = GreyFitSpec(lengths_s=(0.1, 0.3), rounds=(3, 2), starts=1, ticks=1_500, final_rounds=0, validation_s=2.0)
+    spec = GreyBox(linkage=machine, fit=fit) if is_fitted else GreyBox(linkage=machine)
+    twin = spec.start(channels, scales, series, 0)
+    return TwinBundle(spec, fit_grey_box(twin, series, series[-1:], 0).twin if is_fitted else twin)
 
 
 def _sample(machine: str) -> tuple[TwinChannels, TwinScales, list[Series]]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,15 +28,16 @@ from edp.networks.integer import IntegerPredictor
 from edp.networks.plain import model_from_plain, model_to_plain, task_from_plain, task_to_plain, unknown_parts
 from edp.networks.predictor import Predictor
 from edp.registry import missing_parts, origins_in
+from edp.settings.bounds import above
 from edp.settings.provenance import Provenance
 from edp.settings.tree import Table
 from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, read_bytes, write_bytes, write_json
+from edp.storage.arrays import POSITIVE, ArrayRule, checked_arrays
 from edp.storage.headers import ARRAYS_BYTES, read_header
 from edp.storage.paths import entries_of, is_entry_at
 from edp.storage.runs import missing_text
 from edp.storage.seals import HASH, content_digest, digest_of_bytes
-from edp.wording import typed
 
 SCHEMA = 8
 INTEGER_SCHEMA = 9
@@ -51,8 +51,10 @@ REWORDED = {5: SCHEMA, 6: INTEGER_SCHEMA, 7: ADAPTED_SCHEMA}
 HEADER, PLUGINS = "bundle.json", "plugins"
 ARRAYS = ("weights", "integers", "adaptation")
 """Beginnings of the names of a bundle's files of arrays."""
-MOST_RATE_HZ, MOST_BITS = 1e6, 64
-"""Bounds of the ticks in a second, and of the fraction of a number."""
+SCALES = ("front.width", "code.width")
+"""Weights of a predictor that scale its inputs and targets."""
+RATE, MOST_BITS, MOST_TEXT = above(0.0, 1e6), 64, 4096
+"""Bounds of the ticks in a second, of the fraction of a number, and of a name or description."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,9 +133,7 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
         "edp": __version__,
         "task": task_to_plain(task),
         "model": model_to_plain(bundle.predictor.spec),
-        "inputs": [
-            {"name": c.name, "kind": str(c.kind), "unit": c.unit, "description": c.description} for c in bundle.inputs
-        ],
+        "inputs": [channel_to_plain(channel) for channel in bundle.inputs],
         "outputs": [
             {"name": name, "kind": str(kind), "description": text}
             for name, kind, text in zip(task.targets, bundle.target_kinds, bundle.descriptions, strict=True)
@@ -153,12 +153,7 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
         header |= {"schema": ADAPTED_SCHEMA, "adaptation": bundle.adaptation.to_plain() | {"arrays": entry}}
     # The header comes last: it is what makes the new files count.
     write_json(path / HEADER, add_plugins(header))
-    # Old files go only after the rename; a kill in between leaves spare files, not a broken bundle.
-    for old in (
-        file for what in ("weights", "integers", "adaptation") for file in entries_of(path, f"{what}-*.safetensors")
-    ):
-        if old.name not in referenced:
-            old.unlink(missing_ok=True)
+    remove_old_arrays(path, ARRAYS, referenced)
     return path
 
 
@@ -173,6 +168,14 @@ def write_arrays(path: Path, what: str, data: bytes) -> dict[str, str]:
     file = f"{what}-{digest[:12]}.safetensors"
     write_bytes(path / file, data)
     return {"file": file, "blake2b": digest}
+
+
+def remove_old_arrays(path: Path, beginnings: Iterable[str], current: Container[str]) -> None:
+    """Remove files of arrays that a new header no longer names; a kill before that leaves spare files."""
+    for beginning in beginnings:
+        for old in entries_of(path, f"{beginning}-*.safetensors"):
+            if old.name not in current:
+                old.unlink(missing_ok=True)
 
 
 def load_bundle(folder: str | Path) -> Bundle:
@@ -190,6 +193,32 @@ def load_bundle(folder: str | Path) -> Bundle:
         if unknown := unknown_parts(header["model"]):
             raise BundleError(f"bundle '{path}': {'; '.join(unknown)}")
         return _assemble(header, path)
+
+
+def sealed_header(file: Path, what: str, readable: Sequence[int], again: str) -> Table:
+    """Return the header of a model after a check of its schema, hash and rate.
+
+    Args:
+        file: of the header.
+        what: kind of the model, for the message.
+        readable: schemas that are read, rising.
+        again: what to do about another schema.
+
+    Raises:
+        BundleError: another schema, or it was damaged or changed.
+    """
+    header = read_header(file, ("schema",))
+    schema = header["schema"]
+    # 1.0 and true equal 1 in Python; neither is a schema.
+    if type(schema) is not int or schema not in readable:
+        span = " to ".join(dict.fromkeys((str(readable[0]), str(readable[-1]))))
+        raise BundleError(
+            f"{what} '{file.parent}' has schema {str(schema)[:40]}, this EDP ({__version__}) reads {span}; install a "
+            f"newer one, or {again}"
+        )
+    check_hash(header, file)
+    _check_rate(header["rate_hz"])
+    return header
 
 
 def add_plugins(header: Mapping[str, object]) -> dict[str, object]:
@@ -287,9 +316,9 @@ def _read_header(path: Path) -> dict[str, object]:
 def _assemble(header: Table, path: Path) -> Bundle:
     """Build the bundle from a header and its files."""
     spec, task = model_from_plain(header["model"]), task_from_plain(header["task"])
-    inputs = tuple(Channel(_text(c["name"]), Kind(c["kind"]), _text(c["description"])) for c in header["inputs"])
+    inputs = tuple(channel_from_plain(entry) for entry in header["inputs"])
     kinds = tuple(Kind(c["kind"]) for c in header["outputs"])
-    texts = tuple(_text(c["description"]) for c in header["outputs"])
+    texts = tuple(checked_text(c["description"]) for c in header["outputs"])
     _check_channels(header, task, inputs)
     predictor = Predictor(task, spec, blank_scaler(task))
     # Weights are loaded on top of placeholders: nothing in the file decides the structure.
@@ -310,17 +339,43 @@ def _check_channels(header: Table, task: Task, inputs: Sequence[Channel]) -> Non
         raise ValueError("its inputs are not those of its task")
     if [entry["name"] for entry in header["outputs"]] != list(task.targets):
         raise ValueError("its outputs are not the targets of its task")
-    for channel, entry in zip(inputs, header["inputs"], strict=True):
-        if entry["unit"] != channel.unit:
-            raise ValueError(f"input '{channel.name}' is in {str(entry['unit'])[:20]}, {channel.unit} must hold")
-    if not (math.isfinite(task.rate_hz) and 0.0 < task.rate_hz <= MOST_RATE_HZ):
-        raise ValueError(f"its rate_hz is {task.rate_hz}; above 0 and at most {typed(MOST_RATE_HZ)} must hold")
+    _check_rate(task.rate_hz)
 
 
-def _text(value: Any) -> str:
-    if not isinstance(value, str):
+def channel_to_plain(channel: Channel) -> dict[str, str]:
+    """Convert a channel to JSON types."""
+    return {"name": channel.name, "kind": str(channel.kind), "unit": channel.unit, "description": channel.description}
+
+
+def channel_from_plain(entry: Table) -> Channel:
+    """Create a channel from the result of `channel_to_plain`, or from one of earlier versions without a unit.
+
+    Raises:
+        ValueError: an unknown kind, or another unit than that of the kind.
+        TypeError: the name or description is no text.
+    """
+    channel = Channel(checked_text(entry["name"]), Kind(entry["kind"]), checked_text(entry["description"]))
+    unit = entry.get("unit", channel.unit)
+    if unit != channel.unit:
+        raise ValueError(f"channel '{channel.name[:80]}' is in {str(unit)[:20]}, {channel.unit} must hold")
+    return channel
+
+
+def checked_text(value: object) -> str:
+    """Return a text of a header after a check.
+
+    Raises:
+        TypeError: something else, or a text of more than `MOST_TEXT` characters.
+    """
+    if not isinstance(value, str) or len(value) > MOST_TEXT:
         raise TypeError(f"{str(value)[:40]!r} stands where a text must be")
     return value
+
+
+def _check_rate(rate_hz: object) -> None:
+    """Raise ValueError if a sampling rate (Hz) is not above 0 and at most 1e6."""
+    if not RATE.holds(rate_hz):
+        raise ValueError(f"its rate_hz is {str(rate_hz)[:40]}; {RATE.rule('rate_hz')} must hold")
 
 
 def _formats(plain: Any) -> dict[str, int]:
@@ -335,22 +390,16 @@ def _formats(plain: Any) -> dict[str, int]:
 
 def _fill(predictor: Predictor, tensors: Mapping[str, torch.Tensor]) -> None:
     """Load weights into a network after a check of names, shapes, types, finiteness and positive widths."""
-    expected = predictor.state_dict()
-    # Both directions: a missing weight keeps a random start, a spare one belongs to another network.
-    other = sorted({*expected} ^ {*tensors})
-    if other:
-        raise ValueError(f"its weights are not those of its header: '{other[0][:80]}' is in one of them only")
-    for name, tensor in tensors.items():
-        if (tensor.shape, tensor.dtype) != (expected[name].shape, expected[name].dtype):
-            kinds = f"{tuple(tensor.shape)} {tensor.dtype}, not {tuple(expected[name].shape)} {expected[name].dtype}"
-            raise ValueError(f"its weights are not those of its header: '{name}' is {kinds}")
-        if tensor.is_floating_point() and not torch.isfinite(tensor).all():
-            raise ValueError(f"its weights are damaged: '{name}' holds a number that is not finite")
-    predictor.load_state_dict(dict(tensors))
+    # A missing weight would keep a random start, an additional one belongs to another network.
     # Widths divide and multiply; zero or negative ones would turn predictions over without an error.
-    for what, width in (("inputs", predictor.front.width), ("targets", predictor.code.width)):
-        if not (width > 0).all():
-            raise ValueError(f"its weights are damaged: the scale of the {what} holds a width that is not positive")
+    rules = {
+        name: ArrayRule(
+            tuple(tensor.shape), tensor.numpy().dtype, POSITIVE if name in SCALES else -np.inf, is_exact=True
+        )
+        for name, tensor in predictor.state_dict().items()
+    }
+    checked_arrays({name: tensor.numpy() for name, tensor in tensors.items()}, rules, "its weights")
+    predictor.load_state_dict(dict(tensors))
 
 
 def _adaptation(entry: Table, task: Task, path: Path) -> Adaptation:
@@ -391,7 +440,7 @@ def _check_schema(header: Table, path: Path) -> None:
 
 def read_arrays(path: Path, entry: Mapping[str, str]) -> bytes:
     """Read a file of arrays named in a header, and check its digest."""
-    file = path / Path(_text(entry["file"])).name  # never a path out of the bundle
+    file = path / Path(checked_text(entry["file"])).name  # never a path out of the bundle
     if not is_entry_at(file):
         raise BundleError(f"bundle '{path}' lacks its weights '{file.name}'; restore the bundle")
     data = read_bytes(file, ARRAYS_BYTES, f"weights '{file}'", BundleError)

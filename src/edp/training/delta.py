@@ -24,7 +24,8 @@ from safetensors.numpy import load, save
 
 from edp.errors import BundleError
 from edp.networks.predictor import Predictor
-from edp.storage import object_with, parse_json, read_bytes, write_bytes
+from edp.storage import object_with, parse_json, read_bytes
+from edp.storage.arrays import ArrayRule, checked_arrays
 from edp.training.bundle import weights_digest
 
 SCHEMA = 1
@@ -224,15 +225,6 @@ def apply_delta(base: Predictor, delta: Delta) -> Predictor:
     return network.eval()
 
 
-def write_delta(path: str | Path, delta: Delta) -> None:
-    """Write a delta, whole or not at all.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
-    write_bytes(Path(path), delta.to_bytes())
-
-
 def read_delta(path: str | Path) -> Delta:
     """Read a delta from its file.
 
@@ -255,37 +247,36 @@ def delta_from_bytes(data: bytes, where: str) -> Delta:
     object_with(head, ("base", "facts", "shapes", "hash"), where, BundleError)
     if head["hash"] != _hash(arrays) or not isinstance(head["facts"], dict) or not isinstance(head["shapes"], dict):
         raise BundleError(f"{where} is damaged: its numbers do not have the hash in its header; copy it again")
-    parts = {kind: _read_scaled(arrays, head["shapes"], kind, where) for kind in ("w", "l", "r")}
+    matrices = _matrices(arrays, head["shapes"], where)
+    whole, lefts, rights = ({name[2:]: m for name, m in matrices.items() if name[:2] == k} for k in ("w:", "l:", "r:"))
     vectors = {name[2:]: values for name, values in arrays.items() if name.startswith("v:")}
-    lefts, rights = parts["l"], parts["r"]
-    fitting = lefts.keys() == rights.keys() and all(
-        len(left.scales) == len(rights[name].scales) for name, left in lefts.items()
-    )
-    if not fitting or not all(np.isfinite(values).all() for values in arrays.values()):
-        raise BundleError(f"{where} is damaged: factors that do not fit together, or numbers that are not finite")
+    if {name: len(m.scales) for name, m in lefts.items()} != {name: len(m.scales) for name, m in rights.items()}:
+        raise BundleError(f"{where} is damaged: it has factors that do not fit together; copy it again")
     narrow = {name: (lefts[name], rights[name]) for name in lefts}
-    return Delta(str(head["base"]), head["facts"], vectors, parts["w"], narrow)
+    return Delta(str(head["base"]), head["facts"], vectors, whole, narrow)
 
 
-def _read_scaled(
-    arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, object], kind: str, where: str
-) -> dict[str, Scaled]:
-    """Matrices of a kind by name, their shapes and types checked."""
-    matrices = {}
-    for name, data in arrays.items():
-        if not name.startswith(f"{kind}:"):
-            continue
-        scales, shape = arrays.get(f"{kind}s:{name[2:]}"), shapes.get(name)
-        if scales is None or scales.dtype != np.float32 or scales.ndim != 1:
-            raise BundleError(f"{where} is damaged: '{name}' lacks its scales")
+def _matrices(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, object], where: str) -> dict[str, Scaled]:
+    """Return the matrices by name, such as ``w:encoder.weight``, after a check of all arrays."""
+    rules = {name: ArrayRule(values.shape, np.float32) for name, values in arrays.items() if name.startswith("v:")}
+    for name, shape in shapes.items():
         if not isinstance(shape, list) or len(shape) != 2 or not all(type(one) is int for one in shape):
             raise BundleError(f"{where} is damaged: '{name}' lacks its shape")
         columns, bits = shape
-        fits = 0 < columns <= MOST_BYTES and LEAST_BITS <= bits <= MOST_BITS
-        if data.dtype != np.uint8 or not fits or data.size != -(-len(scales) * columns * bits // 8):
-            raise BundleError(f"{where} is damaged: '{name}' has another size than its shape says")
-        matrices[name[2:]] = Scaled.unpacked(data.reshape(-1), scales, columns, bits)
-    return matrices
+        if not (0 < columns <= MOST_BYTES and LEAST_BITS <= bits <= MOST_BITS):
+            raise BundleError(f"{where} is damaged: '{name}' has {columns} columns of {bits} bits")
+        scales = name.replace(":", "s:", 1)
+        rows = len(arrays.get(scales, ()))
+        rules[scales] = ArrayRule((rows,), np.float32, is_exact=True)
+        rules[name] = ArrayRule((-(-rows * columns * bits // 8),), np.uint8, is_exact=True)
+    try:
+        checked = checked_arrays(arrays, rules, where)
+    except ValueError as error:
+        raise BundleError(f"{error}; the delta is damaged: copy it again") from error
+    return {
+        name: Scaled.unpacked(checked[name], checked[name.replace(":", "s:", 1)], *shape)  # type: ignore[misc]
+        for name, shape in shapes.items()
+    }
 
 
 def _hash(arrays: Mapping[str, NDArray[Any]]) -> str:

@@ -10,7 +10,7 @@ import copy
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from edp.networks.twin import Twin, even_starts
 from edp.networks.twin.recurrent import RecurrentTwin
 from edp.networks.twin.recurrent_cell import CellWeights
 from edp.networks.twin.residual import ResidualTwin
+from edp.networks.twin.windows import MeasuredWindows, random_windows
 from edp.settings.bounds import (
     MOST_BATCH,
     MOST_NAMES,
@@ -37,10 +38,10 @@ from edp.settings.bounds import (
     check_count,
     integer,
 )
-from edp.storage.reading import Table
 from edp.storage.runs import KeyedRun
 from edp.training.blas import one_blas_thread
 from edp.training.checkpoint import FILE, TrainingPosition, Weights, damaged, load_checkpoint, save_checkpoint
+from edp.training.fitted_twin import FittedTwin, FreeRunProgress
 from edp.training.optimizers import OptimizerSpec, Soap
 from edp.wording import setting_text, typed
 
@@ -123,78 +124,6 @@ class FreeRunSpec:
             )
 
 
-@dataclass(frozen=True)
-class FreeRunProgress:
-    """Progress of a training on free runs.
-
-    Attributes:
-        update: updates done, of `updates`.
-        updates: of all stages.
-        length_s: of the free runs now.
-        seconds_left: estimated.
-        validation: error of the last validation, in deviations of the velocities; None before the first.
-        best: whether that is the least one so far.
-    """
-
-    update: int
-    updates: int
-    length_s: float
-    seconds_left: float
-    validation: float | None
-    best: bool
-
-
-@dataclass(frozen=True, eq=False)
-class FittedTwin:
-    """A trained twin with its history.
-
-    Attributes:
-        twin: with the weights of the best validation.
-        history: a row per validation; none of a twin that is fitted in closed form.
-        seconds: processor time.
-    """
-
-    twin: Twin
-    history: list[Table]
-    seconds: float
-
-
-class FreeRunSampler:
-    """Stretches of prefix and free run with starts everywhere, scaled; a pure function of seed and update.
-
-    Args:
-        twin: whose numbers they are in.
-        series: training stretches.
-
-    Raises:
-        DataError: no stretch is long enough.
-    """
-
-    def __init__(self, twin: Twin, series: Sequence[Series], longest: int) -> None:
-        usable = [part for part in series if part.samples > twin.prefix_ticks + longest]
-        if not usable:
-            rate = twin.channels.rate_hz
-            raise DataError(
-                f"no stretch is longer than prefix and free run, {typed((twin.prefix_ticks + longest) / rate)} s; "
-                "give "
-                "longer recordings, or shorter free runs (training.lengths_s)"
-            )
-        self.commands = np.concatenate([twin.drive(part.inputs) for part in usable])
-        self.answers = twin.scaled(np.concatenate([part.targets for part in usable]))
-        self.samples = np.array([part.samples for part in usable])
-        self.first = np.cumsum(self.samples) - self.samples
-
-    def rows(self, ticks: int, lanes: int, rng: np.random.Generator) -> NDArray[np.int64]:
-        """Return rows ``(tick + 1, lane)`` of random segments; the last row is the target of the last output."""
-        # Each start is equally likely, so long recordings count by their length.
-        starts = self.samples - ticks
-        ends = np.cumsum(starts)
-        drawn = rng.integers(0, ends[-1], lanes)
-        part = np.searchsorted(ends, drawn, side="right")
-        first = self.first[part] + drawn - (ends[part] - starts[part])
-        return np.asarray(first + np.arange(ticks + 1)[:, None], dtype=np.int64)
-
-
 def draw_measured_ports(spec: FreeRunSpec, shape: tuple[int, int, int], prefix: int, rng: np.random.Generator) -> Array:
     """Return the measured ports ``(tick, lane, answer)``: 1 in the prefix, later by the fractions in the settings."""
     _, lanes, answers = shape
@@ -254,7 +183,17 @@ def _fit_stages(
             f"free runs: {typed(max(spec.lengths_s))} s at {typed(rate)} Hz are more than {MOST_TICKS:,} ticks"
         )
     ticks = np.repeat(lengths, spec.updates)
-    sampler = FreeRunSampler(twin, train, max(lengths))
+    longest = twin.prefix_ticks + max(lengths)
+    scaled = [
+        replace(part, inputs=twin.drive(part.inputs), targets=twin.scaled(part.targets))
+        for part in train
+        if part.samples > longest
+    ]
+    if not scaled:
+        raise DataError(
+            f"no stretch is longer than prefix and free run, {typed(longest / rate)} s; give longer recordings, or "
+            "shorter free runs (training.lengths_s)"
+        )
     judge = FreeRunValidation(twin, validation, round(spec.validation_s * rate), spec.lanes)
     optimizer = spec.optimizer.build(network.named_parameters())
     rates = [group["lr"] for group in optimizer.param_groups]
@@ -267,7 +206,7 @@ def _fit_stages(
         share = _rate(progress.updates / len(ticks), spec.warmup)
         for group, base in zip(optimizer.param_groups, rates, strict=True):
             group["lr"] = base * share
-        loss = _update(twin, sampler, spec, (int(ticks[progress.updates]), progress.updates), weight, optimizer)
+        loss = _update(twin, scaled, spec, (int(ticks[progress.updates]), progress.updates), weight, optimizer)
         progress.updates += 1
         if progress.updates % spec.validate_every and progress.updates != len(ticks):
             continue
@@ -323,19 +262,20 @@ def answer_weights(twin: Twin, spec: FreeRunSpec) -> Array:
 
 def _update(
     twin: RecurrentTwin | ResidualTwin,
-    sampler: FreeRunSampler,
+    train: Sequence[Series],
     spec: FreeRunSpec,
     now: tuple[int, int],
     weight: Tensor,
     optimizer: torch.optim.Optimizer,
 ) -> float:
-    """One update; `now` is the length of the free run in ticks, and how many updates were done. Returns the loss."""
+    """Run one update on scaled segments and return the loss; `now`: ticks of the free run, updates done before."""
     ticks, done = now
     rng = np.random.default_rng([spec.seed, done])
-    rows = sampler.rows(twin.prefix_ticks + ticks, spec.lanes, rng)
-    truth = sampler.answers[rows]
+    windows = random_windows(train, twin.prefix_ticks + ticks, spec.lanes, rng)
+    drawn = MeasuredWindows.read(windows, twin.prefix_ticks + ticks)
+    driven, truth = (np.ascontiguousarray(values.swapaxes(0, 1)) for values in (drawn.commands, drawn.outputs))
     ports = draw_measured_ports(spec, truth[1:].shape, twin.prefix_ticks, rng)
-    commands, measured, port = (torch.from_numpy(a) for a in (sampler.commands[rows[:-1]], truth[:-1], ports))
+    commands, measured, port = (torch.from_numpy(a) for a in (driven, truth[:-1], ports))
     answers = twin.free_run(commands, measured, port)
     loss = huber((answers - torch.from_numpy(truth[1:])) * weight, spec.delta).mean()
     optimizer.zero_grad()
@@ -381,9 +321,8 @@ class FreeRunValidation:
         whole_run = prefix + ticks + 1
         usable = [part for part in series if part.samples >= whole_run]
         each = max(1, lanes // len(usable))
-        starts = even_starts(twin, usable, whole_run, each)
-        self.commands = np.stack([part.inputs[at : at + whole_run - 1] for part, at in starts])
-        self.truth = np.stack([part.targets[at : at + whole_run] for part, at in starts])
+        runs = MeasuredWindows.read(even_starts(twin, usable, whole_run, each), whole_run - 1)
+        self.commands, self.truth = runs.commands, runs.outputs
 
     def error(self) -> float:
         """Error over the free runs in deviations: the geometric mean over actuators, of velocities and of strokes.

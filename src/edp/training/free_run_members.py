@@ -13,14 +13,11 @@ from edp.jobs.workers import WorkUnit
 from edp.networks.twin import TwinScales
 from edp.networks.twin.recurrent import Recurrent, RecurrentTwin, averaged, member_seed
 from edp.networks.twin.static_map import StaticTwin
-from edp.storage import read_object, write_json
 from edp.storage.ledger import TrainingIdentity
-from edp.storage.paths import full_path, is_file_at
+from edp.storage.paths import full_path
 from edp.storage.runs import PARTS, KeyedRun, Run
-from edp.training.free_run import FittedTwin, FreeRunProgress, FreeRunSpec, fit_free_runs
-
-NOTE = "progress.json"
-"""How far a training in another process is, in the folder of its checkpoints."""
+from edp.training.fitted_twin import FittedTwin, FreeRunProgress
+from edp.training.free_run import FreeRunSpec, fit_free_runs
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +73,8 @@ def train_unit(identity: TrainingIdentity, where: Mapping[str, MemberTraining]) 
     job = where["job"]
     if job.folder is None:
         raise ConfigError(f"{job.label} has no folder to be trained in")
-    note = job.folder[0] / NOTE
-    train_member(job, lambda event: write_json(note, dict(vars(event))))
+    folder = job.folder[0]
+    train_member(job, lambda event: event.write(folder))
     return {"trained": job.label}
 
 
@@ -102,16 +99,9 @@ def read_progress_notes(jobs: Sequence[MemberTraining]) -> FreeRunProgress | Non
 
 
 def _read_progress(job: MemberTraining) -> FreeRunProgress | None:
-    if job.folder is None or not is_file_at(note := job.folder[0] / NOTE):
-        return None
     try:
-        row = read_object(note, ("update", "updates", "length_s", "seconds_left", "validation", "best"))
-        error = row["validation"]
-        return FreeRunProgress(
-            int(row["update"]), int(row["updates"]), float(row["length_s"]), float(row["seconds_left"]),
-            None if error is None else float(error), bool(row["best"]),
-        )  # fmt: skip
-    except (EdpError, TypeError, ValueError):
+        return None if job.folder is None else FreeRunProgress.read(job.folder[0])
+    except EdpError:
         return None  # a note is for readers: what cannot be read now is read at the next look
 
 

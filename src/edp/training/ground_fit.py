@@ -13,43 +13,34 @@ from edp.data.series import Series
 from edp.networks.twin.disturbance_observer import LOG_SHARE, DisturbanceObserver
 from edp.networks.twin.grey.ground import GROUNDS, GroundLaw, check_grounded
 from edp.networks.twin.greybox import GreyTwin
+from edp.training.fitted_twin import FittedTwin
 
 Array = NDArray[np.float64]
 Log = tuple[Array, Array, Array]
 
 
-@dataclass(frozen=True, eq=False)
-class FittedGround:
-    """A law, and how much of the forces it explains.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GroundFit(FittedTwin):
+    """A twin of free air with a fitted law of the ground.
 
     Attributes:
-        law: of the ground.
-        explained: share of the squares of the forces where the tip moves in the ground, by part of the recordings;
-            None where a part has no such tick.
-        seconds: processor time.
+        law: ground law. The datasheet has its parameters.
     """
 
     law: GroundLaw
-    explained: dict[str, float | None]
-    seconds: float
-
-    def facts(self) -> dict[str, object]:
-        """Return the provenance entries."""
-        kind = GROUNDS.name_of(self.law)
-        return {"ground": {"kind": kind, "explained": self.explained, "seconds": round(self.seconds, 2)}}
 
 
 def fit_ground(
     kind: str, twin: GreyTwin, train: Sequence[Series], validation: Sequence[Series], machine: str
-) -> FittedGround:
-    """Fit the law to the training data.
+) -> GroundFit:
+    """Fit the law to the training data. The facts have its R^2 in each part, None in a part without contact.
 
     Args:
         kind: name in `GROUNDS`.
-        twin: of free air; it stays as it is.
+        twin: twin of free air; it stays as it is.
         train: recordings in soil.
-        validation: the law's share is asked of them, too.
-        machine: that the twin's linkage is of.
+        validation: recordings in soil for a further R^2.
+        machine: machine of the twin's linkage.
 
     Raises:
         EdpError: the twin can carry no ground, or the recordings are hardly ever in one.
@@ -58,10 +49,13 @@ def fit_ground(
     check_grounded(twin)
     parts = {"train": [read_forces(twin, one) for one in train]}
     parts["validation"] = [read_forces(twin, one) for one in validation]
-    law = GROUNDS[kind].fitted(twin, parts["train"], machine)
-    shares = {part: law.explained(twin, logs) if logs else float("nan") for part, logs in parts.items()}
+    law = GROUNDS[kind].from_logs(twin, parts["train"], machine)
+    shares = {part: law.r_squared(twin, logs) if logs else float("nan") for part, logs in parts.items()}
     explained = {part: share if np.isfinite(share) else None for part, share in shares.items()}
-    return FittedGround(law, explained, time.process_time() - started)
+    seconds = time.process_time() - started
+    facts = {"kind": kind, "explained": explained, "seconds": round(seconds, 2)}
+    rows = tuple(law.rows())
+    return GroundFit(twin=twin, history=[], seconds=seconds, datasheet=rows, facts={"ground": facts}, law=law)
 
 
 def read_forces(twin: GreyTwin, series: Series) -> Log:

@@ -50,11 +50,6 @@ def check_training_memory(net: Predictor, data: Prepared, spec: TrainingSpec, pa
     check_setting(constant_bytes + passes * _backward(net, spec), what, advice)
 
 
-def training_bytes(net: Predictor, data: Prepared, spec: TrainingSpec) -> float:
-    """Return the upper bound of a training's memory in bytes, without recordings and program."""
-    return _weights(net, spec) + _batch(net, spec) + _validation(net, data) + _backward(net, spec)
-
-
 def _weights(net: Predictor, spec: TrainingSpec) -> float:
     return FLOAT * sum(COPIES * math.prod(p.shape) + 2 * spec.optimizer.remembers(p.shape) for p in net.parameters())
 

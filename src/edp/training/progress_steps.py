@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from edp.progress import Progress
-from edp.training.free_run import FreeRunProgress
+from edp.training.fitted_twin import FreeRunProgress
 from edp.training.outcome import TrainingProgress
 
 

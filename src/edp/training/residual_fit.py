@@ -8,25 +8,22 @@ from dataclasses import dataclass, replace
 from edp.data.series import Series
 from edp.networks.twin.residual import Residual, ResidualTwin
 from edp.storage.runs import KeyedRun
-from edp.training.free_run import FreeRunProgress, FreeRunSpec, FreeRunValidation, fit_free_runs
+from edp.training.fitted_twin import FittedTwin, FreeRunProgress
+from edp.training.free_run import FreeRunSpec, FreeRunValidation, fit_free_runs
 
 
-@dataclass(frozen=True, eq=False)
-class ResidualFit:
-    """A trained residual twin.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ResidualFit(FittedTwin):
+    """A trained residual twin: the grey box alone if the weights of the best validation do not help.
 
     Attributes:
-        twin: with the weights of the best validation; the grey box alone where these do not help.
-        history: a row per validation.
-        seconds: processor time of the network's training.
+        twin: the twin that is used.
         grey_error: mean error of the velocities over the free runs of the validation part, in deviations, of the grey
             box alone.
         error: the same with the network.
     """
 
     twin: ResidualTwin
-    history: list[dict[str, object]]
-    seconds: float
     grey_error: float
     error: float
 
@@ -34,10 +31,6 @@ class ResidualFit:
     def helps(self) -> bool:
         """Whether the network has less error than the grey box alone; otherwise its output is zero."""
         return self.error < self.grey_error
-
-    def facts(self) -> dict[str, object]:
-        """For provenance."""
-        return {"helps": self.helps, "validation": self.error, "validation_grey_box": self.grey_error}
 
 
 def residual_spec(form: Residual, training: FreeRunSpec) -> FreeRunSpec:
@@ -81,4 +74,8 @@ def fit_residual(
     fitted = fit_free_runs(twin, train, validation, spec, on_event, run)
     error = min(row["validation"] for row in fitted.history)
     chosen = twin if error < grey_error else twin.drop_network()
-    return ResidualFit(chosen, fitted.history, fitted.seconds, grey_error, error)
+    facts = {"helps": error < grey_error, "validation": error, "validation_grey_box": grey_error}
+    return ResidualFit(
+        twin=chosen, history=fitted.history, seconds=fitted.seconds, facts={"residual": facts}, grey_error=grey_error,
+        error=error,
+    )  # fmt: skip

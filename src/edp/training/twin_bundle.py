@@ -15,17 +15,27 @@ from edp.errors import BundleError, ConfigError, ExportError
 from edp.networks.twin import TWINS, FreeRunIntervals, Twin, TwinPlant, TwinScales, TwinSpec
 from edp.networks.twin.grey.ground import GROUNDS, GroundLaw, check_grounded
 from edp.networks.twin.recurrent_cell import CellWeights
-from edp.settings.bounds import above
 from edp.settings.provenance import Provenance
 from edp.settings.tree import SettingsTree, Table
-from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, write_json
+from edp.storage.arrays import ArrayRule, checked_arrays
 from edp.storage.headers import read_header
 from edp.storage.memory import check_setting
-from edp.storage.paths import entries_of, is_entry_at
+from edp.storage.paths import is_entry_at
 from edp.storage.runs import missing_text
 from edp.storage.seals import HASH
-from edp.training.bundle import Bundle, add_plugins, check_hash, convert_damage, read_arrays, write_arrays
+from edp.training.bundle import (
+    Bundle,
+    add_plugins,
+    channel_from_plain,
+    channel_to_plain,
+    check_hash,
+    convert_damage,
+    read_arrays,
+    remove_old_arrays,
+    sealed_header,
+    write_arrays,
+)
 
 SCHEMA = 2
 GROUNDED = 3
@@ -34,7 +44,6 @@ READABLE = (1, SCHEMA, GROUNDED)
 """Schema 1 had no intervals."""
 HEADER = "twin.json"
 PARTS = ("commands", "velocities", "strokes", "pressures")
-RATE = above(0.0, 1e6)
 STROKES = "full_strokes_m"
 """In the metadata of simulated recordings, and in the provenance of a twin that learned from them."""
 OIL_C = "oil_c"
@@ -116,7 +125,7 @@ def save_twin(bundle: TwinBundle, folder: str | Path) -> Path:
         "edp": __version__,
         "twin": _TREE.plain(bundle.spec, "twin"),
         "rate_hz": channels.rate_hz,
-        "channels": {part: [_plain(channel) for channel in getattr(channels, part)] for part in PARTS},
+        "channels": {part: [channel_to_plain(channel) for channel in getattr(channels, part)] for part in PARTS},
         "weights": entry,
         "intervals": None if bundle.intervals is None else bundle.intervals.to_plain(),
         "provenance": bundle.provenance.to_table(),
@@ -125,10 +134,7 @@ def save_twin(bundle: TwinBundle, folder: str | Path) -> Path:
     if bundle.ground is not None:
         header["ground"] = {"kind": GROUNDS.name_of(bundle.ground), **bundle.ground.plain()}
     write_json(path / HEADER, add_plugins(header))
-    # Old files go only after the rename; a kill in between leaves spare files, not a broken twin.
-    for old in entries_of(path, "weights-*.safetensors"):
-        if old.name != entry["file"]:
-            old.unlink(missing_ok=True)
+    remove_old_arrays(path, ("weights",), (entry["file"],))
     return path
 
 
@@ -172,35 +178,19 @@ def load_twin(folder: str | Path) -> TwinBundle:
     if not is_entry_at(path / HEADER):
         raise BundleError(missing_text(path, "twin", "a twin"))
     with convert_damage(path):
-        header = read_header(path / HEADER, ("schema",))
-        schema = header["schema"]
-        if isinstance(schema, bool) or schema not in READABLE:
-            raise BundleError(
-                f"twin '{path}' has schema {str(schema)[:40]}, this EDP ({__version__}) reads 1 to {GROUNDED}; "
-                "install a newer one, or train again"
-            )
-        check_hash(header, path / HEADER)
+        header = sealed_header(path / HEADER, "twin", READABLE, "train again")
         return _assemble(header, path)
 
 
 def _assemble(header: Table, path: Path) -> TwinBundle:
-    parts = {part: tuple(_channel(entry) for entry in header["channels"][part]) for part in PARTS}
-    if not RATE.holds(header["rate_hz"]):
-        raise ValueError(f"its rate_hz is {str(header['rate_hz'])[:40]}; {RATE.rule('rate_hz')} must hold")
+    parts = {part: tuple(channel_from_plain(entry) for entry in header["channels"][part]) for part in PARTS}
     channels = TwinChannels(**parts, rate_hz=float(header["rate_hz"]))
     spec = _TREE.build(_Form, {"twin": header["twin"]}, f"'{path / HEADER}'").twin
     expected = {**TwinScales.shapes(channels), **spec.shapes(channels)}
     numbers = sum(int(np.prod(shape)) for shape in expected.values())
     check_setting(8 * numbers, f"a twin of {numbers:,} numbers", "the header may be damaged")
-    arrays = load_arrays(read_arrays(path, header["weights"]))
-    other = sorted({*expected} ^ {*arrays})
-    if other:
-        raise ValueError(f"its weights are not those of its header: '{other[0][:80]}' is in one of them only")
-    for name, values in sorted(arrays.items()):
-        if values.shape != expected[name] or values.dtype != np.float32:
-            raise ValueError(f"'{name[:80]}' is {values.shape} {values.dtype}, not {expected[name]} float32")
-        if not np.isfinite(values).all():
-            raise ValueError(f"'{name[:80]}' holds a number that is not finite")
+    rules = {name: ArrayRule(shape, np.float32, is_exact=True) for name, shape in expected.items()}
+    arrays = checked_arrays(load_arrays(read_arrays(path, header["weights"])), rules, "its weights")
     provenance = Provenance.from_table(object_with(header["provenance"], (), "its provenance"), "its provenance")
     scores = object_with(header["scores"], (), "its scores")
     widths = header.get("intervals") if header["schema"] > 1 else None
@@ -219,17 +209,3 @@ def _ground(header: Table, twin: Twin) -> GroundLaw | None:
         return GROUNDS[str(plain["kind"])[:80]].of(plain)
     except ConfigError as error:
         raise ValueError(f"its ground: {error}") from None
-
-
-def _plain(channel: Channel) -> dict[str, str]:
-    return {"name": channel.name, "kind": str(channel.kind), "unit": channel.unit, "description": channel.description}
-
-
-def _channel(entry: Table) -> Channel:
-    texts = [entry["name"], entry["description"]]
-    if not all(isinstance(text, str) for text in texts):
-        raise TypeError("the name or description of a channel is no text")
-    channel = Channel(entry["name"], Kind(entry["kind"]), entry["description"])
-    if entry["unit"] != channel.unit:
-        raise ValueError(f"channel '{channel.name[:80]}' is in {str(entry['unit'])[:20]}, {channel.unit} must hold")
-    return channel

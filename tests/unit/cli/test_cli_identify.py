@@ -78,7 +78,7 @@ def test_a_run_of_a_grey_box_is_taken_and_one_of_another_kind_refused(edp, logs,
         raise ConfigError("no rigid bodies have this load")
 
     # As after a fit as short as this one: its load may be one that no bodies have, and the guess's bodies stay.
-    monkeypatch.setattr(sys.modules["edp.workflows.identify.identify"], "realised", refused)
+    monkeypatch.setattr(sys.modules["edp.workflows.identify.identify"], "realise_bodies", refused)
     for kind, file in (("greybox", "grey"), ("static", "map")):
         settings = [f"twin.kind={kind}", *(word for word in SMALL if kind == "greybox" or "twin." not in word)]
         train_twin(DataSource.of(logs), load_twin_experiment(None, settings), tmp_path / file)

@@ -103,6 +103,7 @@ WHOLE = {
     "replay": "one pass along the logs, in their order",
     "rollout": "one pass along a log",
     "forecast": "one pass along a log",
+    "doctor": "compiles, once for an installation",
     "init": "reads heads of logs, which takes seconds",
     "search run": "trainings, which `tests/unit/search` divides and kills",
     "search report": "writes a page",

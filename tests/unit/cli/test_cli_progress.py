@@ -12,7 +12,7 @@ from edp.cli.console import BoundedProgress, Steps, TimeLeft, count_text, format
 from edp.cli.progress import Display, StageDisplay
 from edp.cli.screen import ScreeningDisplay
 from edp.training import TrainingProgress
-from edp.training.free_run import FreeRunProgress
+from edp.training.fitted_twin import FreeRunProgress
 from edp.training.progress_steps import free_run_steps, training_steps
 
 COMMANDS = Path(console.__file__).parent

@@ -12,7 +12,7 @@ from edp.storage.locks import hold
 from edp.storage.run_kinds import RUN_KINDS
 from edp.storage.run_listing import MODELS, list_runs
 from edp.storage.runs import Run, state_of
-from edp.training.free_run import FreeRunProgress
+from edp.training.fitted_twin import FreeRunProgress
 from edp.training.progress_steps import free_run_steps
 
 

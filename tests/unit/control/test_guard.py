@@ -79,8 +79,8 @@ class FaultySensors(TwinEnvironment):
     def step(self, action):
         row, *rest = super().step(action)
         shown = row.copy()
-        if FROM <= self._tick < UNTIL:
-            shown[interface_of(self).columns(VELOCITIES[:2])] += 5.0 if self._tick % 2 else np.nan
+        if FROM <= self._batch.tick[0] < UNTIL:
+            shown[interface_of(self).columns(VELOCITIES[:2])] += 5.0 if self._batch.tick[0] % 2 else np.nan
         return shown, *rest
 
 

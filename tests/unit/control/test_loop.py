@@ -207,6 +207,10 @@ def test_a_twin_as_a_plant_refuses_soil_and_what_no_lever_commands(twin):
     plant.reset(seed=0)
     with pytest.raises(ConfigError, match="three finite positions"):
         plant.step(np.array([0.0, np.nan, 0.0]))
+    while not plant.step(np.zeros(3))[3]:
+        pass
+    with pytest.raises(ConfigError, match="the episode has ended; call reset"):
+        plant.step(np.zeros(3))
 
 
 def test_an_inversion_runs_a_twin_whose_ports_are_partly_measured(env, twin, task):

@@ -11,6 +11,7 @@ from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.equations import GAMMA
 from edp.networks.twin.grey.parameters import number_table
 from edp.networks.twin.grey.priors import Travel, opening_knots
+from edp.networks.twin.parameters import posterior_deviations
 from edp.signals import VOCABULARY, Channel, Kind
 from edp.sim.machine.machine_files import load_machine, parse_machine
 from edp.sim.machine.parameters import pack
@@ -21,14 +22,19 @@ from edp.training.identification.bodies import (
     base_parameters,
     grey_load,
     load_by_base,
-    realised,
+    realise_bodies,
     solve_base,
 )
 from edp.training.identification.elements import check_strokes, excavator_elements, full_commands
 from edp.training.identification.machine_numbers import MACHINE_NUMBERS, guesses, set_values
 from edp.training.identification.machine_text import machine_text
 from edp.training.identification.mapping import GreyParts, grey_numbers
-from edp.training.identification.tie import CUSHIONS, MachineTie, coordinates, deviations, fix_coordinates, nearest
+from edp.training.identification.parametrisation import (
+    CUSHIONS,
+    MachineParametrisation,
+    nearest_machine,
+    reset_to_guess,
+)
 
 M22 = load_machine("M22")
 PILOTS = ("BmUp", "BmDwn", "AmIn", "AmOut", "BktIn", "BktOut")
@@ -62,21 +68,21 @@ def other_machine(seed=0):
 @pytest.mark.long
 def test_numbers_of_a_grey_box_made_from_a_machine_map_back_to_it(parts):
     machine = other_machine()
-    tie = MachineTie.of(M22, parts, parts.table.nominal[parts.load])
-    numbers = grey_numbers(machine, parts, tie.load)
-    theta = nearest(tie, numbers, 1e4 * np.eye(len(numbers)), prior=0.0)
-    again, truth = (np.array([n.of(m) for n in MACHINE_NUMBERS]) for m in (tie.machine(theta), machine))
+    own = MachineParametrisation.from_guess(M22, parts, parts.table.nominal[parts.load])
+    numbers = grey_numbers(machine, parts, own.load)
+    theta = nearest_machine(own, numbers, 1e4 * np.eye(len(numbers)), prior=0.0)
+    again, truth = (np.array([n.of(m) for n in MACHINE_NUMBERS]) for m in (own.machine(theta), machine))
     assert np.abs(again / truth - 1.0).max() < 1e-9
 
 
 def test_what_the_data_do_not_tell_stays_at_the_guess(parts):
-    machine, tie = other_machine(1), MachineTie.of(M22, parts, parts.table.nominal[parts.load])
-    numbers = grey_numbers(machine, parts, tie.load)
+    machine, own = other_machine(1), MachineParametrisation.from_guess(M22, parts, parts.table.nominal[parts.load])
+    numbers = grey_numbers(machine, parts, own.load)
     # Only dead bands and openings of the boom are told.
     excited = np.zeros(len(numbers))
     excited[parts.table.valve_at[0, at.BAND] : parts.table.valve_at[0, at.BAND] + 12] = 1e6
-    theta = nearest(tie, numbers, np.diag(excited))
-    machine_found = {n.label: n.of(tie.machine(theta)) for n in MACHINE_NUMBERS}
+    theta = nearest_machine(own, numbers, np.diag(excited))
+    machine_found = {n.label: n.of(own.machine(theta)) for n in MACHINE_NUMBERS}
     truth = {n.label: n.of(machine) for n in MACHINE_NUMBERS}
     base = {n.label: n.of(M22) for n in MACHINE_NUMBERS}
     for label in ("valves.dead_band_extend[boom]", "valves.meter_in_extend[boom]", "valves.meter_out_extend[boom]"):
@@ -88,10 +94,10 @@ def test_what_the_data_do_not_tell_stays_at_the_guess(parts):
 def test_a_number_set_back_moves_those_that_make_up_for_it():
     information = np.array([[50.0, 49.0], [49.0, 50.0]])
     theta = np.array([0.5, -0.5])
-    moved = fix_coordinates(theta, information, np.array([False, True]))
+    moved = reset_to_guess(theta, information, np.array([False, True]))
     # What matters is the sum, which the first one now gives alone, but for what was thought before.
     assert moved == pytest.approx([0.5 + 49.0 / 51.0 * -0.5, 0.0])
-    assert deviations(np.diag([0.0, 99.0])) == pytest.approx([1.0, 0.1])
+    assert posterior_deviations(np.diag([0.0, 99.0])) == pytest.approx([1.0, 0.1])
 
 
 def test_opening_curves_and_areas_are_those_of_the_simulator(parts):
@@ -143,16 +149,16 @@ def test_bodies_come_back_from_inertia_and_gravity(poses):
     by_torque, by_inertia = load_by_base(poses, M22.bodies.length, M22.gravity)
     nine = base_parameters(M22.bodies)
     assert solve_base(by_torque @ nine, by_inertia @ nine, poses, M22) == pytest.approx(nine, rel=1e-9)
-    bodies = realised(nine, M22)
+    bodies = realise_bodies(nine, M22)
     assert np.array(bodies.inertia) == pytest.approx(M22.bodies.inertia, rel=1e-6)
     heavy = replace(M22, bodies=replace(M22.bodies, mass=(2500.0, 700.0, 1200.0), com_y=(0.4, 0.2, 0.2)))
     # Other masses, the same motion; a guess that is far off changes what the poses tell by little.
-    assert base_parameters(realised(nine, heavy)) == pytest.approx(nine)
+    assert base_parameters(realise_bodies(nine, heavy)) == pytest.approx(nine)
     assert solve_base(by_torque @ nine, by_inertia @ nine, poses, heavy)[[0, 2, 4]] == pytest.approx(
         nine[[0, 2, 4]], rel=1e-3
     )
     with pytest.raises(ConfigError, match="no rigid bodies have the joint inertia and gravity torques of the logs"):
-        realised(nine * np.array([1, 1, 1, 1, 1, 1, 1, 1, 0.05]), M22)
+        realise_bodies(nine * np.array([1, 1, 1, 1, 1, 1, 1, 1, 0.05]), M22)
 
 
 def test_the_load_of_a_grey_box_is_read_as_forces_and_masses(parts, poses):
@@ -180,9 +186,8 @@ def test_the_text_of_a_machine_is_read_back_as_the_machine():
 
 def test_coordinates_are_plausible_deviations(parts):
     table = parts.table
-    moved = table.values(np.full(len(table.numbers), 0.5))
-    expected = np.where(table.positive, 0.5 / table.width, 0.5)
-    assert coordinates(table, moved, table.nominal) == pytest.approx(expected)
+    moved = table.priors.values(np.full(len(table.numbers), 0.5))
+    assert table.priors.coordinates(moved) == pytest.approx(0.5)
 
 
 def test_logs_without_second_spools_have_none():
@@ -246,9 +251,9 @@ def test_the_chain_of_lags_moves_as_the_spools_of_the_simulator(parts):
 
 def test_no_cushion_of_an_identified_machine_reaches_the_middle_of_its_stroke(parts):
     """Logs that never meet an end stop may ask for any length; a machine file takes half of the stroke at most."""
-    tie = MachineTie.of(M22, parts, parts.table.nominal[parts.load])
-    theta = np.zeros(len(tie.begin))
+    own = MachineParametrisation.from_guess(M22, parts, parts.table.nominal[parts.load])
+    theta = np.zeros(len(own.begin))
     theta[CUSHIONS] = 8.0
-    machine = tie.machine(theta)
+    machine = own.machine(theta)
     for length, stroke in zip(machine.cylinders.cushion_length, machine.cylinders.stroke, strict=True):
         assert 0.49 * stroke < length < 0.5 * stroke

@@ -84,7 +84,7 @@ def test_a_missing_channel_is_silent_and_the_others_watch(fitted, fresh):
     keep = [i for i, name in enumerate(lacking.channel_names) if name != "pressure_b"]
     lacking = Recording("lacking", tuple(lacking.channels[i] for i in keep), lacking.values[:, keep], 100.0)
     assert monitor.check(lacking) == ("pressure_b",)
-    rows = monitor.condition_rows(lacking)
+    rows = monitor.conditioned_rows(lacking)
     silent = np.array(["pressure_b" in name for name in monitor.summary_names])
     assert np.isnan(rows[:, silent]).all()
     # What reads the channel is silent as well; balances of stroke and velocity do not, and go on.
@@ -101,8 +101,8 @@ def test_broken_numbers_spoil_nothing(fitted, fresh):
     values = recording.values.copy()
     values[500:520, 1], values[700, 3], values[800:803, 0] = np.inf, 1e30, np.nan
     monitor = fitted.monitor
-    broken = monitor.condition_rows(replace(recording, values=values))
-    sound = monitor.condition_rows(recording)
+    broken = monitor.conditioned_rows(replace(recording, values=values))
+    sound = monitor.conditioned_rows(recording)
     np.testing.assert_allclose(broken[12:], sound[12:], atol=0.5)
 
 
@@ -184,7 +184,7 @@ def test_the_folder_gives_the_same_monitor(fitted, fresh, tmp_path):
     loaded = load_monitor(folder)
     assert loaded.inputs == fitted.monitor.inputs
     assert loaded.limit == fitted.monitor.limit
-    np.testing.assert_array_equal(loaded.condition_rows(fresh[0]), fitted.monitor.condition_rows(fresh[0]))
+    np.testing.assert_array_equal(loaded.conditioned_rows(fresh[0]), fitted.monitor.conditioned_rows(fresh[0]))
     before = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
     save_monitor(loaded, folder)
     assert sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*")) == before
@@ -265,7 +265,7 @@ def test_a_rig_of_three_channels_and_one_hertz():
     experiment = load_monitor_experiment(None, (), {"hours_per_false_alarm": 0.3, "minutes": 0.05})
     monitor = fit_to_recordings(sessions, experiment).monitor
     assert monitor.chain.summaries.block >= 2
-    assert np.isfinite(monitor.condition_rows(sessions[0])[-1]).any()
+    assert np.isfinite(monitor.conditioned_rows(sessions[0])[-1]).any()
 
 
 def test_a_fit_is_repeatable(healthy):

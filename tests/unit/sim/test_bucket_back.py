@@ -1,6 +1,7 @@
 """The back of the bucket pushes soil: passive pressure, mass, no energy, heaps, prints of the heel, refusals."""
 
 import dataclasses
+from importlib import resources
 
 import numpy as np
 import pytest
@@ -10,15 +11,16 @@ from edp.sim import Scenario, Simulation, load_machine
 from edp.sim.machine import layout as at
 from edp.sim.physics import bucket_back, ground_profile, soil
 from edp.sim.physics import terramechanics as tm
+from edp.sim.physics.material import load_material, material_names
 from edp.sim.physics.plant import Plant
 from edp.sim.physics.pose import Kinematics
 
-MATERIALS = soil.material_names()
+MATERIALS = material_names()
 
 
 def ground(push, name="sandy_loam", friction_deg=10.0, seed=0):
     changes = {"back_push": push, "back_friction_deg": friction_deg if push else 0.0}
-    material = dataclasses.replace(soil.load_material(name), **changes)
+    material = dataclasses.replace(load_material(name), **changes)
     return soil.Ground(material, load_machine("M22"), np.random.default_rng(seed))
 
 
@@ -161,7 +163,7 @@ def test_it_converges_as_the_front_does():
 
 
 def test_a_snapshot_goes_on_to_the_bit(tmp_path):
-    text = (soil.resources.files("edp.sim") / "materials" / "sandy_loam.toml").read_text()
+    text = (resources.files("edp.sim") / "materials" / "sandy_loam.toml").read_text()
     path = tmp_path / "pushed.toml"
     path.write_text(text + "\nback_push = 0.8\nback_friction_deg = 12.0\n")
     simulation = Simulation(Scenario(excitation="grading", material=str(path), duration_s=12.0, seed=4))
@@ -188,4 +190,4 @@ def test_a_snapshot_goes_on_to_the_bit(tmp_path):
 )
 def test_what_cannot_be_is_refused(changes, says):
     with pytest.raises(ConfigError, match=says):
-        dataclasses.replace(soil.load_material("clay"), **changes)
+        dataclasses.replace(load_material("clay"), **changes)

@@ -10,13 +10,14 @@ from edp.sim import load_machine
 from edp.sim.machine import layout as at
 from edp.sim.physics import ground_profile, soil, terrain
 from edp.sim.physics import terramechanics as tm
+from edp.sim.physics.material import load_material
 from edp.sim.physics.plant import Plant
 
 HEEL_X = 5.0
 
 
 def ground(compaction, name="sandy_loam", seed=0):
-    material = dataclasses.replace(soil.load_material(name), compaction=compaction)
+    material = dataclasses.replace(load_material(name), compaction=compaction)
     return soil.Ground(material, load_machine("M22"), np.random.default_rng(seed))
 
 
@@ -147,4 +148,4 @@ def test_without_it_the_ground_forgets():
 @pytest.mark.parametrize("value", [-0.1, 1.1, float("nan")])
 def test_what_cannot_be_is_refused(value):
     with pytest.raises(ConfigError, match="compaction"):
-        dataclasses.replace(soil.load_material("clay"), compaction=value)
+        dataclasses.replace(load_material("clay"), compaction=value)

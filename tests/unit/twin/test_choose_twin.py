@@ -23,7 +23,8 @@ from edp.progress import SilentProgress
 from edp.storage.runs import KeyedRun, Run
 from edp.testing.twins import sample_actuators, sample_series, sample_twin
 from edp.training import free_run_members
-from edp.training.free_run import FreeRunDiverged, FreeRunProgress, FreeRunSpec
+from edp.training.fitted_twin import FreeRunProgress
+from edp.training.free_run import FreeRunDiverged, FreeRunSpec
 from edp.training.free_run_members import MemberTraining, fit_members, member_unit, read_progress_notes
 from edp.training.optimizers import AdamW
 from edp.workflows.twin import choose_twin, fit_twin, training_cost
@@ -58,7 +59,7 @@ def test_the_simplest_candidate_that_is_as_good_as_the_best_is_kept(run, monkeyp
     assert [one.error for one in tried] == [1.0, 0.7, 0.6]
     assert [one.label for one in tried if one.chosen] == [kept]
     assert TWINS.name_of(result.spec) == kept
-    assert result.facts == {"chosen": kept, "folds": 2}
+    assert result.fitted.facts == {"chosen": kept, "folds": 2}
 
 
 @pytest.mark.long
@@ -190,7 +191,7 @@ def test_long_recordings_are_judged_by_the_validation_part_and_have_one_wide_net
     assert tried[1].label.startswith("recurrent (96 units, on the map)")
     assert [twin for twin, _ in result.unseen] == [tried[i].trial.fits[0].fitted.twin for i in range(len(tried))
                                                    if tried[i].chosen]  # fmt: skip
-    assert result.facts["folds"] == 1
+    assert result.fitted.facts["folds"] == 1
 
 
 @pytest.mark.parametrize(
@@ -436,7 +437,7 @@ def test_known_elements_are_fitted_without_each_fold_and_at_last_to_everything(r
     result, tried = one.best()
     assert [row.label for row in tried] == ["static", "elements"]
     assert result.spec == replace(AXES, prefix_ticks=20)
-    assert {row["element"] for row in result.datasheet} == {"m1", "m2"}
+    assert {row.element for row in result.fitted.datasheet} == {"m1", "m2"}
     everything = sum(part.samples for part in [*one.fit.data.train, *one.fit.data.validation])
     assert fits[-1] == [everything, everything]
     assert len(fits) == 3

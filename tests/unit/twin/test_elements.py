@@ -10,7 +10,7 @@ from edp.networks.twin import fit_scales
 from edp.networks.twin.elements import ElementsBox
 from edp.networks.twin.lumped.parts import LagElement, MassElement, TankElement
 from edp.signals import Channel, Kind
-from edp.training.elements_fit import _Problem, fit_elements
+from edp.training.elements_fit import LumpedProblem, fit_elements
 
 TANKS = ElementsBox(
     tanks=(TankElement(name="upper", source="pump"), TankElement(name="lower", source="upper", level="level")),
@@ -43,19 +43,19 @@ def test_a_fit_finds_the_run_again(tanks):
     answers, _ = fit.twin.rollout(series.inputs[None, 10:-1], state)
     error = np.sqrt(np.mean((answers[0, :, 1] - series.targets[11:, 1]) ** 2))
     assert error < 0.02 * series.targets[:, 1].std()
-    assert [row["name"] for row in fit.rows] == [number.name for number in twin.table]
-    assert all(row["low"] <= row["value"] <= row["high"] for row in fit.rows)
+    assert [row.name for row in fit.datasheet] == [number.name for number in twin.table]
+    assert all(row.low <= row.value <= row.high for row in fit.datasheet)
 
 
 def test_slopes_are_those_of_differences(tanks):
     twin, _, series = tanks
-    problem = _Problem(twin, [series])
+    problem = LumpedProblem(twin, [series])
     rng = np.random.default_rng(1)
-    point, way = (0.2 * rng.normal(size=problem.size()[1]) for _ in range(2))
-    _, gradient = problem.normal(point)
-    difference = problem.cost(point + 1e-5 * way) - problem.cost(point - 1e-5 * way)
-    prior = way @ point
-    assert gradient @ way + prior == pytest.approx(difference / 2e-5, rel=1e-4)
+    point, way = (0.2 * rng.normal(size=problem.size) for _ in range(2))
+    above, below = (problem.normal_equations(point + side * 1e-5 * way, False).cost for side in (1.0, -1.0))
+    equations = problem.normal_equations(point, True)
+    assert equations.gradient @ way == pytest.approx((above - below) / 2e-5, rel=1e-4)
+    assert equations.cost == pytest.approx(problem.normal_equations(point, False).cost)
 
 
 @pytest.mark.parametrize(
@@ -85,22 +85,22 @@ def cut(series, samples):
 
 def test_recordings_of_any_length_are_fitted_to_their_ends(tanks):
     twin, _, series = tanks
-    problem = _Problem(twin, [series, cut(series, 60)])
+    problem = LumpedProblem(twin, [series, cut(series, 60)])
     assert problem.truth.shape[:2] == (2, 149)
     assert np.isnan(problem.truth[1, 59:]).all()
     assert np.isfinite(problem.truth[1, :59]).all()
     # What the run says behind the end of its recording counts nowhere.
-    point = np.zeros(problem.size()[1])
-    alone = [_Problem(twin, [one]) for one in (series, cut(series, 60))]
-    assert problem.cost(point) == pytest.approx(sum(one.cost(np.zeros(one.size()[1])) for one in alone))
+    every = (problem, *(LumpedProblem(twin, [one]) for one in (series, cut(series, 60))))
+    both, first, second = (one.normal_equations(np.zeros(one.size), False).cost for one in every)
+    assert both == pytest.approx(first + second)
 
 
 def test_long_logs_are_fitted_in_as_many_runs_as_the_memory_holds(tanks, monkeypatch):
     twin, _, series = tanks
     monkeypatch.setattr("edp.training.elements_fit.MOST_TICKS", 20)
-    assert _Problem(twin, [series]).truth.shape[:2] == (8, 20)
+    assert LumpedProblem(twin, [series]).truth.shape[:2] == (8, 20)
     monkeypatch.setattr("edp.training.elements_fit.MOST_VALUES", 3 * 12 * 20 * 2)
-    assert _Problem(twin, [series]).truth.shape[:2] == (3, 20)
+    assert LumpedProblem(twin, [series]).truth.shape[:2] == (3, 20)
 
 
 def test_a_length_that_no_stretch_has_is_refused(tanks):
@@ -108,4 +108,4 @@ def test_a_length_that_no_stretch_has_is_refused(tanks):
     spec = ElementsBox(tanks=TANKS.tanks, length_s=600.0)
     longer = spec.start(CHANNELS, twin.scales, [series], 0)
     with pytest.raises(DataError, match=r"no training stretch has a free run of 600 s.*596 s"):
-        _Problem(longer, [cut(series, 150)])
+        LumpedProblem(longer, [cut(series, 150)])

@@ -1,5 +1,7 @@
 """Training on free runs: what is drawn, what is learned, and that a seed settles it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,9 +9,10 @@ from edp.errors import ConfigError, DataError, StorageError
 from edp.evaluation.free_run import FreeRunJudgeSpec, free_run_scores, free_runs
 from edp.networks.twin import TWINS, fit_scales
 from edp.networks.twin.recurrent import Recurrent
+from edp.networks.twin.windows import MeasuredWindows, random_windows
 from edp.storage.runs import KeyedRun, Run
 from edp.testing.twins import sample_series
-from edp.training.free_run import FreeRunDiverged, FreeRunSampler, FreeRunSpec, draw_measured_ports, fit_free_runs
+from edp.training.free_run import FreeRunDiverged, FreeRunSpec, draw_measured_ports, fit_free_runs
 from edp.training.optimizers import AdamW, Soap
 
 SMALL = {"lanes": 16, "lengths_s": (0.2, 1.0), "updates": (150, 100), "validate_every": 50, "validation_s": 5.0}
@@ -103,16 +106,15 @@ def test_the_last_stage_ends_early_and_no_other_one(data, monkeypatch):
 
 
 def test_stretches_lie_within_recordings_and_begin_everywhere(data):
-    channels, scales, train, _, _ = data
-    twin = Recurrent(units=4, prefix_ticks=5).start(channels, scales, train, seed=0)
-    sampler = FreeRunSampler(twin, train, 20)
-    rows = sampler.rows(25, 20_000, np.random.default_rng(0))
-    assert rows.shape == (26, 20_000)
-    owners = np.searchsorted(np.cumsum([s.samples for s in train]), rows, side="right")
-    assert (owners == owners[0]).all()
-    assert set(rows[0]) == {s * 600 + t for s in range(4) for t in range(600 - 25)}
-    expected = twin.scale_commands(train[2].inputs)
-    assert np.array_equal(sampler.commands[1200:1800], expected)
+    _, _, train, _, _ = data
+    short = replace(train[0], inputs=train[0].inputs[:25], targets=train[0].targets[:25])
+    windows = random_windows([short, *train], 25, 20_000, np.random.default_rng(0))
+    starts = {(next(i for i, part in enumerate(train) if part is window.series), window.first) for window in windows}
+    assert starts == {(s, t) for s in range(4) for t in range(600 - 25)}
+    measured = MeasuredWindows.read(windows[:3], 25)
+    for k, (series, first) in enumerate(windows[:3]):
+        assert np.array_equal(measured.commands[k], series.inputs[first : first + 25])
+        assert np.array_equal(measured.outputs[k], series.targets[first : first + 26])
 
 
 def test_ports_are_measured_by_their_shares():
@@ -147,7 +149,7 @@ def test_recordings_that_are_too_short_are_refused(data):
     channels, scales, train, _, _ = data
     twin = Recurrent(units=4, prefix_ticks=5).start(channels, scales, train, seed=0)
     with pytest.raises(DataError, match=r"no stretch is longer than prefix and free run, 20\.1 s"):
-        FreeRunSampler(twin, train, 1000)
+        fit_free_runs(twin, train, train, FreeRunSpec(lengths_s=(20.0,), updates=(1,)))
 
 
 @pytest.mark.long

@@ -13,12 +13,13 @@ from edp.data.twin_channels import twin_channels
 from edp.errors import ConfigError
 from edp.networks.twin import fit_scales
 from edp.networks.twin.grey import parameter_index as at
-from edp.networks.twin.grey.datasheet import datasheet, datasheet_text
+from edp.networks.twin.grey.datasheet import datasheet
 from edp.networks.twin.grey.elements import CylinderElement, Elements, ValveElement
 from edp.networks.twin.grey.parameters import monomials, number_table
 from edp.networks.twin.grey.priors import Travel
 from edp.networks.twin.grey.rollouts import RunBatch
 from edp.networks.twin.greybox import GreyBox, GreyFitSpec, RunTarget
+from edp.networks.twin.parameters import Datasheet
 from edp.storage.seals import HASH, content_digest
 from edp.testing.bench import bench_channels, bench_grey_box, bench_series
 from edp.testing.twins import sample_actuators
@@ -127,13 +128,13 @@ def test_a_fit_finds_a_machine_again(bench):
     assert after < 0.05 * before
     best = [row["validation"] for row in result.history if row["best"]]
     assert best[-1] == min(row["validation"] for row in result.history)
-    rows = {f"{row['element']}.{row['name']}": row for row in datasheet(table, fitted.numbers, result.information)}
-    assert rows["pump.full_flow"]["unit"] == "m^3/s"
-    assert rows["valve.into_extend_25"]["excited"]
-    assert all(row["low"] <= row["value"] <= row["high"] for row in rows.values())
+    rows = {f"{row.element}.{row.name}": row for row in datasheet(table, fitted.numbers, result.information)}
+    assert rows["pump.full_flow"].unit == "m^3/s"
+    assert rows["valve.into_extend_25"].excited
+    assert all(row.low <= row.value <= row.high for row in rows.values())
     # Nothing ran into a cushion of a stop, and no port relief opened.
-    assert not rows["ram.head_relief"]["excited"]
-    assert "(" in datasheet_text(list(rows.values()))
+    assert not rows["ram.head_relief"].excited
+    assert "(" in Datasheet(basis="", numbers=tuple(rows.values())).to_text()
 
 
 def test_finer_opening_curves_answer_as_the_coarser_ones_they_were_made_of(bench):
@@ -178,7 +179,7 @@ def test_free_runs_choose_how_many_stretches_an_opening_curve_has(bench):
     assert kept in (10, 20)
     assert result.error == min(row["validation"] for row in result.history if row["stretches"] == kept)
     assert len(result.information) == len(result.twin.numbers) == len(result.theta)
-    names = {row["name"] for row in datasheet(result.twin.table, result.twin.numbers, result.information)}
+    names = {row.name for row in datasheet(result.twin.table, result.twin.numbers, result.information)}
     assert {"into_extend_5", "into_extend_17.5", "into_extend_100"} <= names
 
 
@@ -244,7 +245,7 @@ def test_what_is_left_out_does_nothing_and_is_not_fitted(bench):
     np.testing.assert_array_equal(result.twin.numbers[fixed], bare.numbers[fixed])
     assert not np.array_equal(result.twin.numbers, fresh.numbers)
     rows = datasheet(bare.table, result.twin.numbers, result.information)
-    assert not {row["name"] for row in rows} & {"power_limit", "cushion_length", "cushion_least", "play"}
+    assert not {row.name for row in rows} & {"power_limit", "cushion_length", "cushion_least", "play"}
 
 
 def test_a_part_that_cannot_be_left_out_is_refused_by_name():

@@ -15,12 +15,13 @@ from edp.networks.twin import fit_scales
 from edp.networks.twin.disturbance_observer import DisturbanceObserver
 from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.bodies import forces_by_moments, moments_of
-from edp.networks.twin.grey.datasheet import datasheet, datasheet_text
+from edp.networks.twin.grey.datasheet import datasheet
 from edp.networks.twin.grey.elements import MotorElement, ValveElement
 from edp.networks.twin.grey.known_linkage import BODY_NAMES
 from edp.networks.twin.grey.rollouts import RunBatch
 from edp.networks.twin.grey.runner import SINGLE_TICKS
 from edp.networks.twin.greybox import RunTarget
+from edp.networks.twin.parameters import Datasheet
 from edp.signals import Channel, Kind
 from edp.sim.machine import layout as sim
 from edp.sim.machine.machine_files import load_machine
@@ -208,18 +209,18 @@ def test_a_fit_moves_the_bodies_and_the_datasheet_has_them(twin, runs, guess, tm
     table = begun.table
     bodies = slice(table.inertia_at, table.potential_at)
     assert not np.array_equal(result.twin.numbers[bodies], begun.numbers[bodies])
-    rows = {f"{row['element']}.{row['name']}": row for row in datasheet(table, result.twin.numbers, result.information)}
-    text = datasheet_text(list(rows.values()))
+    rows = {f"{row.element}.{row.name}": row for row in datasheet(table, result.twin.numbers, result.information)}
+    text = Datasheet(basis="", numbers=tuple(rows.values())).to_text()
     for name in BODY_NAMES:
         units = {"mass": "kg", "centre_along": "m", "centre_across": "m", "inertia_about_centre": "kg m^2"}
         for key, unit in units.items():
             row = rows[f"{name}_body.{key}"]
-            assert row["unit"] == unit
-            assert row["low"] <= row["value"] <= row["high"]
+            assert row.unit == unit
+            assert row.low <= row.value <= row.high
             assert f"{name}_body.{key}" in text
-    assert 100.0 < rows["boom_body.mass"]["value"] < 2e4
+    assert 100.0 < rows["boom_body.mass"].value < 2e4
     # Of the boom with all that it carries, at the middle of the strokes: much more than its own mass.
-    assert rows["load.inertia_boom"]["value"] > 5e3
+    assert rows["load.inertia_boom"].value > 5e3
     assert not any("polynomial" in key or "root" in key for key in rows)
     # A twin is whole without the file that it was made with.
     commands = runs[0].inputs[None, :-1]
@@ -234,7 +235,7 @@ def test_inertia_of_the_datasheet_is_that_of_the_load(twin):
     table, zero = twin.table, np.zeros(3)
     rows = datasheet(table, twin.numbers, np.zeros((len(twin.numbers),) * 2))
     mass = load_of(twin, twin.numbers, 0.5 * np.array([1.504, 1.26, 1.104]), zero)[1]
-    told = [row["value"] for row in rows if row["name"].startswith("inertia_") and row["element"] == "load"]
+    told = [row.value for row in rows if row.name.startswith("inertia_") and row.element == "load"]
     np.testing.assert_allclose(told, 1e6 * np.diag(mass), rtol=1e-6)
 
 

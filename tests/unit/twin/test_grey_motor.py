@@ -96,7 +96,7 @@ def test_tangents_are_those_of_differences_with_a_motor(by_angle):
     span = commands[:, : PREFIX + 10]
     _, gradient = loss(twin, numbers, span, rows, len(numbers))
     size = np.where(table.positive, np.abs(numbers), table.width)
-    size[table.leader != np.arange(len(numbers))] = numbers[table.actuator_at[1] + at.ROD_AREA]
+    size[table.priors.leader != np.arange(len(numbers))] = numbers[table.actuator_at[1] + at.ROD_AREA]
     apart = []
     for which in np.flatnonzero(size):
         step = np.zeros(len(numbers))
@@ -229,10 +229,10 @@ def test_a_motor_that_was_simulated_otherwise_is_found():
     assert twin.numbers[twin.table.inertia_at] ** 2 * 1e6 == pytest.approx(INERTIA, rel=0.1)
     result = fit_grey_box(twin, logs[:3], logs[3:4], seed=0)
     fitted, table = result.twin, result.twin.table
-    rows = {row["name"]: row for row in datasheet(table, fitted.numbers, result.information)}
-    assert rows["inertia_motor"]["value"] == pytest.approx(INERTIA, rel=0.05)
-    assert rows["displacement"]["value"] == pytest.approx(DISPLACEMENT, rel=0.02)
-    assert rows["supply"]["value"] == pytest.approx(SUPPLY, rel=0.05)
+    rows = {row.name: row for row in datasheet(table, fitted.numbers, result.information)}
+    assert rows["inertia_motor"].value == pytest.approx(INERTIA, rel=0.05)
+    assert rows["displacement"].value == pytest.approx(DISPLACEMENT, rel=0.02)
+    assert rows["supply"].value == pytest.approx(SUPPLY, rel=0.05)
     place = table.actuator_at[0]
     assert fitted.numbers[place + at.ROD_AREA] == fitted.numbers[place + at.HEAD_AREA] != twin.numbers[place]
     fixed = [k for k in range(at.ACTUATOR_VALUES) if table.numbers[place + k].width == 0.0 and k != at.ROD_AREA]
@@ -245,22 +245,22 @@ def test_a_motor_that_was_simulated_otherwise_is_found():
 def test_the_datasheet_of_a_motor_has_units_of_turning():
     twin, _ = arm()
     rows = datasheet(twin.table, twin.numbers, np.zeros((len(twin.numbers),) * 2))
-    units = {row["name"]: row["unit"] for row in rows if row["element"] == "swing"}
+    units = {row.name: row.unit for row in rows if row.element == "swing"}
     assert units == {
         "displacement": "m^3/rad", "volume_a": "m^3", "volume_b": "m^3", "internal_leakage": "m^3/s/Pa",
         "external_leakage": "m^3/s/Pa", "relief_a": "Pa", "relief_b": "Pa", "coulomb": "N m",
         "static_less_coulomb": "N m", "stribeck": "rad/s", "viscous": "N m s/rad", "bristle_stiffness": "N m/rad",
         "bristle_damping": "N m s/rad", "friction_asymmetry": "N m",
     }  # fmt: skip
-    load = {row["name"]: row for row in rows if row["element"] == "load"}
-    assert load["inertia_ram"]["unit"] == "kg"
-    assert load["inertia_ram"]["value"] == pytest.approx(4900.0, rel=1e-5)
-    assert load["inertia_swing"]["unit"] == "kg m^2"
-    assert load["inertia_swing"]["value"] == pytest.approx(226.0, rel=1e-5)
-    assert load["inertia_root_swing_swing_10"]["unit"] == "kg^0.5 m"
+    load = {row.name: row for row in rows if row.element == "load"}
+    assert load["inertia_ram"].unit == "kg"
+    assert load["inertia_ram"].value == pytest.approx(4900.0, rel=1e-5)
+    assert load["inertia_swing"].unit == "kg m^2"
+    assert load["inertia_swing"].value == pytest.approx(226.0, rel=1e-5)
+    assert load["inertia_root_swing_swing_10"].unit == "kg^0.5 m"
     # The interval of what the data say nothing of is the plausible one, here beyond zero.
-    assert load["inertia_swing"]["low"] == 0.0
-    assert not load["inertia_swing"]["excited"]
+    assert load["inertia_swing"].low == 0.0
+    assert not load["inertia_swing"].excited
     # The load does not know the angle of the swing.
     assert not twin.table.exponents[:, 1].any()
     assert {name for name in load if name.startswith("potential")} == {"potential_10", "potential_20"}

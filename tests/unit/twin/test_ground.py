@@ -117,15 +117,15 @@ def test_a_law_is_found_again_in_its_own_forces(twin, law):
         for t in range(1, len(strokes)):
             lagged[t] = lagged[t - 1] + 0.3 * (law.numbers @ terms[t] - lagged[t - 1])
         logs.append((strokes, velocities, lagged + 500.0 * rng.normal(size=lagged.shape)))
-    found = DragLaw.fitted(twin, logs, "m22")
-    assert found.explained(twin, logs) > 0.98
+    found = DragLaw.from_logs(twin, logs, "m22")
+    assert found.r_squared(twin, logs) > 0.98
     edges = [contact.INWARDS, contact.OUTWARDS, contact.DOWN]
     assert found.numbers[edges] == pytest.approx(law.numbers[edges], rel=0.3)
     rows = found.rows()
-    assert [row["name"] for row in rows[:2]] == ["inwards_edge", "inwards_by_depth"]
-    assert all(row["low"] <= row["value"] <= row["high"] for row in rows)
+    assert [row.name for row in rows[:2]] == ["inwards_edge", "inwards_by_depth"]
+    assert all(row.low <= row.value <= row.high for row in rows)
     with pytest.raises(DataError, match="moves below the surface"):
-        DragLaw.fitted(
+        DragLaw.from_logs(
             twin, [(strokes_of([[6.0, 2.0, -1.4]] * 700), np.full((700, 3), 0.1), np.zeros((700, 3)))], "m22"
         )
 
@@ -172,7 +172,7 @@ def test_a_bundle_keeps_its_ground_and_exports_refuse_it(twin, law, tmp_path):
     again = load_twin(tmp_path / "twin").ground
     assert isinstance(again, DragLaw)
     assert again.plain() == bundle.ground.plain()
-    assert again.rows()[-1]["excited"] is False
+    assert again.rows()[-1].excited is False
     with pytest.raises(ExportError, match=r"the twin has a ground \('drag'\), which exported forms do not have"):
         plant_bundle(bundle)
 

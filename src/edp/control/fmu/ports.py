@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from edp.control.fmu.description import FmuDescription, FmuVariable
+from edp.control.model_batch import check_plant_channels
 from edp.control.plant import PILOTS, STROKES
-from edp.control.rest import check_plant_channels
 from edp.errors import ConfigError, DataError, closest
 from edp.networks.twin.plant import FLAG
 from edp.signals import VOCABULARY, Channel

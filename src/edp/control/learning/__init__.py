@@ -1,11 +1,10 @@
 """Tasks of the bucket tip as environments of Gymnasium: for learning, on the simulator, a twin or an FMU."""
 
+from edp.control.learning.environments import TaskEnvironment, VectorTaskEnvironment
 from edp.control.learning.policy import PolicyController
 from edp.control.learning.registration import register_tasks
 from edp.control.learning.reward import RewardWeights
-from edp.control.learning.single import TaskEnvironment
 from edp.control.learning.spec import LearningSpec
-from edp.control.learning.vector import VectorTaskEnvironment
 
 __all__ = [
     "LearningSpec",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from edp.export.c.constants import CConstant, total_bytes
-from edp.export.c.text import array, filled, number
+from edp.export.c.text import array, filled, initialiser_rows, number, unsigned_literals
 from edp.export.escape import Code
 from edp.ir.rls import Adaptation
 
@@ -39,7 +39,7 @@ def values(adaptation: Adaptation, upper: str, intervals: int) -> dict[str, obje
     work = targets + adaptation.spec.rank + max(inputs, row)
     most = adaptation.unit * adaptation.numbers["limit"]
     sizes = {"inputs": inputs, "targets": targets, "rank": adaptation.spec.rank, "features": n}
-    entries = [*POINTERS, "columns", "ahead", *(f"{size}u" for size in sizes.values())]
+    entries = [*POINTERS, "columns", "ahead", *unsigned_literals(sizes.values())]
     entries += [number(adaptation.numbers[name]) for name in NUMBERS]
     rows = [f"    float rows_{k}[{k * row}];" for k in adaptation.horizons]
     return {
@@ -47,7 +47,7 @@ def values(adaptation: Adaptation, upper: str, intervals: int) -> dict[str, obje
         # The lowest bit makes the marker odd: cleared memory, all zeros, never passes for a state that was reset.
         "adapt_marker": int(adaptation.digest[:8], 16) | 1,
         "ahead": ", ".join(map(str, adaptation.horizons)),
-        "adapt_ahead": ", ".join(f"{k}u" for k in adaptation.horizons),
+        "adapt_ahead": ", ".join(unsigned_literals(adaptation.horizons)),
         "reach": adaptation.max_horizon,
         "rank": adaptation.spec.rank,
         "features": n,
@@ -62,7 +62,7 @@ def values(adaptation: Adaptation, upper: str, intervals: int) -> dict[str, obje
         "adapt_work": work,
         "adapt_constants": Code("\n".join(one.text for one in constants(adaptation) if one.text)),
         "adapt_law": filled(entries),
-        "adapt_most": Code(",\n".join(f"    {{{', '.join(map(number, of))}}}" for of in most)),
+        "adapt_most": initialiser_rows(map(number, row) for row in most),
         "adapt_intervals": _intervals(upper) if intervals else "",
     }
 
@@ -75,7 +75,7 @@ def constants(adaptation: Adaptation) -> list[CConstant]:
         # C has no array of nothing: without directions one number stands there that is never read.
         numbers = values if values.size else np.zeros(1)
         lines.append(CConstant("float", name, len(numbers), array("float", name, map(number, numbers))))
-    columns = array("uint16_t", "columns", (f"{column}u" for column in adaptation.columns))
+    columns = array("uint16_t", "columns", unsigned_literals(adaptation.columns))
     lines.append(CConstant("uint16_t", "columns", len(adaptation.columns), columns))
     shared = [CConstant("edp_adapt_law", "law", 1), CConstant("float", "adapt_most", adaptation.unit.size)]
     return [*lines, *shared, CConstant("uint32_t", "ahead", len(adaptation.horizons))]

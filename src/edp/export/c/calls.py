@@ -7,8 +7,8 @@ from typing import Any
 
 from edp.errors import ExportError
 from edp.export.c.plan import MemoryPlan, scratch_number
-from edp.export.c.text import call, identifier, number
-from edp.export.escape import c_comment
+from edp.export.c.text import bool_literal, call, identifier, number, struct, unsigned_literals
+from edp.export.escape import Code, c_comment
 from edp.ir import Graph, Layer, layers, memory
 from edp.ir.base import INPUT, Number
 from edp.ir.hydraulics import HydraulicTick
@@ -110,8 +110,8 @@ def _gather(calls: Calls, layer: layers.Gather) -> list[str]:
 
 
 def _difference(calls: Calls, layer: memory.Difference) -> list[str]:
-    kind = "true" if layer.from_zero else "false"
-    return calls.simple(layer, "edp_difference", layer.width, kind, slot(layer, "before"), ring(layer))
+    states = (slot(layer, "before"), ring(layer))
+    return calls.simple(layer, "edp_difference", layer.width, bool_literal(layer.from_zero), *states)
 
 
 def _convolution(calls: Calls, layer: memory.Convolution) -> list[str]:
@@ -239,31 +239,31 @@ CALLS: dict[type[Layer], Write] = {
 """By kind of layer."""
 
 
-def structs(layer: Layer) -> list[str]:
+def structs(layer: Layer) -> list[Code]:
     """Constant structs that a layer's function reads, one a line."""
     name = identifier(layer.name)
     at = {key: constant(layer, key) for key in layer.tensors()}
     if isinstance(layer, memory.Lstm | memory.LayerNormLstm):
-        members = f"{at['weight_x']}, {at['weight_h']}, {at['bias']}, {number(layer.share)}"
-        declarations = [f"static const edp_lstm_weights {name}_weights = {{{members}}};"]
+        members = [at[key] for key in ("weight_x", "weight_h", "bias")]
+        declarations = [struct("edp_lstm_weights", f"{name}_weights", [*members, number(layer.share)])]
         if isinstance(layer, memory.LayerNormLstm):
-            norms = [at[key] for key in ("gain_x", "gain_h", "gain_c", "shift_c")] + [number(layer.epsilon)]
-            declarations.append(f"static const edp_lstm_norms {name}_norms = {{{', '.join(norms)}}};")
+            norms = [at[key] for key in ("gain_x", "gain_h", "gain_c", "shift_c")]
+            declarations.append(struct("edp_lstm_norms", f"{name}_norms", [*norms, number(layer.epsilon)]))
         return declarations
     if isinstance(layer, memory.Gru):
-        members = ", ".join(at[key] for key in ("weight_x", "weight_h", "bias_x", "bias_h"))
-        return [f"static const edp_gru_weights {name}_weights = {{{members}}};"]
+        members = [at[key] for key in ("weight_x", "weight_h", "bias_x", "bias_h")]
+        return [struct("edp_gru_weights", f"{name}_weights", members)]
     if isinstance(layer, memory.PrefixCorrection):
-        parts = [at[key] for key in ("first_weight", "first_bias", "second_weight", "second_bias")]
-        sizes = [f"{len(layer.first_bias)}u", f"{len(layer.second_bias)}u", f"{layer.ticks}u"]
-        return [f"static const edp_prefix_weights {name}_weights = {{{', '.join([*parts, *sizes])}}};"]
+        members = [at[key] for key in ("first_weight", "first_bias", "second_weight", "second_bias")]
+        sizes = unsigned_literals((len(layer.first_bias), len(layer.second_bias), layer.ticks))
+        return [struct("edp_prefix_weights", f"{name}_weights", [*members, *sizes])]
     if isinstance(layer, HydraulicTick):
         counts = (
             *(*layer.sizes, len(layer.ports), len(layer.knots), len(layer.exponents), layer.powers),
             *(layer.remembered, layer.steps, *layer.load, layer.circuit, int(layer.linked)),
         )
-        machine = ", ".join([*at.values(), *(f"{count}u" for count in counts), number(layer.tick_s)])
-        return [f"static const edp_hydraulics {name}_machine = {{{machine}}};"]
+        members = [*at.values(), *unsigned_literals(counts), number(layer.tick_s)]
+        return [struct("edp_hydraulics", f"{name}_machine", members)]
     return []
 
 

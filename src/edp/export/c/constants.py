@@ -13,7 +13,7 @@ from edp.export.c import integer_calls
 from edp.export.c.calls import Calls, constant, needs_columns, slot, structs
 from edp.export.c.layout import laid
 from edp.export.c.plan import MemoryPlan
-from edp.export.c.text import array, number
+from edp.export.c.text import array, initialiser, number, unsigned_literals
 from edp.ir import Graph, Layer
 
 TYPES = {
@@ -106,7 +106,7 @@ def constants_of(graph: Graph, plan: MemoryPlan, written: bool = False) -> Itera
         if needs_columns(calls, layer):
             # 16-bit columns: half of the flash of a table of words.
             columns, name = layer.columns, constant(layer, "columns")  # type: ignore[attr-defined]
-            text = array("uint16_t", name, (f"{column}u" for column in columns)) if written else ""
+            text = array("uint16_t", name, unsigned_literals(columns)) if written else ""
             yield CConstant("uint16_t", name, len(columns), text)
         for line in structs(layer) + integer_calls.structs(layer):
             # The declaration is the single source of the name; counting reads it back instead of naming it twice.
@@ -135,7 +135,7 @@ def _tensor(layer: Layer, name: str, values: NDArray[Any], written: bool) -> CCo
 def _tables(graph: Graph) -> CConstant:
     """Return the table of tensor locations for the checksum."""
     entries = [
-        f"{{{constant(layer, name)}, {values.size}u, {values.itemsize}u}}"
+        initialiser([constant(layer, name), *unsigned_literals((values.size, values.itemsize))])
         for layer in graph.layers
         for name, values in layer.tensors().items()
     ]

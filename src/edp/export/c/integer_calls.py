@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.export.c.calls import CALLS, Calls, Write, constant, needs_columns, ring, runs, slot
-from edp.export.c.text import array, call, identifier, number
+from edp.export.c.text import array, bool_literal, call, identifier, initialiser, number, struct, unsigned_literals
+from edp.export.escape import Code
 from edp.ir import Layer
 from edp.ir.layers import Function
 from edp.ir.w8a16 import arithmetic as fixed
@@ -78,8 +79,7 @@ def _recurrent(calls: Calls, x: quantised.QLstm | quantised.QGru) -> list[str]:
 
 
 def _difference(calls: Calls, x: quantised.QDifference) -> list[str]:
-    kind = "true" if x.from_zero else "false"
-    return calls.simple(x, "edp_q_difference", x.width, kind, x.right, slot(x, "before"), ring(x))
+    return calls.simple(x, "edp_q_difference", x.width, bool_literal(x.from_zero), x.right, slot(x, "before"), ring(x))
 
 
 def _pool(calls: Calls, x: quantised.QAttentionPool) -> list[str]:
@@ -120,29 +120,28 @@ INTEGER_CALLS: dict[type[Layer], Write] = {
 """By kind of integer layer."""
 CALLS |= INTEGER_CALLS
 
-COUNTED = (quantised.QDifference, quantised.QConvolution, quantised.QTrailingMean, quantised.QAttentionPool)
-"""Layers with a ring or a counter."""
 
-
-def structs(layer: Layer) -> list[str]:
+def structs(layer: Layer) -> list[Code]:
     """Constant structs that an integer layer's function reads, one a line."""
     name = identifier(layer.name)
 
-    def matrix(suffix: str, weight: str = "weight") -> str:
+    def matrix(suffix: str, weight: str = "weight") -> list[str]:
         parts = (f"{weight}{suffix}", f"multiplier{suffix}", f"shift{suffix}")
-        return "{" + ", ".join(constant(layer, part) for part in parts) + "}"
+        return [constant(layer, part) for part in parts]
+
+    def recurrent(biases: tuple[str, str], share: int) -> list[Code]:
+        members = [initialiser(matrix("_x")), initialiser(matrix("_h")), *(constant(layer, bias) for bias in biases)]
+        return [struct("edp_q_recurrent", f"{name}_weights", [*members, str(share)])]
 
     if isinstance(layer, quantised.QDense | quantised.QGroupedDense | quantised.QConvolution):
-        return [f"static const edp_q_matrix {name}_matrix = {matrix('')};"]
+        return [struct("edp_q_matrix", f"{name}_matrix", matrix(""))]
     if isinstance(layer, quantised.QAttentionPool):
-        return [f"static const edp_q_matrix {name}_matrix = {matrix('', 'score')};"]
+        return [struct("edp_q_matrix", f"{name}_matrix", matrix("", "score"))]
     if isinstance(layer, quantised.QLstm):
-        members = f"{matrix('_x')}, {matrix('_h')}, {constant(layer, 'bias')}, {constant(layer, 'bias')}, {layer.share}"
-        return [f"static const edp_q_recurrent {name}_weights = {{{members}}};"]
+        return recurrent(("bias", "bias"), layer.share)
     if isinstance(layer, quantised.QGru):
         # A GRU has no zoneout; 32768 is 1 in 2^-15.
-        members = f"{matrix('_x')}, {matrix('_h')}, {constant(layer, 'bias_x')}, {constant(layer, 'bias_h')}, 32768"
-        return [f"static const edp_q_recurrent {name}_weights = {{{members}}};"]
+        return recurrent(("bias_x", "bias_h"), 32768)
     return []
 
 
@@ -181,5 +180,5 @@ def tables_header() -> str:
         ("log1p_exp", fixed.LOG1P_EXP, "log(1 + exp(-x)) on [0, 16]"),
         ("normal", fixed.NORMAL, "cumulated normal distribution on [0, 8]"),
     ):
-        parts.append(array("uint16_t", f"edp_table_{name}", (f"{v}u" for v in values), note))
+        parts.append(array("uint16_t", f"edp_table_{name}", unsigned_literals(values), note))
     return "\n".join([*parts, "", "#endif", ""])

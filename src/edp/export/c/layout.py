@@ -7,21 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.ir import Layer, layers, memory
+from edp.ir import Layer
+from edp.ir.layers import GroupedDense
 
 # Sixteen rows: measured on a Cortex-M4F, 165,833 instead of 193,784 instructions a tick (docs/findings.md).
 PANEL = 16
 """Rows that a product computes side by side: `EDP_PANEL` of the runtime."""
-MATRICES: dict[type[Layer], tuple[str, ...]] = {
-    layers.Dense: ("weight",),
-    layers.GroupedDense: ("weight",),
-    memory.Convolution: ("weight",),
-    memory.Lstm: ("weight_x", "weight_h"),
-    memory.LayerNormLstm: ("weight_x", "weight_h"),
-    memory.Gru: ("weight_x", "weight_h"),
-    memory.PrefixCorrection: ("first_weight", "second_weight"),
-}
-"""Constants that `edp_product` reads, by kind of layer."""
 
 
 def laid(layer: Layer, name: str, values: NDArray[Any]) -> NDArray[Any]:
@@ -30,9 +21,9 @@ def laid(layer: Layer, name: str, values: NDArray[Any]) -> NDArray[Any]:
     Matrices lie in panels of `PANEL` rows, in each of them column by column, so that a processor with vectors reads
     neighbours; the rows that are left over lie one after the other.
     """
-    if name not in MATRICES.get(type(layer), ()):
+    if name not in layer.matrices:
         return values.ravel()
-    if isinstance(layer, layers.GroupedDense):
+    if isinstance(layer, GroupedDense):
         return np.concatenate([_panels(matrix) for matrix in values])
     return _panels(values.reshape(len(values), -1))
 

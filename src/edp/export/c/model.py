@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import binascii
-from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
 
 from edp import __version__
 from edp.errors import ExportError
-from edp.export.c import adaptation, integer_calls, tangents
+from edp.export.c import adaptation, integer_calls, parameter_index, tangents
 from edp.export.c.calls import WORK, Calls, describe, needs_columns, slot
 from edp.export.c.constants import constants_of, stored, total_bytes
 from edp.export.c.plan import MemoryPlan, plan
-from edp.export.c.text import filled, indented, number
-from edp.export.escape import C_SIGNIFICANT, Code, c_comment, c_names, fill
+from edp.export.c.text import channel_enumeration, enumeration, filled, indented, number
+from edp.export.escape import C_SIGNIFICANT, Code, c_comment, fill_file, package_text
 from edp.export.hashes import little_endian, model_hash, scale_hash
-from edp.export.si_names import si_channels, si_names
+from edp.export.si_names import si_names
 from edp.export.sizes import MOST_COLUMNS, check_numbers, check_sizes
-from edp.ir import Graph, Layer, memory
+from edp.ir import Graph, Layer
 from edp.ir.base import Number
 from edp.ir.hydraulics import HydraulicTick
 from edp.networks.input_range import HOLD_TICKS, LIMIT, input_limits
@@ -32,17 +30,6 @@ DOUBLE_BYTES = 8
 MOST_STACK = 2**18
 """Bytes: a quarter of the smallest stack that threads of desktop systems have (1 MiB, Windows)."""
 CLIPPED = Code("    uint32_t clipped;  /* numbers beyond the range of their format, chosen on training data */\n")
-COUNTED = (
-    memory.Difference,
-    memory.Starting,
-    memory.Convolution,
-    memory.TrailingMean,
-    memory.AttentionPool,
-    memory.WindowAttention,
-    memory.PrefixCorrection,
-    *integer_calls.COUNTED,
-)
-"""Layers with a ring or a counter."""
 PLANT = (
     " *",
     " * PLANT MODEL. Inputs are the commands, a measured value for each answer, and a flag for each (..._MEASURED): 1",
@@ -125,8 +112,13 @@ class Model:
 
     def fill(self, template: str) -> Code:
         """Fill in a template."""
-        text = resources.files("edp.export.c").joinpath(f"templates/{template}").read_text()
-        return fill(text, self._values())
+        return fill_file(f"c/templates/{template}", self._values())
+
+    def runtime_texts(self) -> dict[str, str]:
+        """Return the files of the runtime by name, generated tables first."""
+        texts = {"edp_tables.h": integer_calls.tables_header()} if self.integer else {}
+        texts |= {parameter_index.HEADER: parameter_index.index_header()} if self.hydraulic else {}
+        return texts | {file: package_text(f"c/runtime/{file}") for file in self.runtime}
 
     def _values(self) -> dict[str, object]:
         task, predictor = self.bundle.task, self.bundle.predictor
@@ -193,27 +185,14 @@ class Model:
     def _enums(self) -> dict[str, str]:
         task, upper = self.bundle.task, self.name.upper()
         # Names must differ within the 63 characters that C99 compares.
-        most = C_SIGNIFICANT - len(f"{upper}_OUT_")
-        inputs = [
-            (f"{upper}_IN_{name} = {i},", f"{channel.unit}; {channel.description}")
-            for i, (name, channel) in enumerate(
-                zip(c_names((c.name for c in si_channels(self.bundle.inputs)), most), self.bundle.inputs, strict=True)
-            )
-        ]
-        targets = [
-            (f"{upper}_OUT_{name} = {i},", "; ".join(part for part in (KINDS[kind].si_unit, text) if part))
-            for i, (name, kind, text) in enumerate(
-                zip(c_names(self._targets(), most), self.bundle.target_kinds, self.bundle.descriptions, strict=True)
-            )
-        ]
-        ahead = [
-            (f"{upper}_AHEAD_{k} = {i},", f"{k} ticks, {1000 * k / task.rate_hz:g} ms")
-            for i, k in enumerate(task.horizons)
-        ]
+        longest = C_SIGNIFICANT - len(f"{upper}_OUT_")
+        units = [KINDS[kind].si_unit for kind in self.bundle.target_kinds]
+        meanings = ["; ".join(filter(None, pair)) for pair in zip(units, self.bundle.descriptions, strict=True)]
+        ahead = [f"{k} ticks, {1000 * k / task.rate_hz:g} ms" for k in task.horizons]
         return {
-            "input_enum": _write_enumeration(inputs),
-            "target_enum": _write_enumeration(targets),
-            "horizon_enum": _write_enumeration(ahead),
+            "input_enum": channel_enumeration(f"{upper}_IN_", self.bundle.inputs, longest, aligned=True),
+            "target_enum": enumeration(f"{upper}_OUT_", self._targets(), meanings, longest, aligned=True),
+            "horizon_enum": enumeration(f"{upper}_AHEAD_", map(str, task.horizons), ahead, aligned=True),
         }
 
     def _state(self) -> dict[str, str]:
@@ -316,12 +295,6 @@ def computed(graph: Graph, plan: MemoryPlan) -> tuple[list[str], list[str]]:
     return lines[1:], [*checks, "if (finite) {", *copies, "}", "return finite;"]
 
 
-def _write_enumeration(entries: Sequence[tuple[str, str]]) -> Code:
-    """Lines of an enumeration with a comment each."""
-    wide = max(len(entry) for entry, _ in entries)
-    return Code("\n".join(f"    {entry:<{wide}} /* {c_comment(text)} */" for entry, text in entries))
-
-
 def make_model(name: str, bundle: Bundle, tangent: bool = False, adapts: bool = False) -> Model:
     """Create a model ready to be written.
 
@@ -340,7 +313,7 @@ def make_model(name: str, bundle: Bundle, tangent: bool = False, adapts: bool = 
     if integer and tangent:
         raise ExportError("a network in integer arithmetic is a staircase and has no tangent; export the float run")
     graph = predictor.integers if isinstance(predictor, IntegerPredictor) else predictor.graph()
-    changes = plan(graph, tangents.tangent_scratch_of) if tangent else None
+    changes = plan(graph, tangent=True) if tangent else None
     model = Model(name, bundle, graph, plan(graph), changes, adapts and bundle.adaptation is not None)
     _check(model)
     return model
@@ -377,7 +350,7 @@ def _check(model: Model) -> None:
 
 def has_ring(layer: Layer) -> bool:
     """Whether the C state of a layer has a ring or a counter."""
-    return isinstance(layer, COUNTED) and bool(layer.slots)
+    return layer.counted and bool(layer.slots)
 
 
 def crc(graph: Graph) -> int:

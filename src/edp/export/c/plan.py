@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-from edp.ir import Graph, Layer, layers, memory
+from edp.ir import Graph, Layer
 from edp.ir.base import Number
-from edp.ir.w8a16 import layers as quantised
 
 
 @dataclass(frozen=True)
@@ -25,48 +24,17 @@ class MemoryPlan:
     sizes: Mapping[Number, int]
 
 
-def scratch_of(layer: Layer) -> int:
-    """Numbers that a layer's C function needs while it runs."""
-    # Four gates; the layer norm keeps the sums of both sides apart, the GRU those of its two products.
-    if isinstance(layer, memory.Lstm):
-        return 4 * layer.width
-    if isinstance(layer, memory.LayerNormLstm):
-        return 8 * layer.width
-    if isinstance(layer, memory.Gru):
-        return 6 * layer.width
-    if isinstance(layer, memory.AttentionPool | memory.WindowAttention):
-        return layer.window
-    if isinstance(layer, layers.RowAttention):
-        return layer.rows
-    if isinstance(layer, memory.PrefixCorrection):
-        hidden, seen = layer.first_weight.shape
-        return int(seen + hidden + len(layer.second_bias))
-    return _integer_scratch(layer)
-
-
-def _integer_scratch(layer: Layer) -> int:
-    if isinstance(layer, quantised.QDense | quantised.QConvolution):
-        return len(layer.bias)
-    if isinstance(layer, quantised.QGroupedDense):
-        return int(layer.bias.shape[1])
-    if isinstance(layer, quantised.QLstm):
-        return 8 * layer.width
-    if isinstance(layer, quantised.QGru):
-        return 6 * layer.width
-    return layer.window if isinstance(layer, quantised.QAttentionPool) else 0
-
-
 def scratch_number(layer: Layer) -> Number:
     """Return the number type of a layer's scratch memory."""
     return Number.FLOAT if layer.number is Number.FLOAT else Number.INT32
 
 
-def plan(graph: Graph, scratch_of: Callable[[Layer], int] = scratch_of) -> MemoryPlan:
+def plan(graph: Graph, tangent: bool = False) -> MemoryPlan:
     """Give every value the first gap that is wide enough from where it is made to where it is last read.
 
     Args:
         graph: the layers.
-        scratch_of: scratch numbers that a layer needs beside its value.
+        tangent: whether the values are those of the tangent along one direction.
     """
     last = {name: at for at, layer in enumerate(graph.layers) for name in layer.inputs}
     # Results are read after the last layer, when they are copied out.
@@ -80,7 +48,7 @@ def plan(graph: Graph, scratch_of: Callable[[Layer], int] = scratch_of) -> Memor
         busy = [block for block in busy if block[3] >= at]
         for places, wide, until, number in (
             (values, layer.width, last.get(layer.name, at), layer.number),
-            (scratch, scratch_of(layer), at, scratch_number(layer)),
+            (scratch, layer.tangent_scratch if tangent else layer.scratch, at, scratch_number(layer)),
         ):
             if not wide:
                 continue

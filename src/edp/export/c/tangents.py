@@ -7,7 +7,7 @@ from typing import Any
 
 from edp.errors import ExportError
 from edp.export.c.calls import Calls, constant, needs_columns, ring, runs, slot
-from edp.export.c.plan import MemoryPlan, scratch_of
+from edp.export.c.plan import MemoryPlan
 from edp.export.c.text import call, identifier, number
 from edp.ir import Graph, Layer, layers, memory
 from edp.ir.base import INPUT
@@ -15,19 +15,6 @@ from edp.ir.layers import BinaryOperation
 
 FILES = ("edp_tangent.h", "edp_tangent.c", "edp_tangent_memory.c")
 """Of the runtime."""
-
-
-def tangent_scratch_of(layer: Layer) -> int:
-    """Return the scratch size of a layer's tangent along one direction.
-
-    The first direction includes the common part.
-    """
-    if isinstance(layer, layers.Activate):
-        return layer.size
-    if isinstance(layer, memory.Lstm | memory.LayerNormLstm | memory.Gru):
-        # The old state is kept beside the scratch: the cell's tangent reads what the layer overwrites.
-        return scratch_of(layer) + layer.width
-    return scratch_of(layer)
 
 
 class Tangents:
@@ -182,7 +169,7 @@ def _lstm(t: Tangents, layer: memory.Lstm | memory.LayerNormLstm) -> list[str]:
     name, units, into = identifier(layer.name), layer.width, layer.weight_x.shape[1]
     normed = isinstance(layer, memory.LayerNormLstm)
     weights, norms = f"&{name}_weights", f"&{name}_norms" if normed else "NULL"
-    gates, dgates, old = t.calls.scratch(layer), t.scratch(layer), t.scratch(layer, scratch_of(layer))
+    gates, dgates, old = t.calls.scratch(layer), t.scratch(layer), t.scratch(layer, layer.scratch)
     states = changed(layer, "h"), changed(layer, "c")
     if normed:
         inputs = (*t.values(layer), *t.changes(layer), slot(layer, "h"), states[0], weights, norms, into, units, gates)
@@ -198,7 +185,7 @@ def _lstm(t: Tangents, layer: memory.Lstm | memory.LayerNormLstm) -> list[str]:
 
 def _gru(t: Tangents, layer: memory.Gru) -> list[str]:
     name, units, into = identifier(layer.name), layer.width, layer.weight_x.shape[1]
-    old = t.scratch(layer, scratch_of(layer))
+    old = t.scratch(layer, layer.scratch)
     memory_arguments = (t.calls.scratch(layer), old, t.scratch(layer), changed(layer, "h"))
     copied_state = call("edp_copy", slot(layer, "h"), units, old)
     own = call(

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import ClassVar
 
 from edp.errors import ExportError
 from edp.export.base import TARGETS
-from edp.export.c.integer_calls import tables_header
 from edp.export.c.model import Model, make_model
-from edp.export.c.text import filled, number
+from edp.export.c.text import reference_array
 from edp.export.escape import C_WORDS, LONGEST_NAME, MATLAB_WORDS, visible
 from edp.export.folder import write_export
 from edp.export.golden import GOLDEN_TICKS, golden_recording
@@ -70,11 +68,7 @@ def core_files(model: Model) -> dict[str, str]:
         files |= {f"{name}_tangent.{end}": model.fill(f"model_tangent.{end}.in") for end in ("h", "c")}
     if model.adapts:
         files |= {f"{name}_adaptation.{end}": model.fill(f"model_adaptation.{end}.in") for end in ("h", "c")}
-    if model.integer:
-        files["edp_tables.h"] = tables_header()
-    for file in model.runtime:
-        files[file] = resources.files("edp.export.c").joinpath(f"runtime/{file}").read_text()
-    return files
+    return files | model.runtime_texts()
 
 
 def check_name(name: str) -> None:
@@ -98,8 +92,6 @@ def golden(model: Model) -> str:
     inputs, outputs, allowed = golden_recording(predictor, GOLDEN_TICKS)
     text = [f"/* Random inputs of {model.name} and the network's predictions, bounds behind them. */"]
     text.append(f"#define GOLDEN_TICKS {len(inputs)}u")
-    for name, rows in (("inputs", inputs), ("outputs", outputs)):
-        body = ",\n".join("    {\n" + filled(map(number, row), "     ") + "}" for row in rows)
-        text.append(f"static const float golden_{name}[{len(rows)}][{rows.shape[1]}] = {{\n{body}\n}};")
-    text.append(f"static const float golden_tolerance[{len(allowed)}] = {{\n{filled(map(number, allowed))}\n}};")
+    for name, values in (("inputs", inputs), ("outputs", outputs), ("tolerance", allowed)):
+        text.append(reference_array("float", f"golden_{name}", values))
     return "\n".join(text) + "\n"

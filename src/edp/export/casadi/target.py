@@ -19,8 +19,8 @@ from edp.export.casadi.states import places, start
 from edp.export.description import Description, as_json, float_graph, golden, has_equations
 from edp.export.escape import fill
 from edp.export.folder import write_export
-from edp.ir import Graph, Layer, hydraulics, memory
-from edp.ir import layers as plain
+from edp.ir import Graph, Layer
+from edp.ir.kinds import FLOAT_KINDS
 from edp.training.bundle import Bundle
 
 RULES = {
@@ -30,14 +30,6 @@ RULES = {
     "bad_input": "NaN or infinite inputs give NaN, in the prediction or in the next state; the external refuses them",
     "warming_up": "after a reset the first `window` predictions do not rest on a whole window",
 }
-KNOWN: frozenset[type[Layer]] = frozenset(
-    kind
-    for room in (plain, memory, hydraulics)
-    for kind in vars(room).values()
-    if isinstance(kind, type) and issubclass(kind, Layer) and kind is not Layer and not kind.__name__.startswith("_")
-)
-"""Kinds of layers that the module builds."""
-
 INDEX_IMPORT = "from edp.networks.twin.grey import parameter_index as at"
 EQUATIONS_IMPORT = "from edp.networks.twin.grey.equations import"
 GOLDEN = ("inputs", "stream", "tolerance")
@@ -116,10 +108,10 @@ def arrays(graph: Graph) -> dict[str, np.ndarray]:
 
 
 def _layer(layer: Layer) -> dict[str, object]:
-    if type(layer) not in KNOWN:
+    if type(layer) not in FLOAT_KINDS:
         raise ExportError(
             f"layer '{layer.name}' is a {type(layer).__name__}, which has no form in CasADi; "
-            f"these have: {', '.join(sorted(kind.__name__ for kind in KNOWN))}"
+            f"these have: {', '.join(sorted(kind.__name__ for kind in FLOAT_KINDS))}"
         )
     return {"kind": layer.kind, "constants": list(layer.tensors())} | layer.options()
 

@@ -5,17 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
-
-from edp import __version__
 from edp.errors import ExportError
 from edp.export.c.calls import Calls, constant, describe, slot
-from edp.export.c.model import Model, crc, make_model, remembered
+from edp.export.c.model import Model, make_model, remembered
 from edp.export.c.text import call, filled, identifier, indented, number
-from edp.export.controller.files import model_files, own_file
 from edp.export.controller.parts import PlanParts
-from edp.export.escape import Code, c_comment, fill
-from edp.export.hashes import model_hash, scale_hash
+from edp.export.controller.plants import plant_files, plant_values
+from edp.export.escape import Code
 from edp.ir import Layer, layers, memory
 from edp.ir.base import INPUT, Number
 from edp.networks.input_range import input_limits
@@ -23,26 +19,6 @@ from edp.networks.twin import TwinPlant
 from edp.training.bundle import Bundle
 
 RUNTIME = ("edp_lanes.h", "edp_lanes.c")
-PUBLIC = ""
-PRIVATE = """\
-    {plant}_memory model;
-    struct {{
-        {plant}_memory memory;
-        float row[{PLANT}_INPUTS];
-    }} past[{NAME}_CONTROL_WINDOW];
-    /* Scratch of a tick. */
-    {plant}_memory lanes[{NAME}_CONTROL_LANES];
-    float rows[{NAME}_CONTROL_LANES][{PLANT}_INPUTS];
-    float works[{NAME}_CONTROL_LANES][{PLANT}_WORK];
-    float answers[{NAME}_CONTROL_LANES][{PLANT}_ANSWERS];
-"""
-"""Fields of the state of a controller on a model with lanes."""
-PRESSURE_ROWS = """\
-            for (uint32_t i = 0; (i < {count}u) && (left == 1u); i++) {{
-                add_row(c, c->answers[0][pressure_answers[i]] / most_pressure, -1e30f, 1.0f, pressure_answers[i],
-                        most_pressure, variables);
-            }}
-"""
 PORTS, FED = "ports.", "ports.fed"
 """Layers of a plant that choose between measured values and last answers, and what they choose."""
 
@@ -61,8 +37,8 @@ class LaneModel:
     model: Model
     plant: TwinPlant
 
-    fragment = "plan_lanes"
-    public, private, recalled, pressure_rows = PUBLIC, PRIVATE, "", PRESSURE_ROWS
+    template = "plan_lanes"
+    fragments = ("fields.h", "pressures.c")
 
     def sizes(self, plan: PlanParts) -> dict[str, int]:
         """Further sizes that the controller defines."""
@@ -91,29 +67,20 @@ class LaneModel:
 
     def files(self) -> dict[str, str]:
         """Model and runtime by file name."""
-        return model_files(self.name, self._fill_template, "plant", self.model, RUNTIME)
+        return plant_files("plant", self.model, self._values(), RUNTIME)
 
     @property
     def sources(self) -> tuple[str, ...]:
         """C files that a program with this model compiles."""
         return (f"{self.name}.c", *(name for name in (*self.model.runtime, *RUNTIME) if name.endswith(".c")))
 
-    def _fill_template(self, template: str) -> Code:
-        text = own_file(f"templates/{template}")
+    def _values(self) -> dict[str, object]:
         graph, twin = self.model.graph, self.plant.twin
         fields, cleared = remembered(graph)
         low, high = input_limits(self.plant)
         at = self.model.plan.values[graph.results["prediction"]]
-        values = {
-            "name": self.name,
-            "NAME": self.name.upper(),
-            "title": c_comment(self.plant.title),
-            "version": __version__,
-            "model_hash": model_hash(graph),
-            "scale_hash": scale_hash(self.plant),
-            "crc": crc(graph),
-            "commands": self.plant.sizes[0],
-            "answers": self.plant.sizes[1],
+        return {
+            **plant_values(self.model, self.plant),
             "inputs": graph.inputs,
             "work": self.work,
             "prefix": max(1, twin.prefix_ticks),
@@ -122,12 +89,10 @@ class LaneModel:
             "forget": indented(cleared or ["s->none[0] = 0.0f;"]),
             "low": filled(map(number, low)),
             "high": filled(map(number, high)),
-            "mean": filled(map(number, np.asarray(twin.scales.answer_offset))),
             "compute": indented(self._write_statements(free=False)),
             "run": indented(self._write_statements(free=True)),
             "result": Code(f" + {at}" if at else ""),
         }
-        return fill(text, values)
 
     def _write_statements(self, free: bool) -> Iterator[str]:
         """Yield the statements of a time step. Neighbouring layers without products share one loop over the copies.

@@ -6,14 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edp import __version__
 from edp.errors import ExportError
-from edp.export.c.model import Model, crc, make_model
-from edp.export.c.text import filled, identifier, number
-from edp.export.controller.files import model_files, own_file
+from edp.export.c.model import Model, make_model
+from edp.export.c.text import filled, identifier, number, unsigned_literals
 from edp.export.controller.parts import PlanParts
-from edp.export.escape import Code, c_comment, fill
-from edp.export.hashes import model_hash, scale_hash
+from edp.export.controller.plants import plant_files, plant_values
+from edp.export.escape import Code
 from edp.ir.hydraulics import VALVE_STATES, HydraulicTick
 from edp.networks.twin import TwinPlant
 from edp.networks.twin.grey.runner import SINGLE_TICKS, goes_twice
@@ -22,44 +20,6 @@ from edp.networks.twin.greybox import GreyTwin
 RUNTIME = ("edp_near.h", "edp_near.c")
 WITHIN = "edp_hydraulics.c"
 """A file that `edp_near.c` includes, so that no program compiles it by itself."""
-PUBLIC = """\
-    uint32_t newton; /* iterations of the model's equations since the last tick */
-    uint32_t newton_limit; /* of them; may be lowered */
-"""
-PRIVATE = """\
-    {plant}_memory model;
-    struct {{
-        {plant}_memory memory;
-        bool measured;
-        float row[{NAME}_CONTROL_INPUTS];
-        float demands[{PLANT}_VALVES];
-    }} past[{NAME}_CONTROL_WINDOW];
-    double resistance[{PLANT}_ACTUATORS]; /* MN that the load does not know of */
-    double by_force[EDP_AXES][EDP_AXES];
-    double expected[EDP_AXES]; /* m/s */
-    bool expects;
-    uint32_t age;
-    uint32_t newton_left;
-    /* Scratch of a tick. */
-    edp_near near;
-    bool between;
-    uint8_t differs[{NAME}_CONTROL_LANES * {PLANT}_VALVES];
-    float demands[{NAME}_CONTROL_LANES][{NAME}_CONTROL_SPAN][{PLANT}_VALVES];
-    double room[{PLANT}_ROOM +
-                EDP_NEAR_ROOM({PLANT}_ACTUATORS, {PLANT}_VALVES, {PLANT}_PUMPS, {NAME}_CONTROL_VARIABLES)];
-"""
-"""Fields of the state of a controller on a grey box."""
-PRESSURE_ROWS = """\
-    for (uint32_t i = 0; (i < {count}u) && ends; i++) {{
-        const float share = (float)edp_near_answer(&c->near, pressure_answers[i], c->between) / most_pressure;
-        add_row(c, share, -1e30f, 1.0f, pressure_answers[i], most_pressure, variables);
-    }}
-"""
-RECALLED = """\
-    for (uint32_t i = 0; i < EDP_AXES; i++) {{
-        control.resistance[{plant}_axes[i]] = 1e-6 * (double)before[{at}u + i];
-    }}
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +42,8 @@ class NearModel:
     machine: HydraulicTick
     velocities: tuple[int, ...]
 
-    fragment = "plan_near"
-    public, private, recalled, pressure_rows = PUBLIC, PRIVATE, RECALLED, PRESSURE_ROWS
+    template = "plan_near"
+    fragments = ("fields.h", "public.h", "pressures.c", "recall.c")
 
     def sizes(self, plan: PlanParts) -> dict[str, int]:
         """Further sizes that the controller defines."""
@@ -103,7 +63,7 @@ class NearModel:
 
     def files(self) -> dict[str, str]:
         """Model and runtime by file name."""
-        return model_files(self.name, self._fill_template, "plant_near", self.model, RUNTIME)
+        return plant_files("plant_near", self.model, self._values(), RUNTIME)
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -111,20 +71,11 @@ class NearModel:
         runtime = (*self.model.runtime, *RUNTIME)
         return (f"{self.name}.c", *(name for name in runtime if name.endswith(".c") and name != WITHIN))
 
-    def _fill_template(self, template: str) -> Code:
-        text = own_file(f"templates/{template}")
-        graph, twin, machine = self.model.graph, self.twin, self.machine
+    def _values(self) -> dict[str, object]:
+        twin, machine = self.twin, self.machine
         actuators, valves, pumps = machine.sizes
-        values = {
-            "name": self.name,
-            "NAME": self.name.upper(),
-            "title": c_comment(self.plant.title),
-            "version": __version__,
-            "model_hash": model_hash(graph),
-            "scale_hash": scale_hash(self.plant),
-            "crc": crc(graph),
-            "commands": self.plant.sizes[0],
-            "answers": self.plant.sizes[1],
+        return {
+            **plant_values(self.model, self.plant),
             "actuators": actuators,
             "valves": valves,
             "pumps": pumps,
@@ -138,11 +89,9 @@ class NearModel:
             "room": machine.room,
             "low": filled(map(number, np.asarray(twin.scales.low) / twin.units)),
             "high": filled(map(number, np.asarray(twin.scales.high) / twin.units)),
-            "mean": filled(map(number, np.asarray(twin.scales.answer_offset))),
-            "axes": Code(", ".join(f"{machine.ports[answer, 1]}u" for answer in self.velocities)),
+            "axes": Code(", ".join(unsigned_literals(machine.ports[answer, 1] for answer in self.velocities))),
             "machine": f"{identifier(machine.name)}_machine",
         }
-        return fill(text, values)
 
 
 def near_model(name: str, plan: PlanParts) -> NearModel | None:

@@ -6,25 +6,27 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from edp import __version__
 from edp.errors import ExportError
 from edp.export.c.model import RUNTIME
+from edp.export.c.tables import ConstantTables
 from edp.export.c.target import check_name
-from edp.export.c.text import number
-from edp.export.controller.files import c_runtime, own_file
+from edp.export.c.text import channel_enumeration, number, reference_array
 from edp.export.controller.lanes import LaneModel, lane_model
 from edp.export.controller.near import NearModel, near_model
-from edp.export.controller.numbers import ConstantTables, constants_of_controller, golden_rows
+from edp.export.controller.numbers import constants_of_controller
 from edp.export.controller.parts import AXES, ControllerParts, GoldenLoop, PlanParts
-from edp.export.escape import C_SIGNIFICANT, Code, c_comment, c_names, fill
+from edp.export.escape import Code, c_comment, fill_file, package_text
 from edp.export.folder import write_export
-from edp.export.si_names import si_channels
 from edp.export.sizes import check_sizes
 from edp.networks.input_range import HOLD_TICKS
 
 SOLVER = tuple(f"daqp/{name}" for name in ("daqp.c", "auxiliary.c", "factorization.c"))
 SOLVER_FILES = (*SOLVER, *(f"daqp/{name}.h" for name in ("daqp", "auxiliary", "factorization", "constants", "types")))
 LICENCE = "daqp/LICENSE"
+TEMPLATES = "controller/templates"
 OWN = ("edp_control.h", "edp_control.c")
 PROGRAM = ("edp_qp.h", "edp_qp.c")
 LONGEST_NAME = 20
@@ -33,45 +35,6 @@ TOLERANCE = 2e-3
 """Of a lever of the self-test, a share of full: single precision against double at a tick from the same memory."""
 PlanModel = LaneModel | NearModel
 INCLUDES = ("edp_control.h", "edp_runtime.h")
-LOOP_LEVERS = """\
-    float strokes[EDP_AXES];
-    for (uint32_t i = 0; i < EDP_AXES; i++) {
-        strokes[i] = in[stroke_reads[i]];
-    }
-    /* At every tick, so that its sums are those of a loop that has always run. */
-    edp_pi_levers(&gains, loop_sides, &limits, &c->reference, c->tick, strokes, c->sum, asked);
-"""
-PUBLIC = """\
-    uint32_t fallbacks;   /* ticks without a solution of the plan */
-    uint32_t iterations;  /* of the solver */
-    uint32_t constraints; /* limits of strokes and pressures in its program */
-    float disturbance[EDP_AXES]; /* m/s that the model does not know of */
-    uint32_t limit; /* of iterations; may be lowered */
-"""
-PRIVATE = """\
-    bool pending; /* values were measured that the model has not read yet */
-    bool formed;
-    uint32_t at;
-    uint32_t seen;
-    float measured[{NAME}_CONTROL_INPUTS];
-    float latest[EDP_AXES];
-    float speeds[{NAME}_CONTROL_BLOCKS][EDP_AXES]; /* the plan, m/s */
-{model}    float moved[{NAME}_CONTROL_LANES][EDP_AXES];
-    float targets[{NAME}_CONTROL_BLOCKS][EDP_AXES];
-    float changed[{NAME}_CONTROL_BLOCKS][EDP_AXES];
-    float changes[{NAME}_CONTROL_BLOCKS][EDP_AXES];
-    float by_variable[{NAME}_CONTROL_VARIABLES][EDP_AXES];
-    float slopes[{NAME}_CONTROL_VARIABLES];
-    float squares[{NAME}_CONTROL_VARIABLES][{NAME}_CONTROL_VARIABLES];
-    float products[{NAME}_CONTROL_VARIABLES];
-    c_float hessian[{NAME}_CONTROL_VARIABLES][{NAME}_CONTROL_VARIABLES];
-    c_float gradient[{NAME}_CONTROL_VARIABLES];
-    c_float matrix[{NAME}_CONTROL_ROWS][{NAME}_CONTROL_VARIABLES];
-    c_float lower[{NAME}_CONTROL_VARIABLES + {NAME}_CONTROL_ROWS];
-    c_float upper[{NAME}_CONTROL_VARIABLES + {NAME}_CONTROL_ROWS];
-    c_float numbers[EDP_QP_NUMBERS({NAME}_CONTROL_VARIABLES, {NAME}_CONTROL_ROWS)];
-    int integers[EDP_QP_INTEGERS({NAME}_CONTROL_VARIABLES, {NAME}_CONTROL_ROWS)];
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,11 +69,11 @@ class ControllerFiles:
             f"{name}_control.c": self._fill_template("control.c.in"),
             f"{name}_control_numbers.h": self._numbers(),
         }
-        texts |= self._runtime() if self.model is None else self.model.files()
+        texts |= {f: package_text(f"c/runtime/{f}") for f in RUNTIME} if self.model is None else self.model.files()
         for file in OWN if self.model is None else (*OWN, *PROGRAM):
-            texts[file] = own_file(f"runtime/{file}")
+            texts[file] = package_text(f"controller/runtime/{file}")
         if self.model is not None:
-            texts |= {file: own_file(file) for file in (*SOLVER_FILES, LICENCE)}
+            texts |= {file: package_text(f"controller/{file}") for file in (*SOLVER_FILES, LICENCE)}
         if self.parts.golden is not None:
             texts[f"{name}_control_golden.h"] = self._golden(self.parts.golden)
             texts["host_test.c"] = self._fill_template("host_test.c.in")
@@ -118,15 +81,12 @@ class ControllerFiles:
         texts["CMakeLists.txt"] = self._fill_template("CMakeLists.txt.in")
         return texts
 
-    def _runtime(self) -> dict[str, str]:
-        return {file: c_runtime(file) for file in RUNTIME}
-
     def _numbers(self) -> Code:
         head = f"/* Constants of {self.name}_control. Written by EDP {__version__}; do not edit. */\n"
         return Code(head + self.tables.finished())
 
     def _fill_template(self, template: str) -> Code:
-        return fill(own_file(f"templates/{template}"), self._values())
+        return fill_file(f"{TEMPLATES}/{template}", self._values())
 
     def _values(self) -> dict[str, object]:
         parts, plan, name = self.parts, self.parts.plan, self.name
@@ -145,7 +105,7 @@ class ControllerFiles:
             "crc": self.tables.crc,
             # Odd, so that zeroed memory does not look like a controller that has begun.
             "marker": int(hashlib.blake2b(repr(self.tables.crc).encode(), digest_size=4).hexdigest(), 16) | 1,
-            "input_enum": self._input_enum(),
+            "input_enum": channel_enumeration(f"{upper}_CONTROL_IN_", parts.inputs),
             "tolerance": number(TOLERANCE),
             "sources": Code(" ".join(self.sources)),
             "solver": Code(" ".join(SOLVER)) if plan is not None else Code(""),
@@ -155,7 +115,7 @@ class ControllerFiles:
         else:
             part, texts = "plan.c.in", self._plan_texts(plan, self.model, places)
         values |= texts
-        return values | {"parts": fill(own_file(f"templates/{part}"), values)}
+        return values | {"parts": fill_file(f"{TEMPLATES}/{part}", values)}
 
     def _pi_texts(self) -> dict[str, object]:
         return {
@@ -168,7 +128,7 @@ class ControllerFiles:
             "private_fields": Code(""),
             "check_plant": Code(""),
             "test_limit": Code(""),
-            "recall": Code(RECALL_SUMS.format(at=AXES)),
+            "recall": Code(f"    (void)memcpy(control.sum, before + {AXES}, EDP_AXES * sizeof(float));\n"),
         }
 
     def _plan_texts(self, plan: PlanParts, model: PlanModel, places: dict[str, str]) -> dict[str, object]:
@@ -185,8 +145,27 @@ class ControllerFiles:
         spare = "EDP_CONTROL_FALLBACK" if plan.fallback else "EDP_CONTROL_NEUTRAL"
         answers = "the PI loop answers (EDP_CONTROL_FALLBACK)" if plan.fallback else "levers go to neutral"
         includes = (f"{name}_plant.h", *INCLUDES, "edp_qp.h")
-        pressures = Code(model.pressure_rows.format(count=len(plan.pressures)) if plan.pressures else "")
-        values = {**places, "pressure_rows": pressures}
+        values: dict[str, object] = {
+            **places,
+            "count": len(plan.pressures),
+            "spare": spare,
+            "variables": plan.variables,
+            # Where the golden loop has what was remembered, see `GoldenLoop.before`; levers come first.
+            "speeds_at": AXES,
+            "latest_at": AXES + plan.variables,
+            "sum_at": 2 * AXES + plan.variables,
+            "disturbance_at": 3 * AXES + plan.variables,
+            "resistance_at": 4 * AXES + plan.variables,
+        }
+
+        def text(file: str) -> Code:
+            return fill_file(f"{TEMPLATES}/{file}.in", values)
+
+        def own(part: str) -> Code:
+            return text(f"{model.template}_{part}") if part in model.fragments else Code("")
+
+        values["pressure_rows"] = own("pressures.c") if plan.pressures else Code("")
+        values["model"] = own("fields.h")
         return {
             "what": Code(
                 f" * It plans {sum(plan.blocks)} ticks ahead on a twin ({name}_plant) in {len(plan.blocks)} "
@@ -199,41 +178,17 @@ class ControllerFiles:
             "cost": Code(f"{model.cost(plan)} Constants beside the\n * model's: {self.tables.bytes} bytes."),
             "includes": Code("\n".join(f'#include "{file}"' for file in sorted(includes))),
             "sizes": Code("\n".join(f"#define {upper}_CONTROL_{key} {value}u" for key, value in sizes.items())),
-            "public_fields": Code(PUBLIC + model.public),
-            "private_fields": Code(PRIVATE.format(**places, model=model.private.format(**places))),
+            "public_fields": Code(text("plan_public.h") + own("public.h")),
+            "private_fields": text("plan_fields.h"),
             "check_plant": Code(f" && {name}_plant_check()"),
-            **{
-                key: fill(own_file(f"templates/{model.fragment}{part}.c.in"), values)
-                for key, part in {"model": "", "slopes": "_slopes", "predict": "_predict"}.items()
-            },
-            "loop_levers": Code(LOOP_LEVERS if plan.fallback else ""),
+            "model": text(f"{model.template}.c"),
+            "slopes": text(f"{model.template}_slopes.c"),
+            "predict": text(f"{model.template}_predict.c"),
+            "loop_levers": text("plan_loop_levers.c") if plan.fallback else Code(""),
             "without_plan": Code(spare),
-            "test_limit": Code(LIMIT_TEST.format(name=name, spare=spare)),
-            "recall": self._recall(plan, model),
+            "test_limit": text("plan_limit_test.c"),
+            "recall": Code(text("plan_recall.c") + own("recall.c")),
         }
-
-    def _recall(self, plan: PlanParts, model: PlanModel) -> Code:
-        """Return the statements of the self-test that set the state."""
-        at = AXES
-        lines = ""
-        for field, size in (("speeds[0]", plan.variables), ("latest", AXES)):
-            lines += f"    (void)memcpy(control.{field}, before + {at}, {size}u * sizeof(float));\n"
-            at += size
-        rest = f"    (void)memcpy(control.disturbance, before + {at + AXES}, EDP_AXES * sizeof(float));\n"
-        rest += model.recalled.format(plant=f"{self.name}_plant", at=at + 2 * AXES)
-        return Code(lines + RECALL_SUMS.format(at=at) + rest)
-
-    def _input_enum(self) -> Code:
-        upper = self.name.upper()
-        names = c_names(
-            (channel.name for channel in si_channels(self.parts.inputs)), C_SIGNIFICANT - len(f"{upper}_CONTROL_IN_")
-        )
-        return Code(
-            "\n".join(
-                f"    {upper}_CONTROL_IN_{own} = {i}, /* {c_comment('; '.join((channel.unit, channel.description)))} */"
-                for i, (own, channel) in enumerate(zip(names, self.parts.inputs, strict=True))
-            )
-        )
 
     def _golden(self, golden: GoldenLoop) -> Code:
         arrays = {
@@ -245,22 +200,13 @@ class ControllerFiles:
         }
         head = f"/* A stretch of a loop of {self.name}_control as it ran in Python. */\n"
         sizes = f"#define GOLDEN_TICKS {len(golden.levers)}u\n#define GOLDEN_ROWS {len(golden.strokes)}u\n"
-        return Code(head + sizes + "".join(golden_rows(key, "float", rows) for key, rows in arrays.items()))
-
-
-RECALL_SUMS = """\
-    (void)memcpy(control.sum, before + {at}, EDP_AXES * sizeof(float));
-"""
-LIMIT_TEST = """\
-    begin();
-    control.limit = 1u;
-    for (uint32_t tick = 0; tick < GOLDEN_TICKS; tick++) {{
-        expect({name}_control_step(&control, golden_measured[tick], levers) == {spare},
-               "at the limit of iterations another command is given");
-        expect(within(levers), "levers are within their limits without a plan");
-    }}
-    expect(control.fallbacks == GOLDEN_TICKS, "ticks without a plan are counted");
-"""
+        return Code(
+            head
+            + sizes
+            + "".join(
+                f"{reference_array('float', key, np.asarray(rows, np.float32))}\n" for key, rows in arrays.items()
+            )
+        )
 
 
 def write_controller(parts: ControllerParts, name: str, folder: Path) -> list[Path]:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -15,23 +13,29 @@ import numpy as np
 from edp import __version__
 from edp.errors import ExportError
 from edp.export.c.model import Model, crc, make_model
+from edp.export.c.tables import ConstantTables
 from edp.export.c.target import check_name
-from edp.export.c.text import filled, identifier, number
-from edp.export.controller.files import c_runtime
-from edp.export.controller.files import own_file as controller_file
+from edp.export.c.text import (
+    channel_enumeration,
+    enumeration,
+    filled,
+    identifier,
+    initialiser_rows,
+    number,
+    reference_array,
+    table,
+    unsigned_literals,
+)
 from edp.export.controller.near import RUNTIME as NEAR
 from edp.export.controller.near import WITHIN
-from edp.export.controller.numbers import ConstantTables, golden_rows
-from edp.export.escape import C_SIGNIFICANT, Code, c_comment, c_names, fill
+from edp.export.escape import Code, c_comment, fill_file, package_text
 from edp.export.folder import write_export
 from edp.export.follower.parts import FollowerParts
 from edp.export.hashes import model_hash, scale_hash
-from edp.export.si_names import si_channels
 from edp.export.sizes import check_sizes
 from edp.ir.hydraulics import HydraulicTick
 from edp.networks.twin.adaptive_correction import JUDGED_S
 from edp.networks.twin.adaptive_twin import LEAST, AdaptiveTwin
-from edp.signals import Channel
 from edp.training.bundle import Bundle
 
 OWN = ("edp_follow.h", "edp_follow.c")
@@ -69,14 +73,16 @@ class FollowerFiles:
     def texts(self) -> dict[str, str]:
         """Every file by name, the one to read first in front."""
         name, values = self.name, self._values()
-        texts: dict[str, str] = {f"{name}.{end}": fill(_own(f"templates/follower.{end}.in"), values) for end in "hc"}
+        texts: dict[str, str] = {
+            f"{name}.{end}": fill_file(f"follower/templates/follower.{end}.in", values) for end in "hc"
+        }
         texts[f"{name}_weights.h"] = self.model.weights()
-        texts |= {file: c_runtime(file) for file in self.model.runtime}
-        texts |= {file: controller_file(f"runtime/{file}") for file in NEAR}
-        texts |= {file: _own(f"runtime/{file}") for file in OWN}
+        texts |= self.model.runtime_texts()
+        texts |= {file: package_text(f"controller/runtime/{file}") for file in NEAR}
+        texts |= {file: package_text(f"follower/runtime/{file}") for file in OWN}
         texts[f"{name}_golden.h"] = self._golden()
         for file in ("host_test.c", "example_task.c", "CMakeLists.txt"):
-            texts[file] = fill(_own(f"templates/{file}.in"), values)
+            texts[file] = fill_file(f"follower/templates/{file}.in", values)
         return texts
 
     @cached_property
@@ -87,16 +93,16 @@ class FollowerFiles:
     @cached_property
     def tables(self) -> ConstantTables:
         """All constants that are not the grey box's."""
-        correction, tables = self.parts.correction(), ConstantTables()
+        correction, tables = self.parts.correction(), ConstantTables("follower")
         which, group = np.nonzero(self.tuned.moves)
         tables.floats("floors", (LEAST * self._widths.astype(np.float64)) ** 2)
         tables.floats("powers", self.tuned.moves[which, group])
-        tables.small("entry_number", which)
-        tables.small("entry_group", group)
+        tables.places("entry_number", which.tolist())
+        tables.places("entry_group", group.tolist())
         tables.floats("deviation", self.tuned.deviation)
         tables.floats("warmth", self.tuned.warmth)
-        tables.small("columns", correction.columns)
-        tables.small("ahead", self.parts.horizons)
+        tables.places("columns", correction.columns)
+        tables.places("ahead", self.parts.horizons)
         return tables
 
     @property
@@ -146,12 +152,11 @@ class FollowerFiles:
         named = ["numbers", "commands", "entries", "groups", "velocities", "targets", "horizons", "reach"]
         counts = [*(s[name] for name in named), self.parts.twin.prefix_ticks, spec.learn_ticks, s["state"], s["most"]]
         shares = [number(spec.gain), number(spec.load_share), repr(keep), number(oil), repr(1.0 / (JUDGED_S * rate))]
-        return filled([*(f"{count}u" for count in counts), *shares])
+        return filled([*unsigned_literals(counts), *shares])
 
     def _values(self) -> dict[str, object]:
         parts, twin, graph = self.parts, self.parts.twin, self.model.graph
         channels, upper, tables = twin.channels, self.name.upper(), self.tables
-        limits = ",\n".join(f"    {{{', '.join(map(number, row))}}}" for row in parts.limit)
         speeds = {channel.name: channel for channel in channels.velocities}
         ahead = [f"{k} ticks, {1000 * k / channels.rate_hz:g} ms" for k in parts.horizons]
         return self.sizes | {
@@ -170,16 +175,16 @@ class FollowerFiles:
             "weights_crc": crc(graph),
             # Odd, so that zeroed memory does not look like a follower that was reset.
             "marker": int(hashlib.blake2b(repr((tables.crc, crc(graph))).encode(), digest_size=4).hexdigest(), 16) | 1,
-            "command_enum": _enum(f"{upper}_COMMAND_", channels.commands),
-            "answer_enum": _enum(f"{upper}_MEASURED_", channels.answers),
-            "target_enum": _enum(f"{upper}_TARGET_", [speeds[name] for name in parts.targets]),
-            "horizon_enum": _write_enumeration(f"{upper}_AHEAD_", [str(k) for k in parts.horizons], ahead),
-            "group_enum": _write_enumeration(f"{upper}_GROUP_", self.tuned.labels, self.tuned.labels),
+            "command_enum": channel_enumeration(f"{upper}_COMMAND_", channels.commands),
+            "answer_enum": channel_enumeration(f"{upper}_MEASURED_", channels.answers),
+            "target_enum": channel_enumeration(f"{upper}_TARGET_", [speeds[name] for name in parts.targets]),
+            "horizon_enum": enumeration(f"{upper}_AHEAD_", map(str, parts.horizons), ahead),
+            "group_enum": enumeration(f"{upper}_GROUP_", self.tuned.labels, self.tuned.labels),
             "low": filled(map(number, np.asarray(twin.scales.low) / twin.units)),
             "high": filled(map(number, np.asarray(twin.scales.high) / twin.units)),
             "constants": Code("\n".join(tables.lines)),
             "own_tables": Code(", ".join(tables.entries)),
-            "limits": Code(limits),
+            "limits": initialiser_rows(map(number, row) for row in parts.limit),
             "law": self._law(),
             "machine": f"{identifier(self.machine.name)}_machine",
             "sources": Code(" ".join(self.sources)),
@@ -193,34 +198,13 @@ class FollowerFiles:
         head += (
             f"#include <math.h>\n#define GOLDEN_TICKS {len(golden.inputs)}u\n#define GOLDEN_TAUGHT {golden.taught}u\n"
         )
-        rows = ",\n".join(f"    {{{', '.join(map(_number_or_nan, row))}}}" for row in golden.forecasts)
-        size = f"[GOLDEN_TICKS][{golden.forecasts.shape[1]}]"
-        forecasts = f"static const float golden_forecasts{size} = {{\n{rows}\n}};\n"
-        inputs = golden_rows("golden_inputs", "float", golden.inputs)
-        return Code(head + inputs + forecasts + golden_rows("golden_factors", "float", golden.factors[None]))
-
-
-def _number_or_nan(value: float) -> str:
-    return "NAN" if math.isnan(value) else number(value)
-
-
-def _own(path: str) -> str:
-    return resources.files("edp.export.follower").joinpath(path).read_text(encoding="utf-8")
-
-
-def _enum(prefix: str, channels: Iterable[Channel]) -> Code:
-    every = si_channels(channels)
-    return _write_enumeration(prefix, [c.name for c in every], ["; ".join((c.unit, c.description)) for c in every])
-
-
-def _write_enumeration(prefix: str, names: Iterable[str], texts: Iterable[str]) -> Code:
-    """Lines of an enumeration, each with a text that is escaped here as its comment."""
-    ends = c_names(names, C_SIGNIFICANT - len(prefix))
-    lines = (
-        f"    {prefix}{end} = {i}, /* {c_comment(text)} */"
-        for i, (end, text) in enumerate(zip(ends, texts, strict=True))
-    )
-    return Code("\n".join(lines))
+        rows = (["NAN" if math.isnan(value) else number(value) for value in row] for row in golden.forecasts)
+        arrays = (
+            reference_array("float", "golden_inputs", golden.inputs),
+            table("float", f"golden_forecasts[GOLDEN_TICKS][{golden.forecasts.shape[1]}]", rows),
+            reference_array("float", "golden_factors", golden.factors[None]),
+        )
+        return Code(head + "".join(f"{definition}\n" for definition in arrays))
 
 
 def write_follower(parts: FollowerParts, plant: Bundle, name: str, folder: Path) -> list[Path]:

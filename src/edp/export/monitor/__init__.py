@@ -3,34 +3,25 @@
 from edp.export.monitor.fmu import write_monitor_fmu
 from edp.export.monitor.golden import drawn_rows
 from edp.export.monitor.parts import (
-    BalancePart,
-    ChainPart,
-    FlowChamber,
-    FlowPart,
     GoldenChain,
     GoldenResiduals,
     MonitorParts,
     NetworkPart,
     SourcePart,
     TwinPart,
-    WatchPart,
+    WatchCode,
 )
 from edp.export.monitor.ros2 import write_monitor_ros2
-from edp.export.monitor.write import DETECTORS, monitor_files, write_monitor
+from edp.export.monitor.write import monitor_files, write_monitor
 
 __all__ = [
-    "DETECTORS",
-    "BalancePart",
-    "ChainPart",
-    "FlowChamber",
-    "FlowPart",
     "GoldenChain",
     "GoldenResiduals",
     "MonitorParts",
     "NetworkPart",
     "SourcePart",
     "TwinPart",
-    "WatchPart",
+    "WatchCode",
     "drawn_rows",
     "monitor_files",
     "write_monitor",

@@ -6,16 +6,15 @@ from edp import __version__
 from edp.export.description import entry_of
 from edp.export.monitor.parts import MonitorParts
 from edp.export.si_names import si_channels
+from edp.monitor.summaries import SUMMARIES
 from edp.storage.reading import Table
 
 SCHEMA = 1
-SUMMARIES = ("mean", "spread", "gain", "lag", "peak")
-"""Of each residual and block."""
 
 
 def description(parts: MonitorParts, name: str) -> Table:
     """Plain values that JSON can hold."""
-    chain = parts.chain
+    chain, summaries = parts.chain, parts.chain.summaries
     return {
         "schema": SCHEMA,
         "edp": __version__,
@@ -24,14 +23,14 @@ def description(parts: MonitorParts, name: str) -> Table:
         "monitor_hash": parts.digest,
         "promise": parts.promise,
         "rate_hz": parts.rate_hz,
-        "block_s": chain.block / parts.rate_hz,
+        "block_s": summaries.block / parts.rate_hz,
         "settle_blocks": chain.settle,
         "inputs": [
             entry_of(c.name, own.name, c.kind, c.description)
             for c, own in zip(parts.inputs, si_channels(parts.inputs), strict=True)
         ],
         "residuals": list(parts.residuals),
-        "summaries": [*SUMMARIES, *(f"drive{number + 1}" for number in range(len(chain.drivers)))],
-        "watches": [{"detector": w.detector, "option": w.option, "directions": w.directions} for w in chain.watches],
+        "summaries": [*SUMMARIES, *(f"drive{number + 1}" for number in range(len(summaries.drivers)))],
+        "watches": [{"detector": w.detector, "option": w.option, "directions": w.directions} for w in parts.watches],
         "limit": chain.limit,
     }

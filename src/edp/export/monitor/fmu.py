@@ -32,7 +32,7 @@ COUNTS = (
 
 def monitor_variables(parts: MonitorParts) -> list[Variable]:
     """Return inputs and outputs in the order of the monitor's C structures, then the variables of the FMU itself."""
-    spread = 1.0 / parts.chain.spread
+    spread = 1.0 / parts.chain.summaries.spread
     inputs = [
         Variable(c.name, "input", c.description, kind=c.kind, nominal=float(f"{abs(width):.3g}") or 1.0)
         for c, width in zip(si_channels(parts.inputs), spread, strict=True)
@@ -40,7 +40,7 @@ def monitor_variables(parts: MonitorParts) -> list[Variable]:
     outputs = [Variable(name, "output", text) for name, text in OUTPUTS]
     statistics = [
         Variable(f"statistic_{i}", "output", f"of {watch.detector} {i}, over the limit: an alarm where it passes 1")
-        for i, watch in enumerate(parts.chain.watches)
+        for i, watch in enumerate(parts.watches)
     ]
     own = [Variable("status", "output", STATUS, "whole")]
     own.append(Variable("valid", "output", "true if this tick is judged and no input is missing", "flag"))

@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.export.monitor.parts import ChainPart
+from edp.export.c.text import array, reference_array
+from edp.export.escape import Code
+from edp.export.monitor.parts import MonitorParts
+from edp.monitor.chain import MonitorChain
 
 JUDGED_BLOCKS = 80
 """Blocks of the self-test behind those that are not judged; in the second half residuals are shifted."""
@@ -19,37 +22,36 @@ SEED = 1
 Rows = NDArray[np.float32]
 
 
-def golden_blocks(chain: ChainPart) -> int:
+def golden_blocks(chain: MonitorChain) -> int:
     """Blocks of the self-test."""
-    return min(chain.settle + JUDGED_BLOCKS, max(2, MOST_TICKS // chain.block))
+    return min(chain.settle + JUDGED_BLOCKS, max(2, MOST_TICKS // chain.summaries.block))
 
 
-def drawn_rows(chain: ChainPart) -> tuple[Rows, Rows]:
+def drawn_rows(chain: MonitorChain) -> tuple[Rows, Rows]:
     """Return random inputs ``(tick, input)`` and residuals ``(tick, residual)`` in their usual range, NaN if missing.
 
     A tick draws its inputs, then its residuals, each as ``centre + spread (2 u - 1)`` in single precision.
     """
-    ticks, inputs, residuals = golden_blocks(chain) * chain.block, len(chain.centre), len(chain.scale)
+    block, inputs, residuals = chain.summaries.block, len(chain.summaries.centre), chain.summaries.residuals
+    ticks = golden_blocks(chain) * block
     width = inputs + residuals
     draws = _lcg(ticks * (width + 1), SEED).reshape(ticks, width + 1)
     u = (draws[:, 1:] >> np.uint32(8)).astype(np.float32) * np.float32(2.0**-24)
     centre, spread, scale = usual_widths(chain)
     middle = np.concatenate([centre, np.zeros(residuals, np.float32)])
     values = middle + np.concatenate([spread, scale]) * (np.float32(2.0) * u - np.float32(1.0))
-    late = np.arange(ticks) >= (golden_blocks(chain) - JUDGED_BLOCKS // 2) * chain.block
+    late = np.arange(ticks) >= (golden_blocks(chain) - JUDGED_BLOCKS // 2) * block
     values[late] += np.concatenate([np.zeros(inputs, np.float32), scale * np.float32(SHIFT)])
     holes = (draws[:, :1] >> np.uint32(30) == 0) & (draws[:, 1:] % np.uint32(MISSING) == 0)
     values[holes] = np.nan
     return values[:, :inputs], values[:, inputs:]
 
 
-def usual_widths(chain: ChainPart) -> tuple[Rows, Rows, Rows]:
+def usual_widths(chain: MonitorChain) -> tuple[Rows, Rows, Rows]:
     """Middle and width of each input, and width of each residual, in single precision."""
-    return (
-        chain.centre.astype(np.float32),
-        (1.0 / chain.spread).astype(np.float32),
-        (1.0 / chain.scale).astype(np.float32),
-    )
+    summaries = chain.summaries
+    centre, spread, scale = summaries.centre, 1.0 / summaries.spread, 1.0 / summaries.scale
+    return centre.astype(np.float32), spread.astype(np.float32), scale.astype(np.float32)
 
 
 def _lcg(count: int, seed: int) -> NDArray[np.uint32]:
@@ -60,3 +62,22 @@ def _lcg(count: int, seed: int) -> NDArray[np.uint32]:
         x = (1_664_525 * x + 1_013_904_223) & 0xFFFFFFFF
         out[i] = x
     return out
+
+
+def golden_header(name: str, parts: MonitorParts) -> Code:
+    """Return the reference values of a self-test as a header."""
+    chain, rows = parts.golden_chain, parts.golden_residuals
+    widths = dict(zip(("centre", "spread", "scale"), usual_widths(parts.chain), strict=True))
+    lines = [
+        f"/* What {name} gives in Python: statistics of drawn rows, and residuals of a stretch. */",
+        reference_array("double", "golden_statistics", chain.statistics, missing=True),
+        array("int32_t", "golden_alarms", map(str, chain.alarms)),
+        array("int32_t", "golden_since", map(str, chain.since)),
+        reference_array("double", "golden_evidence", chain.evidence, missing=True),
+        *(reference_array("float", f"golden_{what}", values, missing=True) for what, values in widths.items()),
+        f"#define GOLDEN_TICKS {len(rows.inputs)}u",
+        reference_array("float", "golden_inputs", rows.inputs, missing=True),
+        reference_array("float", "golden_residuals", rows.residuals, missing=True),
+        reference_array("float", "golden_tolerance", rows.tolerance, missing=True),
+    ]
+    return Code("\n".join(lines) + "\n")

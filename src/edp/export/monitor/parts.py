@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.errors import ExportError
+from edp.monitor.chain import MonitorChain
+from edp.monitor.detectors import DETECTORS as REGISTERED
+from edp.monitor.detectors import CusumSpec, EwmaSpec, GlrSpec, SeparateCusumsSpec
+from edp.monitor.residuals.balances import Balances
+from edp.monitor.residuals.flow_balances import FlowBalances
+from edp.monitor.summaries import SUMMARIES
+from edp.monitor.watches import Watch
 from edp.signals import Channel
 from edp.training.bundle import Bundle
 
@@ -45,27 +54,6 @@ class NetworkPart:
 
 
 @dataclass(frozen=True, eq=False)
-class BalancePart:
-    """Levels less the integrals of their rates, with sums that fade.
-
-    Attributes:
-        reads: inputs of the monitor that are read.
-        middle: what stands in for each of them before it was ever there, shape (reads,).
-        levels: place of the level of each residual among `reads`.
-        rates: likewise of its rate.
-        steps: gain of the rate times the time of a tick, shape (residuals,).
-        left: share of the sum that is left after a tick, shape (residuals,).
-    """
-
-    reads: Places
-    middle: NDArray[np.float32]
-    levels: Places
-    rates: Places
-    steps: Array
-    left: Array
-
-
-@dataclass(frozen=True, eq=False)
 class TwinPart:
     """Residuals of a twin that runs once per group of its outputs, with the ports of the group free.
 
@@ -86,93 +74,14 @@ class TwinPart:
     period: int
 
 
-@dataclass(frozen=True, eq=False)
-class FlowChamber:
-    """A chamber's balance of flow.
-
-    Attributes:
-        velocity: place among `FlowPart.reads`, as are the next ones; of `stroke` -1 is none.
-        own: pressure of the chamber.
-        other: pressure of the one on the other side.
-        stroke: see `velocity`.
-        supplies: pressures of the pumps.
-        spools: places of its spools.
-        sign: 1 for a chamber that grows with the velocity, -1 for the other.
-        end: stroke at which its outflow is cushioned, m.
-        far: stroke at the other end, m.
-        per_cushion: one over the length of the cushion, 1/m.
-        tank: pressure of the return line, MPa.
-        values: of its curves at the knots, shape (paths, knots); `slopes` from each knot on.
-        slopes: see `values`.
-        lines: factors of the terms without a spool, shape (9 + reliefs,).
-        doubts: factors of what makes it uncertain, shape (8,).
-    """
-
-    velocity: int
-    own: int
-    other: int
-    stroke: int
-    supplies: Places
-    spools: Places
-    sign: int
-    end: float
-    far: float
-    per_cushion: float
-    tank: float
-    values: NDArray[np.float32]
-    slopes: NDArray[np.float32]
-    lines: NDArray[np.float32]
-    doubts: NDArray[np.float32]
-
-
-@dataclass(frozen=True, eq=False)
-class FlowPart:
-    """Flow balances: parameters of `edp.monitor.residuals.flow_balances`.
-
-    Attributes:
-        reads: inputs of the monitor that are read.
-        middle: what stands in for each of them before it was ever there, shape (reads,).
-        extend: place of the command that extends of each spool among `reads`; `retract` likewise, -1 for none.
-        retract: see `extend`.
-        gain: one over the full command, shape (spools,).
-        dead: dead time in ticks, shape (spools,).
-        stages: b1, b2, a1, a2 of both stages, shape (spools, 2, 4).
-        play: half width, shape (spools,).
-        memory: rows before a tick that are needed for it.
-        back: ticks by which balances lag.
-        knots: shape (knots,).
-        reliefs: MPa, shape (reliefs,).
-        smooth: MPa^2 below which an orifice turns laminar.
-        cavity: MPa that are added where free air makes oil soft.
-        empty: MPa below which a chamber may be drawn empty.
-        doubtful: place of the relief, among `reliefs`, beyond which a balance is uncertain.
-        per_tick: a sixth of the ticks per second.
-        chambers: the balances.
-        oil: place of the thermometer among `reads`, lowest and highest temperature at which they hold; None without.
-    """
-
-    reads: Places
-    middle: NDArray[np.float32]
-    extend: Places
-    retract: Places
-    gain: NDArray[np.float32]
-    dead: Array
-    stages: NDArray[np.float32]
-    play: NDArray[np.float32]
-    memory: int
-    back: int
-    knots: NDArray[np.float32]
-    reliefs: NDArray[np.float32]
-    smooth: float
-    cavity: float
-    empty: float
-    doubtful: int
-    per_tick: float
-    chambers: tuple[FlowChamber, ...]
-    oil: tuple[int, float, float] | None = None
-
-
-SourcePart = NetworkPart | BalancePart | TwinPart | FlowPart
+SourcePart = NetworkPart | TwinPart | Balances | FlowBalances
+DETECTORS = {
+    "cusum": "EDP_CUSUM",
+    "ewma": "EDP_EWMA",
+    "glr": "EDP_GLR",
+    "separate_cusums": "EDP_SEPARATE_CUSUMS",
+}
+"""Detectors in C, by their names."""
 PIECE, ROW = 8, 32
 """Directions of a detector, and summaries, that one part of the work on a block takes; in C `EDP_PIECE`, `EDP_ROW`."""
 
@@ -183,98 +92,60 @@ def pieces(count: int, size: int) -> list[int]:
 
 
 @dataclass(frozen=True, eq=False)
-class WatchPart:
-    """A view of conditioned summaries and the detector on it.
+class WatchCode:
+    """A view of the monitor with the C form of its detector.
 
     Attributes:
+        watch: the view.
         detector: ``cusum``, ``ewma``, ``glr`` or ``separate_cusums``.
         option: its slack, weight or window.
-        mean: shape (summaries,).
-        matrix: shape (summaries, directions), or (summaries,) where it sees each summary by itself.
-        scale: of its statistic.
+        rows: of its state.
+        passes: over its directions in a block.
     """
 
+    watch: Watch
     detector: str
     option: float
-    mean: Array
-    matrix: Array
-    scale: float
+    rows: int = 1
+    passes: int = 1
 
     @property
     def directions(self) -> int:
         """Numbers that the detector sees."""
-        return int(self.matrix.shape[-1])
+        return self.watch.directions
 
     @property
-    def own(self) -> bool:
-        """Whether each summary is monitored by itself, without clipping."""
-        return self.matrix.ndim == 1
+    def memory(self) -> int:
+        """Numbers of the detector's state."""
+        return self.directions * self.rows
 
     @property
-    def rows(self) -> int:
-        """Number of rows of the detector's state."""
-        return int(self.option) if self.detector == "glr" else 2 if self.detector == "separate_cusums" else 1
-
-    @property
-    def passes(self) -> int:
-        """Number of passes of the detector over its directions in a block."""
-        return self.rows if self.detector == "glr" else 2 if self.detector == "cusum" else 1
+    def slices(self) -> int:
+        """Number of calls of `edp_watch_part`: centring, whitening and detector steps."""
+        detector = len(pieces(self.directions, PIECE)) * self.passes
+        white = len(pieces(self.directions, ROW)) if self.watch.own else self.directions
+        return len(pieces(len(self.watch.mean), ROW)) + white + detector
 
 
-@dataclass(frozen=True, eq=False)
-class ChainPart:
-    """Chain from residuals to alarms: parameters of `edp.monitor.chain`.
+def watch_code(watch: Watch) -> WatchCode:
+    """Return a view with the C form of its detector.
 
-    Attributes:
-        block: ticks of a block.
-        centre: of each input, shape (inputs,).
-        spread: one over the usual width of each input, shape (inputs,).
-        impossible: usual widths from its centre beyond which an input counts as missing.
-        scale: one over the usual width of each residual, shape (residuals,).
-        change: usual variance of the change of the channel of each residual, shape (residuals,).
-        channel: input that each residual judges.
-        level: inputs whose mean is part of the operating point.
-        moving: inputs whose mean size is.
-        drivers: of each residual, pairs of inputs whose difference moves what it judges, shape (drivers, residuals, 2);
-            a second one of -1 is none.
-        point_offset: of the operating point, shape (points,); `point_width` likewise.
-        point_limit: of its scaled numbers.
-        usual: of each summary, shape (summaries, 1 + points); `wide` likewise.
-        least: width of each summary, shape (summaries,).
-        clip: of conditioned summaries.
-        gross: largest size of those that are not clipped.
-        drift_step: most by which the slow drift changes in a block.
-        drift_most: its limit.
-        watches: side by side.
-        limit: of the largest statistic over its scale.
-        quiet: at or below which it is at a healthy level.
-        settle: blocks after a reset that are not judged.
+    Raises:
+        ExportError: there is none.
     """
-
-    block: int
-    centre: Array
-    spread: Array
-    impossible: float
-    scale: Array
-    change: Array
-    channel: Places
-    level: Places
-    moving: Places
-    drivers: NDArray[np.int64]
-    point_offset: Array
-    point_width: Array
-    point_limit: float
-    usual: Array
-    wide: Array
-    least: Array
-    clip: float
-    gross: float
-    drift_step: float
-    drift_most: float
-    watches: tuple[WatchPart, ...]
-    limit: float
-    quiet: float
-    settle: int
+    detector = watch.detector
+    if isinstance(detector, CusumSpec):
+        return WatchCode(watch, "cusum", detector.slack, passes=2)
+    if isinstance(detector, EwmaSpec):
+        return WatchCode(watch, "ewma", detector.weight)
+    if isinstance(detector, GlrSpec):
+        return WatchCode(watch, "glr", float(detector.window), rows=detector.window, passes=detector.window)
+    if isinstance(detector, SeparateCusumsSpec):
+        return WatchCode(watch, "separate_cusums", detector.slack, rows=2)
+    raise ExportError(
+        f"detector '{REGISTERED.name_of(detector)}' has no form in C; these have: {', '.join(DETECTORS)}. Fit the "
+        "monitor with one of them"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,6 +192,7 @@ class MonitorParts:
         rate_hz: ticks per second.
         residuals: names.
         reads: inputs that each residual depends on.
+        columns: place of each input among `inputs`, by its name in the monitor.
         sources: in the order of the residuals.
         chain: what follows them.
         golden_chain: of the self-test.
@@ -334,22 +206,28 @@ class MonitorParts:
     rate_hz: float
     residuals: tuple[str, ...]
     reads: Sequence[Places]
+    columns: Mapping[str, int]
     sources: tuple[SourcePart, ...]
-    chain: ChainPart
+    chain: MonitorChain
     golden_chain: GoldenChain
     golden_residuals: GoldenResiduals
 
+    @cached_property
+    def watches(self) -> tuple[WatchCode, ...]:
+        """Views of the chain with the C forms of their detectors."""
+        return tuple(map(watch_code, self.chain.watches))
+
     @property
-    def summaries(self) -> int:
-        """Numbers of a block."""
-        return len(self.chain.least)
+    def flows(self) -> tuple[FlowBalances, ...]:
+        """Balances of flow among the sources."""
+        return tuple(source for source in self.sources if isinstance(source, FlowBalances))
 
     @property
     def each(self) -> int:
         """Summaries of a residual and block."""
-        return 5 + len(self.chain.drivers)
+        return len(SUMMARIES) + len(self.chain.summaries.drivers)
 
     @property
     def points(self) -> int:
         """Numbers of the operating point, without its 1."""
-        return len(self.chain.point_offset)
+        return len(self.chain.conditioning.offset)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from importlib import resources
 from pathlib import Path
 
 from edp import __version__
 from edp.export.description import as_json
-from edp.export.escape import Code, fill, markdown_text, xml_text, yaml_scalar
+from edp.export.escape import Code, fill_file, markdown_text, package_text, xml_text, yaml_scalar
 from edp.export.folder import write_export
 from edp.export.monitor.describe import description
 from edp.export.monitor.fmu import OUTPUTS
@@ -25,15 +24,6 @@ MODULES = {
     "watch_node.py": "node.py",
 }
 """Modules of the package, by their names here."""
-EVIDENCE = """
-void {name}_evidence(const {name}_state *s, double *out);
-
-void {name}_evidence(const {name}_state *s, double *out) {{
-    for (uint32_t i = 0; i < {upper}_SUMMARIES; i++) {{
-        out[i] = s->evidence[i];
-    }}
-}}
-"""
 
 
 def write_monitor_ros2(parts: MonitorParts, name: str, folder: Path) -> list[Path]:
@@ -49,19 +39,16 @@ def write_monitor_ros2(parts: MonitorParts, name: str, folder: Path) -> list[Pat
         StorageError: the folder cannot be written.
     """
     package, texts = f"{name}_ros", monitor_files(parts, name).texts()
-    shared = resources.files("edp.export.ros2")
-    own = resources.files("edp.export.monitor")
     about = _describe(parts, name)
     blanks = _blanks(parts, package, name, about)
 
     def filled(template: str) -> str:
-        escaped = {"title": xml_text(parts.title)}
-        return fill(shared.joinpath(f"templates/{template}.in").read_text(), blanks | escaped)
+        return fill_file(f"ros2/templates/{template}.in", blanks | {"title": xml_text(parts.title)})
 
-    readme = own.joinpath("templates/ros2_README.md.in").read_text()
-    shim = filled("shim.c") + EVIDENCE.format(name=name, upper=name.upper())
+    readme = blanks | {"title": markdown_text(parts.title)}
+    evidence = fill_file("monitor/templates/ros2_evidence.c.in", {"name": name, "upper": name.upper()})
     files = {
-        "README.md": fill(readme, blanks | {"title": markdown_text(parts.title)}),
+        "README.md": fill_file("monitor/templates/ros2_README.md.in", readme),
         "package.xml": filled("package.xml"),
         "setup.py": filled("setup.py"),
         "setup.cfg": filled("setup.cfg"),
@@ -70,9 +57,9 @@ def write_monitor_ros2(parts: MonitorParts, name: str, folder: Path) -> list[Pat
         f"launch/{NODE}.launch.py": filled("predictor.launch.py"),
         f"{package}/__init__.py": "",
         f"{package}/model.json": as_json(about).decode(),
-        f"{package}/csrc/{name}_ros.c": shim,
+        f"{package}/csrc/{name}_ros.c": filled("shim.c") + evidence,
     }
-    files |= {f"{package}/{new}": shared.joinpath(f"package/{old}").read_text() for old, new in MODULES.items()}
+    files |= {f"{package}/{new}": package_text(f"ros2/package/{old}") for old, new in MODULES.items()}
     files |= {f"{package}/csrc/{file}": text for file, text in texts.items()}
     return write_export(folder, {file: text.encode() for file, text in files.items()})
 

@@ -2,153 +2,84 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edp.export.c.model import Model, make_model
-from edp.export.c.text import number
-from edp.export.monitor.flows import FlowCode
-from edp.export.monitor.numbers import MonitorTables
-from edp.export.monitor.parts import BalancePart, FlowPart, NetworkPart, SourcePart, TwinPart
+from edp.export.c.tables import ConstantTables
+from edp.export.c.text import bool_literal, number, table, unsigned_literals
+from edp.export.escape import Code, fill_file
+from edp.export.monitor.parts import NetworkPart, SourcePart, TwinPart
+from edp.monitor.residuals.balances import Balances
+from edp.monitor.residuals.flow_balances import ChamberCurves, FlowBalances
+from edp.monitor.residuals.flow_curves import BACK, CAVITY, EMPTY, KNOTS, RELIEFS, SMOOTH
+from edp.training.bundle import Bundle
 
-HOLD = """\
-    for (uint32_t i = 0; i < {count}u; i++) {{
-        if (s->there[{own}_reads[i]]) {{
-            s->{own}_in[i] = s->row[{own}_reads[i]]; /* else the last value stands in */
-        }}
-    }}
-"""
-NETWORK = """
-static void {own}_residuals({name}_state *s) {{
-    {model}_output out;
-{hold}    const bool known = {model}_step(&s->{own}, s->{own}_in, &out) <= EDP_WARMING;
-    for (uint32_t i = 0; i < {residuals}u; i++) {{
-        const float expected = (&out.prediction[0][0])[{own}_results[i]];
-        s->residuals[{first}u + i] = known ? (s->row[{own}_judged[i]] - expected) : (float)edp_unknown();
-    }}
-}}
-"""
-TURNS = """
-/* Runs every {every} ticks, by turns with others; residuals hold in between, but not what came of a missing value. */
-static void {own}_residuals({name}_state *s) {{
-{hold}    if (s->{own}_due == 0u) {{
-        const bool known = {model}_step(&s->{own}, s->{own}_in, &s->{own}_out) <= EDP_WARMING;
-        const bool fed = all_there(s, {own}_reads, {reads}u);
-        for (uint32_t i = 0; i < {residuals}u; i++) {{
-            const float expected = (&s->{own}_out.prediction[0][0])[{own}_results[i]];
-            const uint16_t judged = {own}_judged[i];
-            s->{own}_kept[i] = (known && fed && s->there[judged]) ? (s->row[judged] - expected) : (float)edp_unknown();
-        }}
-        s->{own}_due = {every}u;
-    }}
-    s->{own}_due--;
-    edp_copy(s->{own}_kept, {residuals}u, &s->residuals[{first}u]);
-}}
-"""
-AHEAD = """
-/* Predictions wait in a ring until what they are about is measured. */
-static void {own}_residuals({name}_state *s) {{
-    {model}_output *const out = &s->{own}_out;
-{hold}    const bool known = {model}_step(&s->{own}, s->{own}_in, out) <= EDP_WARMING;
-    for (uint32_t i = 0; i < {residuals}u; i++) {{
-        const uint32_t back = (s->{own}_at + {length}u - {own}_delays[i]) % {length}u;
-        const bool due = s->{own}_seen >= {own}_delays[i];
-        s->{own}_past[s->{own}_at][i] = known ? (&out->prediction[0][0])[{own}_results[i]] : (float)edp_unknown();
-{width}        s->residuals[{first}u + i] = due ? {value} : (float)edp_unknown();
-    }}
-    s->{own}_at = (s->{own}_at + 1u) % {length}u;
-    s->{own}_seen += (s->{own}_seen < {length}u) ? 1u : 0u;
-}}
-"""
-WIDTH = """\
-        const float half = 0.5f * ((&out->upper[0][0][0])[{own}_results[i]] - (&out->lower[0][0][0])[{own}_results[i]]);
-        s->{own}_width[s->{own}_at][i] = (half > {least}) ? half : {least};
-"""
-TWIN = """
-/* A twin a group of its answers, whose ports are free but for a tick now and then. */
-static void {own}_residuals({name}_state *s) {{
-    {model}_output out;
-    float row[{inputs}];
-    uint32_t at = {first}u;
-    const bool apart = (s->{own}_ticks >= {prefix}u) && (((s->{own}_ticks - {prefix}u) % {period}u) != 0u);
-{hold}    for (uint32_t g = 0; g < {groups}u; g++) {{
-        edp_copy(s->{own}_in, {reads}u, row);
-        edp_fill(1.0f, {answers}u, &row[{reads}u]);
-        for (uint32_t i = {own}_group_from[g]; i < {own}_group_from[g + 1u]; i++) {{
-            const uint32_t answer = {own}_groups[i];
-            const float expected = (s->{own}_ticks > 0u) ? s->{own}_expected[i] : row[{commands}u + answer];
-            s->residuals[at] = row[{commands}u + answer] - expected;
-            at++;
-            if (apart) {{
-                row[{commands}u + answer] = 0.0f;
-                row[{reads}u + answer] = 0.0f;
-            }}
-        }}
-        const bool known = {model}_step(&s->{own}[g], row, &out) <= EDP_WARMING;
-        for (uint32_t i = {own}_group_from[g]; i < {own}_group_from[g + 1u]; i++) {{
-            s->{own}_expected[i] = known ? out.prediction[0][{own}_groups[i]] : (float)edp_unknown();
-        }}
-    }}
-    /* The count stays small for ever, and within a period tells the same. */
-    s->{own}_ticks++;
-    s->{own}_ticks -= (s->{own}_ticks >= ({prefix}u + {period}u)) ? {period}u : 0u;
-}}
-"""
-BALANCE = """
-/* Levels less the integrals of their rates; what is older fades, and what happened while a value was missing is not
-   known. */
-static void {own}_residuals({name}_state *s) {{
-{hold}    for (uint32_t i = 0; i < {residuals}u; i++) {{
-        const double level = (double)s->{own}_in[{own}_levels[i]];
-        const double step = (double)s->{own}_in[{own}_rates[i]] * {own}_steps[i];
-        const bool now = s->there[{own}_reads[{own}_levels[i]]];
-        const bool whole = s->{own}_began && now && s->{own}_known[i] && s->there[{own}_reads[{own}_rates[i]]];
-        const double change = whole ? ((level - s->{own}_level[i]) - step) : 0.0;
-        s->{own}_sum[i] = ({own}_left[i] * s->{own}_sum[i]) + change;
-        s->{own}_level[i] = level;
-        s->{own}_known[i] = now;
-        s->residuals[{first}u + i] = (float)s->{own}_sum[i];
-    }}
-    s->{own}_began = true;
-}}
-"""
+NO_PLACE = 0xFFFF
+"""A command that is not there."""
+DOUBTFUL = 1
+"""Place of the relief, among `RELIEFS`, beyond which a balance of flow is uncertain."""
 
 
-class SourceCode(Protocol):
+class SourceCode(ABC):
     """A source in C.
 
-    Attributes:
-        model: its network; None without one.
+    Args:
+        own: prefix of its names within the monitor.
+        reads: inputs of the monitor that it is fed, in its order.
+        middle: what stands in for each of them before it was ever there, shape (reads,).
         residuals: how many it has.
     """
 
-    model: Model | None
-    residuals: int
+    model: Model | None = None
+    """Its network; None without one."""
+    template: str
+    """Name of the template of its function."""
 
+    def __init__(self, own: str, reads: Sequence[int], middle: NDArray[np.float32], residuals: int) -> None:
+        self.own, self.reads, self.middle, self.residuals = own, tuple(reads), middle, residuals
+
+    @abstractmethod
     def fields(self) -> list[str]:
         """Members of the monitor's state."""
-        ...
 
-    def constants(self, tables: MonitorTables) -> None:
+    @property
+    @abstractmethod
+    def bytes(self) -> int:
+        """Size of these members without what the layers of a network remember."""
+
+    @abstractmethod
+    def constants(self, tables: ConstantTables) -> None:
         """Enter the constants."""
-        ...
 
-    def code(self, name: str, first: int) -> str:
-        """Return the function that fills the residuals beginning at `first`."""
-        ...
+    @abstractmethod
+    def forget(self) -> list[str]:
+        """Return the statements after a gap, which invalidate the stored past."""
+
+    @abstractmethod
+    def blanks(self, first: int) -> dict[str, object]:
+        """Return the values of the template of the function that are its own; `first` as in `code`."""
 
     def reset(self) -> list[str]:
         """Statements that set the state at the start."""
-        ...
+        return [f"edp_copy({self.own}_middle, {len(self.reads)}u, s->{self.own}_in);"]
 
-    def forget(self) -> list[str]:
-        """Return the statements after a gap, which invalidate the stored past."""
-        ...
+    def code(self, name: str, first: int) -> Code:
+        """Return the function that fills the residuals of the monitor `name` beginning at `first`."""
+        reads, blanks = len(self.reads), self.blanks(first)
+        hold = self.fill_template("hold", {"count": reads})
+        common = {"name": name, "hold": hold, "first": first, "residuals": self.residuals, "reads": reads}
+        return self.fill_template(self.template, {**common, **blanks})
+
+    def fill_template(self, template: str, values: Mapping[str, object]) -> Code:
+        """Return a filled template of a source."""
+        return fill_file(f"monitor/templates/source_{template}.c.in", {"own": self.own, **values})
 
 
-class NetworkCode:
+class NetworkCode(SourceCode):
     """A virtual sensor or a look-ahead network.
 
     Args:
@@ -158,16 +89,16 @@ class NetworkCode:
     """
 
     def __init__(self, part: NetworkPart, own: str, model: str) -> None:
-        self.part, self.own = part, own
-        self.model: Model | None = make_model(model, part.bundle)
-        self.prefix = model
-        self.residuals = len(part.judged)
+        super().__init__(own, part.reads, part.middle, len(part.judged))
+        self.part, self.prefix = part, model
+        self.model = make_model(model, part.bundle)
         self.ahead = part.scaled or max(part.delays) > 0
         self.turns = part.every > 1
+        self.template = "ahead" if self.ahead else "turns" if self.turns else "network"
 
     def fields(self) -> list[str]:
         """See `SourceCode`."""
-        lines = [f"{self.prefix}_state {self.own};", f"float {self.own}_in[{len(self.part.reads)}];"]
+        lines = [f"{self.prefix}_state {self.own};", f"float {self.own}_in[{len(self.reads)}];"]
         lines += [f"{self.prefix}_output {self.own}_out; /* to be read: what the network said last */"]
         if self.ahead:
             lines += [f"uint32_t {self.own}_at;", f"uint32_t {self.own}_seen;"]
@@ -180,40 +111,43 @@ class NetworkCode:
             ]
         return lines
 
-    def constants(self, tables: MonitorTables) -> None:
+    @property
+    def bytes(self) -> int:
+        """See `SourceCode`."""
+        part, task = self.part, self.part.bundle.task
+        intervals = 2 * len(part.bundle.predictor.output.coverages)
+        out = len(task.targets) * len(task.horizons) * (1 + intervals)
+        ring = (max(part.delays) + 1) * self.residuals if max(part.delays) else 0
+        last = 1 + self.residuals if self.turns else 0
+        return 4 * (len(self.reads) + out + ring * (2 if part.scaled else 1) + last) + _network_bytes(part.bundle)
+
+    def constants(self, tables: ConstantTables) -> None:
         """See `SourceCode`."""
         part = self.part
-        tables.places(f"{self.own}_reads", part.reads)
+        tables.places(f"{self.own}_reads", self.reads)
         tables.places(f"{self.own}_judged", part.judged)
         tables.places(f"{self.own}_results", part.results)
-        tables.floats(f"{self.own}_middle", part.middle)
+        tables.floats(f"{self.own}_middle", self.middle)
         if self.ahead:
             tables.places(f"{self.own}_delays", part.delays)
 
-    def code(self, name: str, first: int) -> str:
+    def blanks(self, first: int) -> dict[str, object]:
         """See `SourceCode`."""
         own, part = self.own, self.part
         value = f"(s->row[{own}_judged[i]] - s->{own}_past[back][i])"
-        blanks: dict[str, object] = {
-            "own": own,
-            "name": name,
+        width = self.fill_template("ahead_width", {"least": number(part.least_width)}) if part.scaled else Code("")
+        return {
             "model": self.prefix,
-            "hold": HOLD.format(own=own, count=len(part.reads)),
-            "residuals": self.residuals,
-            "first": first,
-            "width": WIDTH.format(own=own, least=number(part.least_width)) if part.scaled else "",
-            "value": f"({value} / s->{own}_width[back][i])" if part.scaled else value,
+            "width": width,
+            "value": Code(f"({value} / s->{own}_width[back][i])" if part.scaled else value),
             "length": max(part.delays) + 1,
             "every": part.every,
-            "reads": len(part.reads),
         }
-        return (AHEAD if self.ahead else TURNS if self.turns else NETWORK).format(**blanks)
 
     def reset(self) -> list[str]:
         """See `SourceCode`."""
-        filled_inputs = f"edp_copy({self.own}_middle, {len(self.part.reads)}u, s->{self.own}_in);"
         due = [f"s->{self.own}_due = {self.part.first}u;"] if self.turns else []
-        return [f"{self.prefix}_reset(&s->{self.own});", filled_inputs, *due, *self._unknown()]
+        return [f"{self.prefix}_reset(&s->{self.own});", *super().reset(), *due, *self._unknown()]
 
     def forget(self) -> list[str]:
         """See `SourceCode`."""
@@ -225,44 +159,45 @@ class NetworkCode:
         return [f"edp_fill((float)edp_unknown(), {self.residuals}u, s->{self.own}_kept);"] if self.turns else []
 
 
-class BalanceCode:
-    """Balances; see `BalancePart`."""
+class BalanceCode(SourceCode):
+    """Levels less the integrals of their rates, with sums that fade."""
 
-    def __init__(self, part: BalancePart, own: str) -> None:
-        self.part, self.own = part, own
-        self.model: Model | None = None
-        self.residuals = len(part.levels)
+    template = "balance"
+
+    def __init__(self, source: Balances, own: str, columns: Mapping[str, int]) -> None:
+        super().__init__(own, [columns[name] for name in source.inputs], source.middle, len(source.pairs))
+        self.source = source
 
     def fields(self) -> list[str]:
         """See `SourceCode`."""
         sums = [f"double {self.own}_{what}[{self.residuals}];" for what in ("level", "sum")]
         flags = f"bool {self.own}_known[{self.residuals}];"
-        return [f"float {self.own}_in[{len(self.part.reads)}];", *sums, f"bool {self.own}_began;", flags]
+        return [f"float {self.own}_in[{len(self.reads)}];", *sums, f"bool {self.own}_began;", flags]
 
-    def constants(self, tables: MonitorTables) -> None:
+    @property
+    def bytes(self) -> int:
         """See `SourceCode`."""
-        part = self.part
-        for what, places in (("reads", part.reads), ("levels", part.levels), ("rates", part.rates)):
+        return 4 * len(self.reads) + 17 * self.residuals + 7
+
+    def constants(self, tables: ConstantTables) -> None:
+        """See `SourceCode`."""
+        source, (levels, rates) = self.source, self.source.pairs.T.tolist()
+        for what, places in (("reads", self.reads), ("levels", levels), ("rates", rates)):
             tables.places(f"{self.own}_{what}", places)
-        tables.floats(f"{self.own}_middle", part.middle)
-        tables.doubles(f"{self.own}_steps", part.steps)
-        tables.doubles(f"{self.own}_left", part.left)
+        tables.floats(f"{self.own}_middle", self.middle)
+        tables.doubles(f"{self.own}_steps", source.gains / source.rate_hz)
+        tables.doubles(f"{self.own}_left", 1.0 - 1.0 / (source.memories_s * source.rate_hz))
 
-    def code(self, name: str, first: int) -> str:
+    def blanks(self, first: int) -> dict[str, object]:
         """See `SourceCode`."""
-        hold = HOLD.format(own=self.own, count=len(self.part.reads))
-        return BALANCE.format(own=self.own, name=name, hold=hold, residuals=self.residuals, first=first)
-
-    def reset(self) -> list[str]:
-        """See `SourceCode`."""
-        return [f"edp_copy({self.own}_middle, {len(self.part.reads)}u, s->{self.own}_in);"]
+        return {}
 
     def forget(self) -> list[str]:
         """See `SourceCode`."""
         return [f"s->{self.own}_began = false;", f"edp_clear({self.residuals}u, s->{self.own}_sum);"]
 
 
-class TwinCode:
+class TwinCode(SourceCode):
     """A twin with free ports; see `TwinPart`.
 
     Args:
@@ -271,49 +206,47 @@ class TwinCode:
         model: C prefix of its plant.
     """
 
+    template = "twin"
+
     def __init__(self, part: TwinPart, own: str, model: str) -> None:
-        self.part, self.own, self.prefix = part, own, model
-        self.model: Model | None = make_model(model, part.bundle)
-        self.residuals = sum(map(len, part.groups))
+        super().__init__(own, part.reads, part.middle, sum(map(len, part.groups)))
+        self.part, self.prefix = part, model
+        self.model = make_model(model, part.bundle)
 
     def fields(self) -> list[str]:
         """See `SourceCode`."""
         lines = [f"{self.prefix}_state {self.own}[{len(self.part.groups)}];", f"uint32_t {self.own}_ticks;"]
-        return [
-            *lines,
-            f"float {self.own}_in[{len(self.part.reads)}];",
-            f"float {self.own}_expected[{self.residuals}];",
-        ]
+        return [*lines, f"float {self.own}_in[{len(self.reads)}];", f"float {self.own}_expected[{self.residuals}];"]
 
-    def constants(self, tables: MonitorTables) -> None:
+    @property
+    def bytes(self) -> int:
+        """See `SourceCode`."""
+        return 4 * (len(self.reads) + self.residuals + 1) + len(self.part.groups) * _network_bytes(self.part.bundle)
+
+    def constants(self, tables: ConstantTables) -> None:
         """See `SourceCode`."""
         groups = self.part.groups
-        tables.places(f"{self.own}_reads", self.part.reads)
+        tables.places(f"{self.own}_reads", self.reads)
         tables.places(f"{self.own}_groups", [answer for group in groups for answer in group])
         tables.places(f"{self.own}_group_from", np.cumsum([0, *map(len, groups)]).tolist())
-        tables.floats(f"{self.own}_middle", self.part.middle)
+        tables.floats(f"{self.own}_middle", self.middle)
 
-    def code(self, name: str, first: int) -> str:
+    def blanks(self, first: int) -> dict[str, object]:
         """See `SourceCode`."""
-        part, reads, answers = self.part, len(self.part.reads), len(self.part.bundle.task.targets)
-        return TWIN.format(
-            own=self.own,
-            name=name,
-            model=self.prefix,
-            hold=HOLD.format(own=self.own, count=reads),
-            first=first,
-            inputs=reads + answers,
-            reads=reads,
-            answers=answers,
-            commands=reads - answers,
-            groups=len(part.groups),
-            prefix=part.prefix,
-            period=part.period,
-        )
+        part, reads, answers = self.part, len(self.reads), len(self.part.bundle.task.targets)
+        return {
+            "model": self.prefix,
+            "inputs": reads + answers,
+            "answers": answers,
+            "commands": reads - answers,
+            "groups": len(part.groups),
+            "prefix": part.prefix,
+            "period": part.period,
+        }
 
     def reset(self) -> list[str]:
         """See `SourceCode`."""
-        return [*self.forget(), f"edp_copy({self.own}_middle, {len(self.part.reads)}u, s->{self.own}_in);"]
+        return [*self.forget(), *super().reset()]
 
     def forget(self) -> list[str]:
         """See `SourceCode`."""
@@ -321,8 +254,112 @@ class TwinCode:
         return [*(f"{self.prefix}_reset(&s->{self.own}[{g}]);" for g in groups), f"s->{self.own}_ticks = 0u;"]
 
 
-def source_code(part: SourcePart, index: int, name: str) -> SourceCode:
-    """Return the code writer for one residual source of the monitor `name`.
+class FlowCode(SourceCode):
+    """Balances of flow: spool positions from commands, opening curves, and one residual per chamber."""
+
+    template = "flow"
+
+    def __init__(self, source: FlowBalances, own: str, columns: Mapping[str, int]) -> None:
+        super().__init__(own, [columns[name] for name in source.inputs], source.middle, len(source.chambers))
+        self.source = source
+        self.length = source.spools.memory + 1
+        """Number of stored rows, including the present one."""
+
+    def fields(self) -> list[str]:
+        """See `SourceCode`."""
+        own, spools, reads = self.own, len(self.source.spools.gain), len(self.reads)
+        memory = [f"float {own}_in[{reads}];", f"float {own}_past[{self.length}][{reads}];", f"uint32_t {own}_at;"]
+        stages = [f"float {own}_{stage}[{spools}][2];" for stage in ("first", "second")]
+        return [*memory, *stages, f"float {own}_played[{spools}];", f"bool {own}_began;"]
+
+    @property
+    def bytes(self) -> int:
+        """See `SourceCode`."""
+        return 4 * ((self.length + 1) * len(self.reads) + 5 * len(self.source.spools.gain)) + 8
+
+    def constants(self, tables: ConstantTables) -> None:
+        """See `SourceCode`."""
+        spools, chambers, own = self.source.spools, self.source.chambers, self.own
+        tables.places(f"{own}_reads", self.reads)
+        for name, columns in (("extend", spools.extend), ("retract", spools.retract)):
+            tables.places(f"{own}_{name}", map(_place, columns.tolist()))
+        whole = np.floor(spools.dead).astype(int)
+        tables.places(f"{own}_late", (whole + BACK).tolist())
+        tables.floats(f"{own}_part", spools.dead - whole)
+        tables.floats(f"{own}_middle", self.middle)
+        for name in ("gain", "stages", "play"):
+            tables.floats(f"{own}_{name}", getattr(spools, name))
+        tables.floats(f"{own}_knots", KNOTS)
+        tables.floats(f"{own}_reliefs", RELIEFS)
+        for name in ("values", "slopes", "lines", "doubts"):
+            tables.floats(f"{own}_{name}", np.concatenate([getattr(chamber, name) for chamber in chambers]))
+        tables.places(f"{own}_pumps", [pump for chamber in chambers for pump in chamber.spots.supplies])
+        tables.text(fill_file("monitor/templates/source_flow.h.in", {"own": own}).rstrip())
+        paths = np.cumsum([0, *(len(chamber.values) for chamber in chambers)]).tolist()
+        pumps = np.cumsum([0, *(len(chamber.spots.supplies) for chamber in chambers)]).tolist()
+        rows = [self._chamber(index, chamber, paths[index], pumps[index]) for index, chamber in enumerate(chambers)]
+        tables.text(table(f"{own}_chamber", f"{own}_chambers[{len(rows)}]", rows))
+
+    def _chamber(self, index: int, chamber: ChamberCurves, path: int, pump: int) -> list[str]:
+        """Return the members of a chamber's struct; its first curve is `path`, its first pump `pump`."""
+        spots = chamber.spots
+        second = spots.spools[1] if len(spots.spools) > 1 else NO_PLACE
+        places = [spots.velocity, spots.own, spots.other, _place(spots.stroke)]
+        places += [spots.spools[0], second, path, pump, len(spots.supplies)]
+        numbers = (spots.end, spots.far, 1.0 / spots.cushion, spots.tank)
+        lines = f"&{self.own}_lines[{index * len(chamber.lines)}]"
+        doubts = f"&{self.own}_doubts[{index * len(chamber.doubts)}]"
+        return [*unsigned_literals(places), bool_literal(spots.sign > 0), *map(number, numbers), lines, doubts]
+
+    def blanks(self, first: int) -> dict[str, object]:
+        """See `SourceCode`."""
+        source, oil = self.source, Code("")
+        if source.oil is not None:
+            values = {
+                "place": source.oil.column,
+                "low": number(source.oil.low),
+                "high": number(source.oil.high),
+                "residuals": self.residuals,
+                "first": first,
+            }
+            oil = self.fill_template("flow_oil", values)
+        return {
+            "oil": oil,
+            "length": self.length,
+            "spools": len(source.spools.gain),
+            "knots": len(KNOTS),
+            "reliefs": len(RELIEFS),
+            "back": BACK,
+            "none": NO_PLACE,
+            "smooth": number(SMOOTH),
+            "cavity": number(CAVITY),
+            "empty": number(EMPTY),
+            "doubtful": DOUBTFUL,
+            "per_tick": number(source.per_tick),
+        }
+
+    def forget(self) -> list[str]:
+        """See `SourceCode`."""
+        return [f"s->{self.own}_began = false;"]
+
+
+def _network_bytes(bundle: Bundle) -> int:
+    """Counters and the last inputs, which the state of every network has in addition to what its layers remember."""
+    return 4 * (8 + len(bundle.inputs))
+
+
+def _place(column: int) -> int:
+    return NO_PLACE if column < 0 else column
+
+
+def source_code(part: SourcePart, index: int, name: str, columns: Mapping[str, int]) -> SourceCode:
+    """Return the code writer for one residual source of a monitor.
+
+    Args:
+        part: the source.
+        index: its number among the sources.
+        name: of the monitor.
+        columns: place of each input of the monitor by its name.
 
     Raises:
         ExportError: its network has no form in C.
@@ -331,12 +368,6 @@ def source_code(part: SourcePart, index: int, name: str) -> SourceCode:
         return NetworkCode(part, f"n{index}", f"{name}_n{index}")
     if isinstance(part, TwinPart):
         return TwinCode(part, f"t{index}", f"{name}_t{index}")
-    if isinstance(part, FlowPart):
-        return FlowCode(part, f"f{index}", HOLD.format(own=f"f{index}", count=len(part.reads)))
-    return BalanceCode(part, f"b{index}")
-
-
-def reads_tables(reads: Sequence[tuple[int, ...]], tables: MonitorTables) -> None:
-    """Add the table of inputs of all residuals, concatenated, and the table of their starts."""
-    tables.places("reads", [column for columns in reads for column in columns])
-    tables.places("reads_from", np.cumsum([0, *(len(columns) for columns in reads)]).tolist())
+    if isinstance(part, FlowBalances):
+        return FlowCode(part, f"f{index}", columns)
+    return BalanceCode(part, f"b{index}", columns)

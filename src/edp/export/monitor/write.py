@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -14,27 +12,32 @@ import numpy as np
 from edp import __version__
 from edp.errors import ExportError
 from edp.export.c.model import RUNTIME
+from edp.export.c.tables import ConstantTables
 from edp.export.c.target import check_name, core_files
-from edp.export.c.text import indented, number
-from edp.export.escape import C_SIGNIFICANT, Code, c_comment, c_names, fill
+from edp.export.c.text import (
+    bool_literal,
+    channel_enumeration,
+    double_number,
+    enumeration,
+    indented,
+    number,
+    struct,
+    table,
+    unsigned_literals,
+)
+from edp.export.escape import C_SIGNIFICANT, Code, c_comment, fill_file, package_text
 from edp.export.folder import write_export
-from edp.export.monitor.golden import JUDGED_BLOCKS, MISSING, SEED, SHIFT, golden_blocks
-from edp.export.monitor.numbers import MonitorTables, double_number, golden_header
-from edp.export.monitor.parts import PIECE, ROW, MonitorParts, WatchPart, pieces
-from edp.export.monitor.sources import SourceCode, reads_tables, source_code
-from edp.export.si_names import si_channels
+from edp.export.monitor.golden import JUDGED_BLOCKS, MISSING, SEED, SHIFT, golden_blocks, golden_header
+from edp.export.monitor.parts import DETECTORS, ROW, MonitorParts, pieces
+from edp.export.monitor.sources import SourceCode, source_code
 from edp.export.sizes import check_sizes
+from edp.monitor.conditioning import GROSS, POINT_LIMIT
+from edp.monitor.monitor import IMPOSSIBLE
 from edp.networks.input_range import HOLD_TICKS
 
 OWN = ("edp_chain.h", "edp_chain.c")
 LONGEST_NAME = 20
 """Of a monitor: names of its networks and functions are made from it."""
-DETECTORS = {
-    "cusum": "EDP_CUSUM",
-    "ewma": "EDP_EWMA",
-    "glr": "EDP_GLR",
-    "separate_cusums": "EDP_SEPARATE_CUSUMS",
-}
 NO_INPUT = 0xFFFF
 """Stands for a driver without a second input: `EDP_NO_INPUT`."""
 MOST_MEMORY = 2**31 - 1
@@ -62,8 +65,8 @@ class MonitorFiles:
             f"{name}.c": self._fill_template("monitor.c.in"),
             f"{name}_numbers.h": self._numbers(),
         }
-        texts |= {file: _own(f"runtime/{file}") for file in OWN}
-        texts |= {file: resources.files("edp.export.c").joinpath(f"runtime/{file}").read_text() for file in RUNTIME}
+        texts |= {file: package_text(f"monitor/runtime/{file}") for file in OWN}
+        texts |= {file: package_text(f"c/runtime/{file}") for file in RUNTIME}
         for source in self.sources:
             texts |= {} if source.model is None else core_files(source.model)
         return texts
@@ -88,87 +91,82 @@ class MonitorFiles:
     def slices(self) -> int:
         """Parts of the work on a block: operating point, residuals and their summaries, watches, verdict, evidence."""
         residuals = (self.parts.each + 1) * len(self.parts.residuals)
-        evidence = len(pieces(self.parts.summaries, ROW))
-        return 2 + residuals + sum(map(_watch_slices, self.parts.chain.watches)) + evidence
+        evidence = len(pieces(self.parts.chain.summaries.width, ROW))
+        return 2 + residuals + sum(view.slices for view in self.parts.watches) + evidence
 
     def _numbers(self) -> Code:
         head = f"/* Constants of {self.name}. Written by EDP {__version__}; do not edit. */\n"
         return Code(head + self.tables.finished())
 
     @cached_property
-    def tables(self) -> MonitorTables:
+    def tables(self) -> ConstantTables:
         """The constants."""
-        chain, tables = self.parts.chain, MonitorTables()
-        reads_tables(self.parts.reads, tables)
+        chain, tables = self.parts.chain, ConstantTables("monitor")
+        summaries, conditioning = chain.summaries, chain.conditioning
+        tables.places("reads", [column for columns in self.parts.reads for column in columns])
+        tables.places("reads_from", np.cumsum([0, *map(len, self.parts.reads)]).tolist())
         for source in self.sources:
             source.constants(tables)
         for name in ("centre", "spread", "scale", "change"):
-            tables.doubles(name, getattr(chain, name))
+            tables.doubles(name, getattr(summaries, name))
         for name in ("channel", "level", "moving"):
-            tables.places(name, getattr(chain, name))
-        pairs = chain.drivers.transpose(1, 0, 2).reshape(-1, 2)
+            tables.places(name, getattr(summaries, name).tolist())
+        pairs = summaries.drivers.transpose(1, 0, 2).reshape(-1, 2)
         tables.places("driver_first", pairs[:, 0].tolist())
         tables.places("driver_second", np.where(pairs[:, 1] < 0, NO_INPUT, pairs[:, 1]).tolist())
-        sizes = (
-            chain.block,
-            len(chain.centre),
-            len(chain.scale),
-            len(chain.level),
-            len(chain.moving),
-            len(chain.drivers),
-        )
-        arrays = "centre, spread, scale, change, channel, level, moving, driver_first, driver_second"
-        named = ", ".join([*(f"{size}u" for size in sizes), arrays])
-        tables.text(f"static const edp_blocks blocks = {{{named}}};")
-        for name in ("point_offset", "point_width", "usual", "wide", "least"):
-            tables.singles(name, getattr(chain, name))
-        self._enter_watches(tables)
-        self._enter_scalars(tables)
-        return tables
-
-    def _enter_watches(self, tables: MonitorTables) -> None:
-        rows = []
-        for index, watch in enumerate(self.parts.chain.watches):
-            tables.singles(f"mean_{index}", watch.mean)
-            tables.singles(f"matrix_{index}", np.ascontiguousarray(watch.matrix.T))
-            weight = watch.option if watch.detector == "ewma" else 1.0
-            sizes = f"{self.parts.summaries}u, {watch.directions}u, {watch.rows}u"
-            options = ", ".join(map(double_number, (watch.option, (2.0 - weight) / weight, watch.scale)))
-            own = "true" if watch.own else "false"
-            rows.append(f"    {{{DETECTORS[watch.detector]}, {own}, {sizes}, {options}, mean_{index}, matrix_{index}}}")
-        body = ",\n".join(rows)
-        tables.text(f"static const edp_watch watches[{len(rows)}] = {{\n{body}\n}};")
-        memories = np.cumsum([0, *map(_memory, self.parts.chain.watches)]).tolist()
+        counted = (summaries.centre, summaries.scale, summaries.level, summaries.moving, summaries.drivers)
+        arrays = ("centre", "spread", "scale", "change", "channel", "level", "moving", "driver_first", "driver_second")
         tables.text(
-            f"static const uint32_t memory_from[{len(rows)}] = {{{', '.join(f'{m}u' for m in memories[:-1])}}};"
+            struct("edp_blocks", "blocks", [*unsigned_literals((summaries.block, *map(len, counted))), *arrays])
         )
-        first = 1 + (self.parts.each + 1) * len(self.parts.residuals)
-        starts = first + np.cumsum([0, *map(_watch_slices, self.parts.chain.watches)])
-        slice_text = ", ".join(f"{start}u" for start in starts.tolist())
-        tables.text(f"static const uint32_t slices_from[{len(starts)}] = {{{slice_text}}};")
-
-    def _enter_scalars(self, tables: MonitorTables) -> None:
-        chain = self.parts.chain
+        lines = {
+            "point_offset": conditioning.offset,
+            "point_width": conditioning.width,
+            "usual": conditioning.usual,
+            "wide": conditioning.spread,
+            "least": conditioning.floor,
+        }
+        for name, values in lines.items():
+            tables.singles(name, values)
+        self._enter_watches(tables)
         scalars = {
-            "IMPOSSIBLE": chain.impossible,
-            "POINT_LIMIT": chain.point_limit,
-            "CLIP": chain.clip,
-            "GROSS": chain.gross,
-            "DRIFT_STEP": chain.drift_step,
-            "DRIFT_MOST": chain.drift_most,
+            "IMPOSSIBLE": IMPOSSIBLE,
+            "POINT_LIMIT": POINT_LIMIT,
+            "CLIP": conditioning.clip,
+            "GROSS": GROSS,
+            "DRIFT_STEP": chain.drift.step,
+            "DRIFT_MOST": chain.drift.most,
             "ALARM_LIMIT": chain.limit,
             "QUIET": chain.quiet,
         }
         for name, value in scalars.items():
             tables.text(f"#define {name} {double_number(value)}")
         tables.text(f"#define POINTS {self.parts.points}u")
-        tables.text(f"#define BLOCK_S {number(chain.block / self.parts.rate_hz)}")
+        tables.text(f"#define BLOCK_S {number(summaries.block / self.parts.rate_hz)}")
+        return tables
+
+    def _enter_watches(self, tables: ConstantTables) -> None:
+        watches, rows = self.parts.watches, []
+        for index, view in enumerate(watches):
+            tables.singles(f"mean_{index}", view.watch.mean)
+            tables.singles(f"matrix_{index}", np.ascontiguousarray(view.watch.matrix.T))
+            weight = view.option if view.detector == "ewma" else 1.0
+            sizes = unsigned_literals((self.parts.chain.summaries.width, view.directions, view.rows))
+            options = map(double_number, (view.option, (2.0 - weight) / weight, view.watch.scale))
+            arrays = (f"mean_{index}", f"matrix_{index}")
+            rows.append([DETECTORS[view.detector], bool_literal(view.watch.own), *sizes, *options, *arrays])
+        tables.text(table("edp_watch", f"watches[{len(rows)}]", rows))
+        memories = np.cumsum([0, *(view.memory for view in watches[:-1])]).tolist()
+        tables.text(struct("uint32_t", f"memory_from[{len(memories)}]", unsigned_literals(memories)))
+        first = 1 + (self.parts.each + 1) * len(self.parts.residuals)
+        starts = (first + np.cumsum([0, *(view.slices for view in watches)])).tolist()
+        tables.text(struct("uint32_t", f"slices_from[{len(starts)}]", unsigned_literals(starts)))
 
     def _fill_template(self, template: str) -> Code:
-        return fill(_own(f"templates/{template}"), self._values())
+        return fill_file(f"monitor/templates/{template}", self._values())
 
     def _values(self) -> dict[str, object]:
-        parts, chain = self.parts, self.parts.chain
+        parts, chain, summaries = self.parts, self.parts.chain, self.parts.chain.summaries
         models = [source.model for source in self.sources if source.model is not None]
         checks = "".join(f" && {model.name}_check()" for model in models)
         headers = sorted({"edp_chain.h", "edp_runtime.h", *(f"{model.name}.h" for model in models)})
@@ -181,27 +179,27 @@ class MonitorFiles:
             "hash": parts.digest,
             # Odd, so that zeroed memory does not look like a state that was reset.
             "marker": int(hashlib.blake2b(parts.digest.encode(), digest_size=4).hexdigest(), 16) | 1,
-            "crc": self.tables.crc,
+            "crc": self.tables.double_crc,
             "rate": number(parts.rate_hz),
             "rate_hz": f"{parts.rate_hz:g}",
             "tick_ms": f"{1000 / parts.rate_hz:g}",
-            "block": chain.block,
-            "block_s": f"{chain.block / parts.rate_hz:g}",
+            "block": summaries.block,
+            "block_s": f"{summaries.block / parts.rate_hz:g}",
             "settle": chain.settle,
             "hold": HOLD_TICKS,
-            "limit": f"{chain.impossible:.0f}",
+            "limit": f"{IMPOSSIBLE:.0f}",
             "inputs": len(parts.inputs),
             "residuals": len(parts.residuals),
             "each": parts.each,
-            "drivers": len(chain.drivers),
-            "levels": len(chain.level),
-            "moving": len(chain.moving),
+            "drivers": len(summaries.drivers),
+            "levels": len(summaries.level),
+            "moving": len(summaries.moving),
             "points": max(1, parts.points),
-            "watches": len(chain.watches),
-            "widest": max(watch.directions for watch in chain.watches),
-            "memory": sum(map(_memory, chain.watches)),
+            "watches": len(parts.watches),
+            "widest": max(view.directions for view in parts.watches),
+            "memory": sum(view.memory for view in parts.watches),
             "slices": self.slices,
-            "slices_per_tick": -(-self.slices // chain.block),
+            "slices_per_tick": -(-self.slices // summaries.block),
             "includes": Code("\n".join(f'#include "{file}"' for file in headers)),
             "cost": self._cost(),
             "check_networks": Code(checks),
@@ -224,41 +222,24 @@ class MonitorFiles:
     @property
     def double_operations(self) -> int:
         """Number of double operations per sample on average; + - * / each count as one."""
-        chain = self.parts.chain
-        summaries, points = self.parts.summaries, self.parts.points
+        summaries, points = self.parts.chain.summaries, self.parts.points
         tick = (
-            (14 + 5 * len(chain.drivers)) * len(chain.scale)
-            + 2 * len(chain.centre)
-            + len(chain.level)
-            + len(chain.moving)
+            (14 + 5 * len(summaries.drivers)) * len(summaries.scale)
+            + 2 * len(summaries.centre)
+            + len(summaries.level)
+            + len(summaries.moving)
         )
-        white = sum(2 * watch.matrix.size + 5 * _memory(watch) for watch in chain.watches)
-        return tick + round((summaries * (4 * points + 12) + white) / chain.block)
+        white = sum(2 * view.watch.matrix.size + 5 * view.memory for view in self.parts.watches)
+        return tick + round((summaries.width * (4 * points + 12) + white) / summaries.block)
 
     def _enums(self) -> dict[str, Code]:
         upper, parts = self.name.upper(), self.parts
-        most = C_SIGNIFICANT - len(f"{upper}_RES_")
-        inputs = zip(c_names((c.name for c in si_channels(parts.inputs)), most), parts.inputs, strict=True)
-        residuals = zip(c_names(parts.residuals, most), parts.residuals, strict=True)
-        watches = enumerate(parts.chain.watches)
+        longest = C_SIGNIFICANT - len(f"{upper}_RES_")
+        views = [f"{view.detector}, {view.directions} directions" for view in parts.watches]
         return {
-            "input_enum": Code(
-                "\n".join(
-                    f"    {upper}_IN_{own} = {i}, /* {c_comment('; '.join((channel.unit, channel.description)))} */"
-                    for i, (own, channel) in enumerate(inputs)
-                )
-            ),
-            "residual_enum": Code(
-                "\n".join(
-                    f"    {upper}_RES_{own} = {i}, /* {c_comment(text)} */" for i, (own, text) in enumerate(residuals)
-                )
-            ),
-            "watch_enum": Code(
-                "\n".join(
-                    f"    {upper}_STAT_{i} = {i}, /* {watch.detector}, {watch.directions} directions */"
-                    for i, watch in watches
-                )
-            ),
+            "input_enum": channel_enumeration(f"{upper}_IN_", parts.inputs, longest),
+            "residual_enum": enumeration(f"{upper}_RES_", parts.residuals, parts.residuals, longest),
+            "watch_enum": enumeration(f"{upper}_STAT_", map(str, range(len(views))), views),
         }
 
     def _source_texts(self) -> dict[str, Code]:
@@ -289,17 +270,6 @@ class MonitorFiles:
         }
 
 
-def _memory(watch: WatchPart) -> int:
-    return watch.directions * watch.rows
-
-
-def _watch_slices(watch: WatchPart) -> int:
-    """Return the number of calls of `edp_watch_part`: centring, whitening and detector steps."""
-    detector = len(pieces(watch.directions, PIECE)) * watch.passes
-    white = len(pieces(watch.directions, ROW)) if watch.own else watch.directions
-    return len(pieces(len(watch.mean), ROW)) + white + detector
-
-
 def monitor_files(parts: MonitorParts, name: str) -> MonitorFiles:
     """Create a monitor ready to be written.
 
@@ -313,21 +283,10 @@ def monitor_files(parts: MonitorParts, name: str) -> MonitorFiles:
     check_name(name)
     if len(name) > LONGEST_NAME:
         raise ExportError(f"name '{name}' of a monitor has {len(name)} characters; at most {LONGEST_NAME} must hold")
-    _check_detectors(parts.chain.watches)
-    memory = sum(map(_memory, parts.chain.watches))
-    check_sizes({"bytes of the detectors' memory": 8 * memory, "ticks of a block": parts.chain.block}, MOST_MEMORY)
-    sources = tuple(source_code(part, index, name) for index, part in enumerate(parts.sources))
-    files = MonitorFiles(name, parts, sources)
-    return files
-
-
-def _check_detectors(watches: Sequence[WatchPart]) -> None:
-    for watch in watches:
-        if watch.detector not in DETECTORS:
-            raise ExportError(
-                f"detector '{watch.detector}' has no form in C, since it needs exponentials; these have: "
-                f"{', '.join(DETECTORS)}. Fit the monitor with one of them"
-            )
+    memory, block = sum(view.memory for view in parts.watches), parts.chain.summaries.block
+    check_sizes({"bytes of the detectors' memory": 8 * memory, "ticks of a block": block}, MOST_MEMORY)
+    sources = (source_code(part, index, name, parts.columns) for index, part in enumerate(parts.sources))
+    return MonitorFiles(name, parts, tuple(sources))
 
 
 def write_monitor(parts: MonitorParts, name: str, folder: Path) -> list[Path]:
@@ -347,7 +306,3 @@ def write_monitor(parts: MonitorParts, name: str, folder: Path) -> list[Path]:
     """
     texts = monitor_files(parts, name).folder_texts()
     return write_export(folder, {file: text.encode() for file, text in texts.items()})
-
-
-def _own(path: str) -> str:
-    return resources.files("edp.export.monitor").joinpath(path).read_text(encoding="utf-8")

@@ -21,6 +21,8 @@ SPOILT = "spoilt"
 """The state that is 0 until an input was not finite, and NaN from then on."""
 LAST = "_next"
 """What the name of a state ends with where it comes out."""
+KINDS: frozenset[type[Layer]] = frozenset({*PLAIN, *STEPS, memory.Feed, memory.PrefixCorrection})
+"""Kinds of layers with a form in ONNX; the last two reach into other layers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +65,7 @@ def states_of(graph: Graph) -> list[State]:
 
 def refuse(layer: Layer) -> ExportError:
     """Return the error for an unsupported kind of layer."""
-    kinds: set[type[Layer]] = {*PLAIN, *STEPS, memory.Feed, memory.PrefixCorrection}
-    supported_kinds = sorted(kind.__name__ for kind in kinds)
+    supported_kinds = sorted(kind.__name__ for kind in KINDS)
     return ExportError(
         f"layer '{layer.name}' is a {type(layer).__name__}, which has no form in ONNX; these have: "
         f"{', '.join(supported_kinds)}"

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.ir.base import INPUT, Graph
+from edp.ir.arithmetic import RUNTIME
+from edp.ir.base import INPUT, Graph, LayerRun, Values
 from edp.ir.layers import Standardise
 from edp.ir.memory import Rotation
 from edp.ir.reference import Reference
@@ -17,7 +18,6 @@ from edp.ir.w8a16.balance import balanced
 from edp.ir.w8a16.moments import InputMoments
 from edp.ir.w8a16.parts import integer_part
 from edp.ir.w8a16.quantise import Formats, formats, quantise, weights_of
-from edp.ir.w8a16.single import OVER_TIME
 
 # 500 ticks are 5 s at 100 Hz: longer than the networks remember, so that a piece shows steady values.
 PIECE = 500
@@ -89,31 +89,28 @@ def pieces(recordings: Sequence[NDArray[np.floating]], ticks: int) -> list[NDArr
     return cut
 
 
-def _compute_inputs(graph: Graph, rows: NDArray[np.floating]) -> dict[str, object]:
+def _compute_inputs(graph: Graph, rows: NDArray[np.floating]) -> dict[str, Values]:
     inside = integer_part(graph)
-    values: dict[str, object] = {INPUT: np.asarray(rows, dtype=np.float32)[:, None]}
+    values: dict[str, Values] = {INPUT: np.asarray(rows, dtype=np.float32)[:, None]}
     for layer in graph.layers:
         inputs_computed = layer.inputs and set(layer.inputs) <= set(values)
-        if inputs_computed and layer.name not in inside and type(layer) in OVER_TIME:
+        if inputs_computed and layer.name not in inside and layer.bit_exact:
             memory = {slot.name: graph.start(layer.name, slot).astype(np.float32) for slot in layer.slots}
-            values[layer.name] = OVER_TIME[type(layer)](layer, memory, *(values[name] for name in layer.inputs))
+            run = LayerRun(layer.tensors(), memory, {}, RUNTIME)
+            values[layer.name] = layer.over_time(run, *(values[name] for name in layer.inputs))
     return values
 
 
-def _follow(graph: Graph, rows: NDArray[np.floating], ranges: dict[str, float]) -> dict[str, Any]:
+def _follow(graph: Graph, rows: NDArray[np.floating], ranges: dict[str, float]) -> dict[str, Values]:
     """Values of every layer at every tick, ``(time, number)``."""
-    run = Reference(graph)
-    turning = [layer.name for layer in graph.layers if isinstance(layer, Rotation)]
-    seen: dict[str, list[Any]] = {}
-    for row in rows:
-        for name, values in run.step(row).items():
-            seen.setdefault(name, []).append(values)
-        for name in turning:
-            _raise(ranges, f"{name}/h", run.memory[name]["h"])
-    stacked = {name: np.stack(values) for name, values in seen.items()}
-    for name, values in stacked.items():
-        _raise(ranges, name, values)
-    return stacked
+    values = {name: value[:, 0] for name, value in Reference(graph).values(rows[:, None]).items()}
+    for name, value in values.items():
+        _raise(ranges, name, value)
+    for layer in graph.layers:
+        if isinstance(layer, Rotation):
+            # Its value is its state, which has a format of its own.
+            _raise(ranges, f"{layer.name}/h", values[layer.name])
+    return values
 
 
 def _raise(ranges: dict[str, float], name: str, values: Any) -> None:

@@ -6,18 +6,6 @@ from edp.ir import layers, memory
 from edp.ir.base import INPUT, Graph
 from edp.ir.layers import Function
 
-# Norms and attentions need sums of squares and quotients that 16-bit formats would spoil.
-FLOAT = (
-    layers.LayerNorm,
-    layers.RowAttention,
-    layers.Accumulate,
-    layers.Clip,
-    memory.WindowAttention,
-    memory.Feedback,
-    memory.Feed,
-)
-"""Kinds that stay in single precision wherever they stand: they have no weights, or a few gains."""
-
 
 def integer_part(graph: Graph) -> set[str]:
     """Layers that are computed in integer arithmetic: after the scaling of the inputs, up to the last weights.
@@ -35,7 +23,8 @@ def integer_part(graph: Graph) -> set[str]:
             before |= set(layer.inputs) | {layer.name}
     inside: set[str] = set()
     for layer in graph.layers:
-        if layer.name not in scaled or isinstance(layer, (layers.Standardise, *FLOAT)):
+        # Norms and attentions need sums of squares and quotients that 16-bit formats would spoil.
+        if layer.name not in scaled or isinstance(layer, layers.Standardise) or layer.stays_float:
             continue
         # The exponential leaves 16 bits quickly; it stays in single precision.
         exponential = isinstance(layer, layers.Activate) and layer.function is Function.EXP

@@ -1,7 +1,7 @@
 """Conversion of a float layer graph to integer layers, given the range of each value.
 
 What lies between the standardised inputs and the last weights is computed in integer arithmetic; scaling of the
-inputs, the way back to SI units and the few kinds in `FLOAT` stay in single precision.
+inputs, the way back to SI units and the few kinds with `Layer.stays_float` stay in single precision.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from edp.errors import ExportError
 from edp.ir import layers, memory
 from edp.ir.base import INPUT, Graph, Layer, Number
-from edp.ir.hydraulics import HydraulicTick
 from edp.ir.layers import BinaryOperation, Function
 from edp.ir.w8a16 import arithmetic as fixed
 from edp.ir.w8a16 import layers as quantised
@@ -27,11 +26,8 @@ from edp.ir.w8a16.rows import halves, rows, to_gates
 
 Ranges = Mapping[str, float]
 """Largest magnitude of each value, and of each slot as ``layer/slot``."""
-REFUSED: dict[type[Layer], str] = {
-    memory.LayerNormLstm: "train with the cell 'lstm', or export in float32",
-    HydraulicTick: "its equations need double precision: export in float32",
-    memory.PrefixCorrection: "train with the initial state 'zero' or 'learned', or export in float32",
-}
+ADVICE = "export in float32"
+"""For a layer without an integer form that gives no advice of its own."""
 
 
 @dataclass(frozen=True)
@@ -131,9 +127,10 @@ def quantise(graph: Graph, chosen: Formats, moments: Mapping[str, NDArray[np.flo
     work = _Work(graph, chosen.fracs, WeightRounding(chosen.weights, moments or {}), {}, [], {})
     for layer in graph.layers:
         kind = type(layer)
-        if kind in REFUSED:
+        if "integers" in layer.without or (layer.name in inside and kind not in LOWER):
+            advice = layer.without.get("integers", ADVICE)
             raise ExportError(
-                f"layer '{layer.name}' is a {kind.__name__}, which has no form in integer arithmetic; {REFUSED[kind]}"
+                f"layer '{layer.name}' is a {kind.__name__}, which has no form in integer arithmetic; {advice}"
             )
         if layer.name not in inside:
             if isinstance(layer, layers.Dense):

@@ -49,7 +49,7 @@ def read_store(folder: str | Path) -> list[Recording]:
     recordings = [recording_of(entry, index, files[entry.rows]) for entry in index.recordings]
     logs = [Path(entry.log) for entry in index.recordings]
     names = unique_names([recording.name for recording in recordings], logs)
-    named = [replace(recording, name=name).set_digest(recording.digest) for recording, name in zip(recordings, names)]
+    named = [replace(recording, name=name).with_digest(recording.digest) for recording, name in zip(recordings, names)]
     return alike(named, logs)
 
 
@@ -60,7 +60,7 @@ def recording_of(entry: StoreEntry, index: StoreIndex, values: FloatArray) -> Re
     meta = object_with(parse_json(entry.meta, where, DataError), (), where, DataError)
     stop = entry.first + entry.samples * len(channels)
     rows = values[entry.first : stop].reshape(entry.samples, len(channels))
-    return Recording(entry.name, channels, rows, entry.rate_hz, entry.source, meta).set_digest(entry.digest)
+    return Recording(entry.name, channels, rows, entry.rate_hz, entry.source, meta).with_digest(entry.digest)
 
 
 def check_store(folder: str | Path) -> StoreIndex:

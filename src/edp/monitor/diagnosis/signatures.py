@@ -14,13 +14,23 @@ from edp.errors import DataError, StorageError
 from edp.monitor.diagnosis.causes import FaultClass, class_of
 from edp.monitor.diagnosis.evidence import Scatter
 from edp.monitor.diagnosis.structure import Confusion
-from edp.monitor.stored_arrays import read_stored, shaped, write_stored
+from edp.monitor.stored_arrays import read_stored, write_stored
 from edp.settings.results import read_part
+from edp.storage.arrays import ArrayRule, checked_arrays
 from edp.storage.paths import is_there
 
 Array = NDArray[np.float64]
 FILE, SCHEMA = "dictionary", 1
 MOST_CLASSES, MOST_SUMMARIES, MOST_SIGNATURES = 5_000, 5_000, 50_000
+ARRAYS = {
+    "signatures": ArrayRule((2, "signatures", "features")),
+    "owner": ArrayRule(("signatures",)),
+    "sizes": ArrayRule(("signatures",)),
+    "mean": ArrayRule(("features",)),
+    "lasting": ArrayRule(("features",)),
+    "passing": ArrayRule(("features",)),
+    "matrix": ArrayRule(("features", "features")),
+}
 NUMBERS = ("changing", "temperature", "strange")
 
 
@@ -142,24 +152,18 @@ def load_dictionary(folder: Path, summaries: Sequence[str]) -> Dictionary | None
     try:
         classes = tuple(class_of(entry, where) for entry in entries)
         pairs = tuple(read_part(Confusion, entry, where) for entry in header.get("confusions", []))
-    except (DataError, TypeError) as error:
+        sizes = {"signatures": count, "features": 2 * len(summaries)}
+        values = checked_arrays(arrays, ARRAYS, "the dictionary", sizes)
+    except (DataError, TypeError, ValueError) as error:
         raise StorageError(f"{where} is damaged: {error}; fit the monitor again") from error
-    width = 2 * len(summaries)
-    scatter = Scatter(
-        shaped(arrays, "mean", (width,), where),
-        np.maximum(shaped(arrays, "lasting", (width,), where), 1e-12),
-        np.maximum(shaped(arrays, "passing", (width,), where), 0.0),
-        shaped(arrays, "matrix", (width, width), where),
-    )
-    owner = shaped(arrays, "owner", (count,), where).astype(np.int64)
+    lasting, passing = np.maximum(values["lasting"], 1e-12), np.maximum(values["passing"], 0.0)
+    scatter, owner = Scatter(values["mean"], lasting, passing, values["matrix"]), values["owner"].astype(np.int64)
     if set(owner.tolist()) != set(range(len(classes))):
         raise StorageError(f"{where}: signatures are not those of its classes; fit the monitor again")
     numbers = {name: _positive(header.get(name), f"{where}: {name}") for name in NUMBERS}
-    signatures = shaped(arrays, "signatures", (2, count, width), where)
-    sizes = shaped(arrays, "sizes", (count,), where)
     provenance = header.get("provenance")
     return Dictionary(
-        tuple(summaries), classes, scatter, signatures, owner, sizes, **numbers, confusions=pairs,
+        tuple(summaries), classes, scatter, values["signatures"], owner, values["sizes"], **numbers, confusions=pairs,
         provenance=provenance if isinstance(provenance, dict) else {},
     )  # fmt: skip
 

@@ -23,12 +23,20 @@ from edp.monitor.residuals.base import (
     SourceParts,
     mean_inputs,
     residual_labels,
+    source_arrays,
 )
 from edp.recording import Recording
 from edp.settings.bounds import above, check_bounds, span
 from edp.signals import KINDS, Channel, Kind
+from edp.storage.arrays import ArrayRule
 
 Array = NDArray[np.float64]
+ARRAYS = {
+    "pairs": ArrayRule(("residuals", 2), np.int64, low=0, high="inputs"),
+    "gains": ArrayRule(("residuals",)),
+    "memories_s": ArrayRule(("residuals",)),
+}
+"""Of its file."""
 RATE_OF = {
     Kind.POSITION: Kind.VELOCITY,
     Kind.ANGLE: Kind.ANGULAR_VELOCITY,
@@ -121,18 +129,12 @@ class Balances(ResidualSource):
     def of_parts(cls, parts: SourceParts) -> Balances:
         """See `ResidualSource.of_parts`."""
         inputs, units = residual_labels(parts.plain)
-        pairs = np.asarray(parts.arrays["pairs"], np.int64)
-        gains, memories = (np.asarray(parts.arrays[name], np.float64) for name in ("gains", "memories_s"))
-        middle, rate_hz = np.asarray(parts.arrays["middle"], np.float32), float(parts.plain["rate_hz"])
-        count = len(units)
-        shapes = (pairs.shape, gains.shape, memories.shape, middle.shape)
-        if shapes != ((count, 2), (count,), (count,), (len(inputs),)):
-            raise ValueError("arrays of a balance have other shapes than its header says")
-        if not all(np.isfinite(values).all() for values in (gains, memories, middle)) or not 0.0 < rate_hz <= 1e6:
-            raise ValueError("a number of a balance is not finite, or its rate cannot be")
-        if count and (pairs.min() < 0 or pairs.max() >= len(inputs) or (memories * rate_hz < 1.0).any()):
-            raise ValueError("a pair of a balance lies outside its inputs, or its memory is shorter than a tick")
-        return cls(inputs, pairs, gains, memories, rate_hz, middle, units)
+        arrays, rate_hz = source_arrays(parts, ARRAYS, residuals=len(units)), float(parts.plain["rate_hz"])
+        if not 0.0 < rate_hz <= 1e6:
+            raise ValueError(f"the rate of a balance is {rate_hz} Hz; above 0 and at most 1e6 must hold")
+        if (arrays["memories_s"] * rate_hz < 1.0).any():
+            raise ValueError("the memory of a balance is shorter than a tick")
+        return cls(inputs, **arrays, rate_hz=rate_hz, units=units)
 
 
 @RESIDUALS.register("balances")

@@ -15,12 +15,15 @@ from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.registry import Registry
 from edp.signals import Channel
+from edp.storage.arrays import ArrayRule, checked_arrays
 from edp.training.bundle import Bundle
 from edp.training.twin_bundle import TwinBundle
 
 Rows = NDArray[np.float32]
 MOST_RESIDUALS = 512
 """Maximum number of residuals of a source. A machine with more channels is monitored in parts."""
+MIDDLE = ArrayRule(("inputs",), np.float32)
+"""Substitutes for absent channels, an array of each source."""
 SISTERS = 11
 """Seeds of drawn machines are apart from all others."""
 
@@ -322,13 +325,17 @@ def mean_inputs(material: FitMaterial, inputs: Sequence[str]) -> Rows:
     return np.asarray(np.mean(means, axis=0), dtype=np.float32)
 
 
-def middle_of(parts: SourceParts) -> tuple[tuple[str, ...], Rows]:
-    """Return the inputs of a source and the substitutes for absent channels.
+def source_arrays(parts: SourceParts, rules: Mapping[str, ArrayRule], **sizes: int) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a source after a check; those of its parts, with a dot in their names, are left out.
+
+    Args:
+        parts: of the source.
+        rules: declarations of the arrays besides ``middle``.
+        sizes: of dimensions besides ``inputs``.
 
     Raises:
         ValueError: values that cannot be.
     """
-    inputs, middle = texts_of(parts.plain["inputs"], "its inputs"), np.asarray(parts.arrays["middle"], np.float32)
-    if middle.shape != (len(inputs),) or not np.isfinite(middle).all():
-        raise ValueError("the middle of the inputs has another shape, or is not finite")
-    return inputs, middle
+    own = {name: values for name, values in parts.arrays.items() if "." not in name}
+    inputs = len(texts_of(parts.plain["inputs"], "its inputs"))
+    return checked_arrays(own, {"middle": MIDDLE, **rules}, "a source", {"inputs": inputs, **sizes})

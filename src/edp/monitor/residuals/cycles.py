@@ -22,13 +22,20 @@ from edp.monitor.residuals.base import (
     Rows,
     SourceParts,
     mean_inputs,
-    middle_of,
+    source_arrays,
+    texts_of,
 )
 from edp.monitor.residuals.committees import constant_channels
 from edp.settings.bounds import check_bounds, span
+from edp.storage.arrays import POSITIVE, ArrayRule
 from edp.wording import figure, setting_text
 
 Array = NDArray[np.float64]
+ARRAYS = {
+    "template": ArrayRule(("ticks", "inputs"), np.float32),
+    "width": ArrayRule(("ticks", "inputs"), np.float32, low=POSITIVE),
+}
+"""Of its file."""
 PREFIX = "cycle:"
 LEAST_CYCLES = 3
 """Fewer tell no scatter."""
@@ -83,18 +90,13 @@ class Cycles(ResidualSource):
     @classmethod
     def of_parts(cls, parts: SourceParts) -> Cycles:
         """See `ResidualSource.of_parts`."""
-        inputs, middle = middle_of(parts)
+        inputs, arrays = texts_of(parts.plain["inputs"], "its inputs"), source_arrays(parts, ARRAYS)
         repeats = parts.plain["repeats"]
         if type(repeats) is not bool:
             raise ValueError("it does not say whether its cycle repeats")
-        template, width = (np.asarray(parts.arrays[name], np.float32) for name in ("template", "width"))
-        if template.ndim != 2 or template.shape != width.shape or template.shape[1] != len(inputs):
-            raise ValueError("arrays of a cycle have other shapes than its header says")
-        if not 1 <= len(template) <= MOST_TICKS:
-            raise ValueError(f"a cycle has {len(template)} ticks; 1 to {MOST_TICKS} must hold")
-        if not (np.isfinite(template).all() and np.isfinite(width).all() and (width > 0.0).all()):
-            raise ValueError("a number of a cycle is not finite, or a width is not above zero")
-        return cls(inputs, template, width, middle, repeats)
+        if not 1 <= len(arrays["template"]) <= MOST_TICKS:
+            raise ValueError(f"a cycle has {len(arrays['template'])} ticks; 1 to {MOST_TICKS} must hold")
+        return cls(inputs, arrays["template"], arrays["width"], arrays["middle"], repeats)
 
 
 @RESIDUALS.register("cycles")

@@ -21,7 +21,8 @@ from edp.monitor.residuals.base import (
     Rows,
     SourceParts,
     mean_inputs,
-    middle_of,
+    source_arrays,
+    texts_of,
 )
 from edp.monitor.residuals.flow_curves import (
     BACK,
@@ -42,13 +43,29 @@ from edp.monitor.residuals.flow_fit import fit_chambers, fit_oil_range
 from edp.recording import Recording
 from edp.settings.bounds import MOST_ROWS, check_bounds, integer, span
 from edp.signals import KINDS, Kind
+from edp.storage.arrays import ArrayRule, arrays_under, checked_arrays
 from edp.storage.reading import Table
 from edp.wording import figure, percent
 
 PREFIX = "flow:"
-NUMBERS = ("values", "slopes", "lines", "doubts")
 MOST_CHAMBERS, MOST_DEAD = 64, 1_000
 """Maximum numbers in a file: chambers, and samples of dead time."""
+NUMBERS = {
+    "values": ArrayRule(("paths", len(KNOTS)), np.float32),
+    "slopes": ArrayRule(("paths", len(KNOTS)), np.float32),
+    "lines": ArrayRule((LINES,), np.float32),
+    "doubts": ArrayRule((DOUBTS,), np.float32, low=0.0),
+}
+"""Arrays of a chamber in a file."""
+SPOOLS = {
+    "extend": ArrayRule(("spools",), np.int64, low=0, high="inputs"),
+    "retract": ArrayRule(("spools",), np.int64, low=-1, high="inputs"),
+    "gain": ArrayRule(("spools",), np.float32),
+    "dead": ArrayRule(("spools",), low=0.0, high=MOST_DEAD),
+    "stages": ArrayRule(("spools", 2, 4), np.float32),
+    "play": ArrayRule(("spools",), np.float32, low=0.0),
+}
+"""Arrays of `SpoolModel` in a file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,10 +229,12 @@ class FlowBalances(ResidualSource):
     @classmethod
     def of_parts(cls, parts: SourceParts) -> FlowBalances:
         """See `ResidualSource.of_parts`."""
-        (inputs, middle), rate_hz = middle_of(parts), float(parts.plain["rate_hz"])
+        inputs, middle = texts_of(parts.plain["inputs"], "its inputs"), source_arrays(parts, {})["middle"]
+        rate_hz = float(parts.plain["rate_hz"])
         if not 0.0 < rate_hz <= 1e6:
             raise ValueError("its rate cannot be")
-        spools = _spools_of(parts.arrays, len(inputs))
+        sizes, own = {"inputs": len(inputs)}, arrays_under(parts.arrays, "spools.")
+        spools = SpoolModel(**checked_arrays(own, SPOOLS, "its spools", sizes))
         entries = parts.plain["chambers"]
         if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_CHAMBERS:
             raise ValueError(f"it has no list of 1 to {MOST_CHAMBERS} chambers")
@@ -237,24 +256,6 @@ def _oil_of(entry: Any, inputs: int) -> OilRange | None:
     return oil
 
 
-def _spools_of(arrays: Any, inputs: int) -> SpoolModel:
-    extend, retract = (np.asarray(arrays[f"spools.{name}"], np.int64) for name in ("extend", "retract"))
-    gain, stages, play = (np.asarray(arrays[f"spools.{name}"], np.float32) for name in ("gain", "stages", "play"))
-    dead = np.asarray(arrays["spools.dead"], np.float64)
-    count = extend.shape
-    if extend.ndim != 1 or any(one.shape != count for one in (retract, gain, dead, play)):
-        raise ValueError("arrays of its spools have other shapes than each other")
-    if stages.shape != (*count, 2, 4):
-        raise ValueError("stages of its spools have another shape")
-    if not all(np.isfinite(one).all() for one in (gain, dead, stages, play)):
-        raise ValueError("a number of its spools is not finite")
-    if ((extend < 0) | (extend >= inputs) | (retract < -1) | (retract >= inputs)).any():
-        raise ValueError("a spool names an input that there is not")
-    if ((dead < 0.0) | (dead > MOST_DEAD)).any() or (play < 0.0).any():
-        raise ValueError("a dead time or a play cannot be")
-    return SpoolModel(extend, retract, gain, dead, stages, play)
-
-
 def _place_of(entry: Any, inputs: int, spools: int) -> ChamberPlaces:
     single = {name: int(entry[name]) for name in ("velocity", "own", "other", "stroke", "sign")}
     lists = {name: tuple(int(value) for value in entry[name]) for name in ("supplies", "spools")}
@@ -273,15 +274,11 @@ def _place_of(entry: Any, inputs: int, spools: int) -> ChamberPlaces:
 
 
 def _chamber_of(spots: ChamberPlaces, arrays: Any, index: int) -> ChamberCurves:
-    values, slopes, lines, doubts = (np.asarray(arrays[f"{index}.{name}"], np.float32) for name in NUMBERS)
-    curves = (spots.paths, len(KNOTS))
-    if (values.shape, slopes.shape, lines.shape, doubts.shape) != (curves, curves, (LINES,), (DOUBTS,)):
-        raise ValueError("curves of a chamber have other shapes than its header says")
-    if not all(np.isfinite(one).all() for one in (values, slopes, lines, doubts)):
-        raise ValueError("a number of a chamber is not finite")
-    if (doubts < 0.0).any() or doubts[0] <= 0.0:
-        raise ValueError("the width of a chamber's balance is not positive")
-    return ChamberCurves(spots, values, slopes, lines, doubts)
+    own = arrays_under(arrays, f"{index}.")
+    numbers = checked_arrays(own, NUMBERS, f"chamber {index}", {"paths": spots.paths})
+    if numbers["doubts"][0] <= 0.0:
+        raise ValueError(f"the width of the balance of chamber {index} is {numbers['doubts'][0]}; above 0 must hold")
+    return ChamberCurves(spots, **numbers)
 
 
 @RESIDUALS.register("flow_balances")

@@ -20,7 +20,8 @@ from edp.monitor.residuals.base import (
     Rows,
     SourceParts,
     mean_inputs,
-    middle_of,
+    source_arrays,
+    texts_of,
 )
 from edp.monitor.residuals.committees import CommitteeOptions, constant_channels
 from edp.networks.predictor import Predictor
@@ -102,7 +103,7 @@ class LookAhead(ResidualSource):
     @classmethod
     def of_parts(cls, parts: SourceParts) -> LookAhead:
         """See `ResidualSource.of_parts`."""
-        inputs, middle = middle_of(parts)
+        inputs, middle = texts_of(parts.plain["inputs"], "its inputs"), source_arrays(parts, {})["middle"]
         bundles = {}
         for number in sorted(parts.bundles, key=lambda text: (len(text), text)):
             bundle = parts.bundles[number]

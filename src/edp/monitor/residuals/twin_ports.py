@@ -17,7 +17,7 @@ from edp.monitor.residuals.base import (
     Rows,
     SourceParts,
     mean_inputs,
-    middle_of,
+    source_arrays,
     texts_of,
 )
 from edp.monitor.residuals.groups import groups_of
@@ -105,7 +105,7 @@ class TwinPorts(ResidualSource):
     @classmethod
     def of_parts(cls, parts: SourceParts) -> TwinPorts:
         """See `ResidualSource.of_parts`."""
-        inputs, middle = middle_of(parts)
+        inputs, middle = texts_of(parts.plain["inputs"], "its inputs"), source_arrays(parts, {})["middle"]
         bundle, period, groups = parts.bundles["twin"], parts.plain["period"], parts.plain["groups"]
         if not isinstance(bundle, TwinBundle):
             raise ValueError("its network is no twin")

@@ -28,7 +28,7 @@ from edp.monitor.residuals.base import (
     Rows,
     SourceParts,
     mean_inputs,
-    middle_of,
+    source_arrays,
     texts_of,
 )
 from edp.monitor.residuals.committees import CommitteeOptions, constant_channels
@@ -117,7 +117,8 @@ class VirtualSensors(ResidualSource):
     @classmethod
     def of_parts(cls, parts: SourceParts) -> VirtualSensors:
         """See `ResidualSource.of_parts`."""
-        (inputs, middle), groups = middle_of(parts), texts_of(parts.plain["groups"], "its groups")
+        inputs, middle = texts_of(parts.plain["inputs"], "its inputs"), source_arrays(parts, {})["middle"]
+        groups = texts_of(parts.plain["groups"], "its groups")
         every = parts.plain.get("every", 1)  # monitors of earlier versions have none
         if type(every) is not int or not 1 <= every <= MOST_EVERY:
             raise ValueError(f"its networks run every {shown(every)} ticks; an integer of 1 to {MOST_EVERY} must hold")

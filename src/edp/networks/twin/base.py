@@ -15,6 +15,7 @@ from edp.errors import ConfigError, DataError, ExportError
 from edp.ir import Builder, Graph
 from edp.networks.twin.lowering import add_bounds, plant_graph
 from edp.networks.twin.scales import Array, TwinScales
+from edp.networks.twin.windows import WindowStart
 from edp.registry import Registry
 from edp.settings.bounds import MOST_TICKS, integer
 from edp.wording import typed
@@ -326,7 +327,7 @@ def _measure_excess(channels: TwinChannels, scales: TwinScales, start: Array) ->
     return np.asarray(np.maximum(low - start[:, ends], start[:, ends] - high) / (high - low), dtype=np.float32)
 
 
-def even_starts(twin: Twin, series: Sequence[Series], length: int, each: int) -> list[tuple[Series, int]]:
+def even_starts(twin: Twin, series: Sequence[Series], length: int, each: int) -> list[WindowStart]:
     """Return evenly spaced starts of runs with `length` samples, at most `each` per segment, none beyond an end stop.
 
     Raises:
@@ -337,7 +338,7 @@ def even_starts(twin: Twin, series: Sequence[Series], length: int, each: int) ->
 
 def starts_within(
     channels: TwinChannels, scales: TwinScales, series: Sequence[Series], length: int, each: int
-) -> list[tuple[Series, int]]:
+) -> list[WindowStart]:
     """Return `even_starts` for the channels and scales of a twin that is not trained yet.
 
     Raises:
@@ -345,15 +346,13 @@ def starts_within(
     """
     # Starts within one stretch that would be the same tick are one run.
     runs = [
-        (part, int(at))
+        WindowStart(part, int(at))
         for part in series
         if part.samples >= length
         for at in np.unique(np.linspace(0, part.samples - length, each).astype(np.int64))
     ]
     usable = [
-        (part, at)
-        for part, at in runs
-        if (_measure_excess(channels, scales, part.targets[at : at + 1]) <= BEYOND).all()
+        run for run in runs if (_measure_excess(channels, scales, run.series.targets[[run.first]]) <= BEYOND).all()
     ]
     if not usable:
         raise DataError(

@@ -16,13 +16,12 @@ from edp.networks.twin.lumped.parts import (
     MOST_ELEMENTS,
     Doubles,
     LagElement,
-    LumpedNumber,
     MassElement,
     Parts,
     TankElement,
     check_parts,
     default_parts,
-    list_lumped_parameters,
+    lumped_parameters,
 )
 from edp.networks.twin.lumped.run import Values, Wiring, free_run, simulate_measured
 from edp.networks.twin.scales import Array, TwinScales
@@ -79,7 +78,7 @@ class ElementsBox:
 
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> ElementsTwin:
         """Return a twin with typical parameters."""
-        numbers = [n.nominal for n in list_lumped_parameters(self.parts(channels), channels, scales)]
+        numbers = [n.nominal for n in lumped_parameters(self.parts(channels), channels, scales)]
         return self.build(channels, scales, {"numbers": np.array(numbers, np.float32)})
 
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
@@ -102,7 +101,7 @@ class ElementsTwin(Twin):
     def __init__(self, channels: TwinChannels, scales: TwinScales, spec: ElementsBox, numbers: Doubles) -> None:
         super().__init__(channels, scales, spec.prefix_ticks)
         self.spec, self.elements, self.numbers = spec, spec.parts(channels), numbers
-        self.table: list[LumpedNumber] = list_lumped_parameters(self.elements, channels, scales)
+        self.table = lumped_parameters(self.elements, channels, scales)
         names = [c.name for c in channels.answers]
         self.columns = {name: i for i, name in enumerate(names)}
         self.inputs = {c.name: i for i, c in enumerate(channels.commands)}

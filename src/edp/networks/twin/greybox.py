@@ -13,6 +13,7 @@ from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, closest
 from edp.ir import Builder
 from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinRunner, TwinState
+from edp.networks.twin.descent import NormalEquations
 from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.channel_map import GreyChannelMap, turning_scales
 from edp.networks.twin.grey.correction import Cell, OutputBounds, RunTrace
@@ -161,7 +162,7 @@ class GreyBox:
         numbers = arrays["numbers"].astype(np.float64)
         if not (numbers[table.positive] > 0).all():
             raise ValueError("one of its numbers is not positive")
-        if not (numbers == numbers[table.leader]).all():
+        if not (numbers == numbers[table.priors.leader]).all():
             raise ValueError("both sides of one of its motors have not the same displacement")
         scales = turning_scales(elements, channels, scales)
         wiring = GreyChannelMap.of(elements, channels, scales)
@@ -230,21 +231,6 @@ class RunTarget:
     prefix: int
     followed: int = 0
     stride: int = 1
-
-
-@dataclass(frozen=True, eq=False)
-class NormalEquations:
-    """Normal equations of a Gauss-Newton step.
-
-    Attributes:
-        matrix: Gauss-Newton matrix, shape (parameter, parameter). Shape (0, 0) without derivatives.
-        gradient: gradient of the sum of the losses, shape (parameter,). Shape (0,) without derivatives.
-        losses: loss of each run, shape (run,).
-    """
-
-    matrix: Doubles
-    gradient: Doubles
-    losses: Doubles
 
 
 class GreyTwin(Twin):

@@ -24,6 +24,7 @@ from edp.ir.layers import BinaryOperation, Clip, Dense
 from edp.ir.memory import Feed, Feedback
 from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, even_starts, list_solved_columns
 from edp.networks.twin.scales import Array, TwinScales
+from edp.networks.twin.windows import MeasuredWindows
 from edp.settings.bounds import check_bounds, check_count, integer
 
 Doubles = NDArray[np.float64]
@@ -369,10 +370,8 @@ def _free_error(twin: Twin, judged: Sequence[Series]) -> float:
     """Return the mean absolute free-run error, each output scaled by its standard deviation."""
     ticks = min(round(JUDGED_S * twin.channels.rate_hz), max(part.samples for part in judged) - twin.prefix_ticks - 1)
     length, prefix = twin.prefix_ticks + ticks, twin.prefix_ticks
-    runs = even_starts(twin, judged, length + 1, JUDGED_EACH)
-    commands = np.stack([part.inputs[first : first + length] for part, first in runs])
-    truth = np.stack([part.targets[first : first + length + 1] for part, first in runs])
-    state = twin.reset(commands[:, :prefix], truth[:, :prefix])
-    answers, _ = twin.rollout(commands[:, prefix:], state)
-    error = np.abs(answers - truth[:, prefix + 1 :]) / twin.scales.answer_width
+    runs = MeasuredWindows.read(even_starts(twin, judged, length + 1, JUDGED_EACH), length)
+    state = twin.reset(runs.commands[:, :prefix], runs.outputs[:, :prefix])
+    answers, _ = twin.rollout(runs.commands[:, prefix:], state)
+    error = np.abs(answers - runs.outputs[:, prefix + 1 :]) / twin.scales.answer_width
     return float(error[..., list_solved_columns(twin.channels)].mean())

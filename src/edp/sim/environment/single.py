@@ -1,4 +1,4 @@
-"""One machine as an environment of Gymnasium."""
+"""Environments of Gymnasium with one episode at a time; the simulated machine is one of them."""
 
 from __future__ import annotations
 
@@ -8,27 +8,85 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError
-from edp.signals import KINDS, Channel
+from edp.signals import Channel
+from edp.sim.environment.batch import EpisodeBatch, Infos, Options, check_render, check_seed, checked_actions
 from edp.sim.environment.library import gymnasium
 from edp.sim.environment.model import NominalMachine
+from edp.sim.environment.simulator import SimulatorBatch
 from edp.sim.environment.spec import EnvironmentSpec, settings_of
-from edp.sim.environment.start import MOST_SEED, check_seed, episode_start
-from edp.sim.environment.truth import Truth
-from edp.sim.episodes.episodes import Episodes, EpisodeStart, Moment
+from edp.sim.episodes.episodes import Moment
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
 from edp.storage.reading import Table
 
 Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
+ACTION = (at.AXES,)
 
 
-class ExcavatorEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
+class SingleEnvironment(gymnasium.Env[Observation, Observation]):
+    """An environment that is a batch of one episode.
+
+    Args:
+        batch: of one episode.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012  as Gymnasium declares it
+    render_mode = None
+
+    def __init__(self, batch: EpisodeBatch) -> None:
+        self._batch, self.rate_hz = batch, batch.rate_hz
+        self.observation_space, self.action_space = batch.observation_space, batch.action_space
+        # Why there is no step now; empty while an episode is under way.
+        self._idle = "has not begun"
+
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Observation, Table]:
+        """Begin an episode.
+
+        Args:
+            seed: of all that is random in the episode; None goes on with the environment's own generator.
+            options: settings for this episode alone.
+
+        Returns:
+            The first observation, and what began.
+
+        Raises:
+            ConfigError: an option is unknown or out of range.
+        """
+        seed = check_seed(seed)
+        super().reset(seed=seed)
+        facts = self._batch.begin(0, seed, self.np_random, options or {})
+        self._idle = ""
+        return self._batch.observation(0), {**facts, **self._batch.info(0)}
+
+    def step(self, action: Any) -> tuple[Observation, float, bool, bool, Infos]:
+        """Hold an action, shape (3,), for one step.
+
+        Raises:
+            ConfigError: the action is not three finite numbers, or no episode is under way.
+            SimulationError: the state became non-finite.
+        """
+        if self._idle:
+            raise ConfigError(f"the episode {self._idle}; call reset() before step()")
+        batch = self._batch
+        rewards, terminated, truncated = batch.step(checked_actions(action, ACTION)[None])
+        failed, over, info = terminated.item(0), truncated.item(0), batch.info(0)
+        if failed or over:
+            self._idle = "has ended"
+            info |= batch.summary(0)
+        return batch.observation(0), rewards.item(0), failed, over, info
+
+
+class ExcavatorEnv(SingleEnvironment):
     """An excavator front under lever commands; observations are what its sensors show, in SI units.
 
     The action is the lever positions of boom, arm and bucket, -1 to 1, extension positive; beyond, they stand at the
     end. The observation at tick k shows pilot pressures as the lever of tick k - 1 left them. The reward is 0: what is
     wanted of the machine is a task's affair. Episodes do not terminate; they are truncated at `duration_s`.
+
+    `reset` takes the options of `edp.sim.environment.start`. Its seed is that of start, noise, soil and drawn machine;
+    the scenario of the same seed begins alike. It says ``seed``, ``machine``, ``mass_t`` of a drawn machine,
+    ``material`` and ``truth``, which each step says as well.
 
     Args:
         settings: what is simulated and shown.
@@ -39,70 +97,23 @@ class ExcavatorEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         settings: see `EnvironmentSpec`.
         channels: name, unit and kind of each value of an observation.
         rate_hz: ticks per second.
-        model: the nominal machine of the present episode, or of the next one where none has begun.
 
     Raises:
         ConfigError: a setting is unknown or out of range.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012  as Gymnasium declares it
+    _batch: SimulatorBatch
 
     def __init__(self, settings: EnvironmentSpec | None = None, render_mode: None = None, **changes: Any) -> None:
-        if render_mode is not None:
-            raise ConfigError(f"environment: render_mode = {render_mode!r}; there is nothing to render, leave it out")
+        check_render("environment", render_mode)
         self.settings = settings_of(settings, changes)
+        super().__init__(SimulatorBatch([self.settings]))
         self.channels: tuple[Channel, ...] = self.settings.channels
-        self.rate_hz, self.render_mode = self.settings.rate_hz, None
-        self.observation_space, self.action_space = spaces(self.channels)
-        self.model = NominalMachine(self.settings.scenario(0).load())
-        self._episodes = Episodes(1, self.settings.columns)
-        self._levers = np.zeros((1, at.AXES))
-        self._begun, self._ended, self._in_soil = False, False, False
 
-    def reset(self, *, seed: int | None = None, options: Table | None = None) -> tuple[Observation, Table]:
-        """Begin an episode.
-
-        Args:
-            seed: of start, noise, soil and drawn machine; the scenario of the same seed begins alike. None goes on with
-                the environment's own generator.
-            options: settings for this episode alone, see `edp.sim.environment.start`.
-
-        Returns:
-            The first observation, and what began: ``seed``, ``machine``, ``mass_t`` of a drawn machine, ``material``
-            and ``truth``.
-
-        Raises:
-            ConfigError: an option is unknown or out of range.
-        """
-        seed = check_seed(seed)
-        super().reset(seed=seed)
-        if seed is None:
-            seed = int(self.np_random.integers(MOST_SEED))
-        start, facts = episode_start(self.settings, seed, options)
-        out = self._episodes.new_out()
-        self._episodes.begin(0, start, out)
-        self._enter(start)
-        return out[0][0], {**facts, "truth": self._truth(out[1][0])}
-
-    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, object]]:
-        """Hold lever positions, shape (3,), for one tick.
-
-        Raises:
-            ConfigError: they are not three finite numbers, or no episode is under way.
-            SimulationError: the state became non-finite.
-        """
-        if not self._begun or self._ended:
-            what = "has ended" if self._begun else "has not begun"
-            raise ConfigError(f"the episode {what}; call reset() before step()")
-        levers = np.asarray(action, dtype=float)
-        if levers.shape != (at.AXES,):
-            raise ConfigError(f"levers of shape {levers.shape}; give three positions: boom, arm and bucket")
-        # Copied: compiled code takes neither strides nor arrays that may not be written.
-        self._levers[0] = levers
-        out = self._episodes.new_out()
-        self._episodes.step(self._levers, out)
-        self._ended = bool(out[2][0])
-        return out[0][0], 0.0, False, self._ended, {"truth": self._truth(out[1][0])}
+    @property
+    def model(self) -> NominalMachine:
+        """The nominal machine of the present episode, or of the next one where none has begun."""
+        return self._batch.models[0]
 
     @property
     def machine(self) -> Machine:
@@ -127,7 +138,7 @@ class ExcavatorEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             ConfigError: no episode has begun.
         """
-        return self._episodes.moment(0)
+        return self._batch.episodes.moment(0)
 
     def restore(self, snapshot: Moment) -> Observation:
         """Go to a moment, of this environment or of another: what follows gives the same bits as it gave then.
@@ -138,12 +149,9 @@ class ExcavatorEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             ConfigError: the snapshot is of an environment that shows other channels.
         """
-        self._episodes.go_to(0, snapshot)
-        self._enter(snapshot.start)
-        out = self._episodes.new_out()
-        self._episodes.show(0, out)
-        observation: Observation = out[0][0]
-        return observation
+        self._batch.restore(0, snapshot)
+        self._idle = "has ended" if self._batch.ended[0] else ""
+        return self._batch.observation(0)
 
     def branch(self, seed: int) -> None:
         """Give sensors and soil new random numbers from now on; the present state stays.
@@ -151,21 +159,4 @@ class ExcavatorEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             ConfigError: no episode has begun.
         """
-        self._episodes.redraw(0, np.random.SeedSequence(seed))
-
-    def _enter(self, start: EpisodeStart) -> None:
-        if start.machine is not self.model.machine:
-            self.model = NominalMachine(start.machine)
-        self._begun, self._ended = True, self._episodes.ended(0)
-        self._in_soil = bool(start.scenario.material)
-
-    def _truth(self, row: Array) -> Truth:
-        pilot_pressure, episodes = self.model.machine.valves.pilot_pressure, self._episodes
-        return Truth(row, pilot_pressure, self._in_soil, episodes.most_faults, episodes.shares())
-
-
-def spaces(channels: tuple[Channel, ...]) -> tuple[Any, Any]:
-    """Return the spaces of observations, within the plausibility limits of each channel's kind, and of levers."""
-    limits = np.array([KINDS[channel.kind].plausible for channel in channels], dtype=np.float32)
-    observations = gymnasium.spaces.Box(limits[:, 0], limits[:, 1], dtype=np.float32)
-    return observations, gymnasium.spaces.Box(-1.0, 1.0, (at.AXES,), np.float32)
+        self._batch.episodes.redraw(0, np.random.SeedSequence(seed))

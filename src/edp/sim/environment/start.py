@@ -6,10 +6,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edp.errors import ConfigError, closest
-from edp.settings.bounds import shown
+from edp.sim.environment.batch import Infos, Options
 from edp.sim.environment.spec import EnvironmentSpec
 from edp.sim.episodes.episodes import EpisodeStart
 from edp.sim.faults import fault_text
@@ -35,17 +34,16 @@ OWN = ("strokes", "oil_temperature")
 MOST_SEED = 2**31 - 1
 
 
-def episode_start(spec: EnvironmentSpec, seed: int, options: Table | None) -> tuple[EpisodeStart, dict[str, object]]:
+def episode_start(spec: EnvironmentSpec, seed: int, options: Options) -> tuple[EpisodeStart, Infos]:
     """Return the start of an episode, and its description for `info`.
 
     Raises:
         ConfigError: an option is unknown (the closest is offered) or out of range.
     """
-    options = dict(options or {})
     for name in options:
         if name not in (*OF_SPEC, *OWN):
             raise ConfigError(f"reset: option '{name}' is unknown{closest(str(name), [*OF_SPEC, *OWN])}")
-    overrides = {name: value for name, value in options.items() if name in OF_SPEC}
+    overrides: Table = {name: value for name, value in options.items() if name in OF_SPEC}
     if "machine" in overrides and spec.randomise is not False:
         raise ConfigError("reset: option 'machine' and an environment that draws machines (randomise); leave one out")
     if overrides:
@@ -57,41 +55,11 @@ def episode_start(spec: EnvironmentSpec, seed: int, options: Table | None) -> tu
     start = EpisodeStart(
         scenario, machine, spec.hand, spec.loop_latency, spec.lost_frames, _strokes(options.get("strokes"))
     )
-    facts: dict[str, object] = {"seed": seed, "machine": machine.name, "material": spec.material}
+    facts: Infos = {"seed": seed, "machine": machine.name, "material": spec.material}
     if spec.faults:
         facts["faults"] = "; ".join(map(fault_text, spec.faults))
     mass_t = look_up_mass(machine.name)
     return start, facts if mass_t is None else {**facts, "mass_t": mass_t}
-
-
-def check_mask(lanes: int, mask: Any) -> NDArray[np.bool_]:
-    """Return the mask of environments that restart, shape ``(lanes,)``; all of them without a mask.
-
-    Raises:
-        ConfigError: another shape or type, or no lane at all.
-    """
-    if mask is None:
-        return np.ones(lanes, dtype=np.bool_)
-    array = np.asarray(mask)
-    if array.shape != (lanes,) or array.dtype != np.bool_ or not array.any():
-        raise ConfigError(
-            f"reset: reset_mask of shape {array.shape} and type {array.dtype}; give {lanes} booleans, of which one at "
-            "least is True"
-        )
-    return array
-
-
-def check_seed(seed: Any) -> int | None:
-    """Return a seed checked for Gymnasium.
-
-    Raises:
-        ConfigError: it is no whole number, or negative.
-    """
-    if seed is None:
-        return None
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise ConfigError(f"reset: seed = {shown(seed)}; give a whole number that is not negative, or None")
-    return int(seed)
 
 
 def _draw_machine(spec: EnvironmentSpec, seed: int) -> Machine:

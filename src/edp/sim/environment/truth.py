@@ -14,6 +14,7 @@ from edp.sim.machine import layout as at
 from edp.sim.sensors.sensors import KELVIN, OIL, truth_columns
 
 Array = NDArray[np.float64]
+FAULTS = tuple(FAULT_CHANNELS)
 
 
 @cache
@@ -51,7 +52,7 @@ class Truth(Mapping[str, object]):
         shares: Callable[[], Array] | None = None,
     ) -> None:
         self._rows, self._pilot_pressure, self._sources = rows, pilot_pressure, sources(in_soil)
-        self._faults, self._shares = tuple(FAULT_CHANNELS)[:faults], shares
+        self._faults, self._shares = FAULTS[:faults], shares
 
     def __getitem__(self, name: str) -> Any:
         """Return a number, or an array of shape (machine,)."""

@@ -1,4 +1,4 @@
-"""Many machines as one environment of Gymnasium: one compiled call a tick."""
+"""Environments of Gymnasium with many episodes side by side; simulated machines are some of them."""
 
 from __future__ import annotations
 
@@ -11,22 +11,122 @@ from numpy.typing import NDArray
 from edp.errors import ConfigError
 from edp.settings.bounds import shown
 from edp.signals import Channel
+from edp.sim.environment.batch import (
+    ALL,
+    AutoresetMode,
+    Bools,
+    EpisodeBatch,
+    Infos,
+    Options,
+    check_mask,
+    check_render,
+    checked_actions,
+    checked_mode,
+    checked_seeds,
+)
 from edp.sim.environment.library import gymnasium
 from edp.sim.environment.model import NominalMachine
-from edp.sim.environment.single import spaces
+from edp.sim.environment.simulator import SimulatorBatch
 from edp.sim.environment.spec import EnvironmentSpec, settings_of
-from edp.sim.environment.start import MOST_SEED, check_mask, check_seed, episode_start
-from edp.sim.environment.truth import Truth
-from edp.sim.episodes.episodes import Episodes, Moment
+from edp.sim.episodes.episodes import Moment
 from edp.sim.machine import layout as at
 
 Array = NDArray[np.float64]
-AutoresetMode = gymnasium.vector.AutoresetMode
-Bools = NDArray[np.bool_]
-MOST_MACHINES = 65_536
+Observations = NDArray[np.float32]
 
 
-class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
+class VectorEnvironment(gymnasium.vector.VectorEnv[Observations, Observations, NDArray[Any]]):
+    """Environments that are a batch of episodes.
+
+    Args:
+        batch: of the episodes.
+        mode: what happens to an episode that has ended, see `checked_mode`.
+    """
+
+    def __init__(self, batch: EpisodeBatch, mode: Any) -> None:
+        self._batch, self._mode, self.num_envs, self.rate_hz = batch, mode, batch.count, batch.rate_hz
+        self.metadata, self.render_mode = {"render_modes": [], "autoreset_mode": mode}, None
+        self.single_observation_space, self.single_action_space = batch.observation_space, batch.action_space
+        self.observation_space, self.action_space = (
+            gymnasium.vector.utils.batch_space(space, batch.count)
+            for space in (batch.observation_space, batch.action_space)
+        )
+        self._generators = [np.random.default_rng() for _ in range(batch.count)]
+        self._begun, self._ended = np.zeros(batch.count, np.bool_), np.zeros(batch.count, np.bool_)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: Options | None = None
+    ) -> tuple[Observations, Infos]:
+        """Begin episodes.
+
+        Args:
+            seed: of the first, the others count on; or one for each; None goes on with the generators of each.
+            options: as those of one environment, for all; ``reset_mask``, shape (num_envs,), resets these alone.
+
+        Returns:
+            Observations, shape (num_envs, value), and what began, as arrays beside masks such as ``_seed``.
+
+        Raises:
+            ConfigError: an option or the number of seeds is not possible.
+        """
+        options = dict(options or {})
+        mask = check_mask(self.num_envs, options.pop("reset_mask", None))
+        infos = self._begin(mask, checked_seeds(self.num_envs, seed), options, {})
+        return self._batch.observation(ALL), {**infos, **self._batch.info(ALL)}
+
+    def step(self, actions: Any) -> tuple[Observations, Array, Bools, Bools, Infos]:
+        """Hold actions, shape (num_envs, 3), for one step.
+
+        Raises:
+            ConfigError: they are not finite or of another shape, or an episode has ended or not begun.
+            SimulationError: a state became non-finite.
+        """
+        asked = checked_actions(actions, (self.num_envs, at.AXES))
+        again, restarts = self._ended, bool(self._ended.any())
+        if not self._begun.all() or (restarts and self._mode is not AutoresetMode.NEXT_STEP):
+            stuck = ~self._begun if self._mode is AutoresetMode.NEXT_STEP else ~self._begun | again
+            raise ConfigError(f"episodes {shown(np.flatnonzero(stuck).tolist())} are not under way; call reset() first")
+        # An episode that is reset in this step ignores its action.
+        active = ~again if restarts else None
+        outcome = self._batch.step(asked, active)
+        rewards, terminated, truncated = outcome.rewards.copy(), outcome.terminated.copy(), outcome.truncated.copy()
+        if active is not None:
+            terminated &= active
+            truncated &= active
+        self._ended = terminated | truncated
+        infos: Infos = {}
+        ended = np.flatnonzero(self._ended).tolist()
+        for index in ended:
+            infos = self._add_info(infos, self._batch.summary(index), index)
+        if restarts:
+            infos = self._begin(again, [None] * self.num_envs, {}, infos)
+        if ended and self._mode is AutoresetMode.SAME_STEP:
+            infos = self._restart(infos)
+        return self._batch.observation(ALL), rewards, terminated, truncated, {**self._batch.info(ALL), **infos}
+
+    def _begin(self, mask: Bools, seeds: Sequence[int | None], options: Options, infos: Infos) -> Infos:
+        """Begin the masked episodes; return the infos with what began."""
+        for index in np.flatnonzero(mask).tolist():
+            seed = seeds[index]
+            if seed is not None:
+                self._generators[index] = gymnasium.utils.seeding.np_random(seed)[0]
+            facts = self._batch.begin(index, seed, self._generators[index], options)
+            self._begun[index], self._ended[index] = True, False
+            infos = self._add_info(infos, facts, index)
+        return infos
+
+    def _restart(self, infos: Infos) -> Infos:
+        """Begin the next episodes in the step in which the last ones ended; return infos with their last views."""
+        ended, rows = self._ended.copy(), self._batch.observation(ALL)
+        last = np.full(self.num_envs, None, dtype=object)
+        for index in np.flatnonzero(ended).tolist():
+            last[index] = rows[index]
+        final = {**infos, **self._batch.info(ALL)}
+        infos = self._begin(ended, [None] * self.num_envs, {}, {})
+        return infos | {"final_obs": last, "_final_obs": ended, "final_info": final, "_final_info": ended.copy()}
+
+
+class VectorExcavatorEnv(VectorEnvironment):
     """Excavator fronts side by side, each with its own machine, soil and seed; the same bits as `ExcavatorEnv`.
 
     Args:
@@ -41,11 +141,12 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
         settings: of each machine.
         channels: name, unit and kind of each value of an observation.
         rate_hz: ticks per second.
-        models: the nominal machine of each episode.
 
     Raises:
         ConfigError: a setting is unknown or out of range, or those of the machines cannot go side by side.
     """
+
+    _batch: SimulatorBatch
 
     def __init__(
         self,
@@ -55,157 +156,30 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
         render_mode: None = None,
         **changes: Any,
     ) -> None:
-        if render_mode is not None:
-            raise ConfigError(f"environment: render_mode = {render_mode!r}; there is nothing to render, leave it out")
-        if not 1 <= num_envs <= MOST_MACHINES:
-            raise ConfigError(f"environment: num_envs = {num_envs}; give 1 to {MOST_MACHINES}")
-        self.num_envs, self.settings = num_envs, _side_by_side(num_envs, settings, changes)
-        try:
-            mode = AutoresetMode(autoreset_mode)
-        except ValueError as error:
-            modes = ", ".join(entry.value for entry in AutoresetMode)
-            raise ConfigError(f"environment: autoreset_mode = {autoreset_mode!r}; choose one of {modes}") from error
-        self.metadata = {"render_modes": [], "autoreset_mode": mode}
-        self.channels: tuple[Channel, ...] = self.settings[0].channels
-        self.rate_hz, self.render_mode = self.settings[0].rate_hz, None
-        self.single_observation_space, self.single_action_space = spaces(self.channels)
-        self.observation_space, self.action_space = (
-            gymnasium.vector.utils.batch_space(space, num_envs)
-            for space in (self.single_observation_space, self.single_action_space)
-        )
-        self.models = [NominalMachine(each.scenario(0).load()) for each in self.settings]
-        self._mode = mode
-        self._episodes = Episodes(num_envs, self.settings[0].columns)
-        self._levers, self._pilots = np.zeros((num_envs, at.AXES)), np.zeros(num_envs)
-        self._generators = [np.random.default_rng() for _ in range(num_envs)]
-        self._begun, self._in_soil = np.zeros(num_envs, dtype=np.bool_), False
-        self._present = self._episodes.new_out()
-        for array in self._present[:2]:
-            # What has not begun shows nothing.
-            array[:] = np.nan
+        check_render("environment", render_mode)
+        mode = checked_mode("environment", num_envs, autoreset_mode)
+        self.settings = _side_by_side(num_envs, settings, changes)
+        super().__init__(SimulatorBatch(self.settings), mode)
+        self.channels: tuple[Channel, ...] = self._batch.channels
 
-    def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, object] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, object]]:
-        """Begin episodes.
-
-        Args:
-            seed: of the first, the others count on; or one for each; None goes on with the generators of each.
-            options: as those of `ExcavatorEnv`, for all; ``reset_mask``, shape (num_envs,), resets these alone.
-
-        Returns:
-            Observations, shape (num_envs, channel), and what began, as arrays beside masks such as ``_machine``.
-
-        Raises:
-            ConfigError: an option or the number of seeds is not possible.
-        """
-        options = dict(options or {})
-        mask = check_mask(self.num_envs, options.pop("reset_mask", None))
-        seeds = [None] * self.num_envs if seed is None else seed
-        if isinstance(seeds, int | np.integer):
-            seeds = [int(seeds) + i for i in range(self.num_envs)]
-        if len(seeds) != self.num_envs:
-            raise ConfigError(f"reset: {len(seeds)} seeds for {self.num_envs} machines; give one for each, or one")
-        infos = self._begin(mask, seeds, options)
-        return self._present[0].copy(), {**infos, "truth": self._truth()}
-
-    def step(self, actions: Any) -> tuple[NDArray[np.float32], Array, Bools, Bools, dict[str, object]]:
-        """Hold lever positions, shape (num_envs, 3), for one tick.
-
-        Raises:
-            ConfigError: they are not finite or of another shape, or an episode has ended or not begun.
-            SimulationError: a state became non-finite.
-        """
-        levers = np.asarray(actions, dtype=float)
-        if levers.shape != self._levers.shape:
-            raise ConfigError(f"levers of shape {levers.shape}; give shape {self._levers.shape}: boom, arm, bucket")
-        self._levers[:] = levers
-        ended = self._present[2].copy()
-        resets = self._mode is AutoresetMode.NEXT_STEP
-        stuck = ~self._begun if resets else ~self._begun | ended
-        if stuck.any():
-            raise ConfigError(f"episodes {shown(np.flatnonzero(stuck).tolist())} are not under way; call reset() first")
-        infos: dict[str, object] = {}
-        if resets and ended.any():
-            # An episode that is reset in this step ignores its levers.
-            self._episodes.step(self._levers, self._present, ~ended)
-            infos = self._begin(ended, [None] * self.num_envs, {})
-        else:
-            self._episodes.step(self._levers, self._present)
-        truncated = self._present[2].copy()
-        if self._mode is AutoresetMode.SAME_STEP and truncated.any():
-            infos = self._next_at_once(truncated)
-        infos["truth"] = self._truth()
-        never = np.zeros(self.num_envs, dtype=np.bool_)
-        return self._present[0].copy(), np.zeros(self.num_envs), never, truncated, infos
+    @property
+    def models(self) -> list[NominalMachine]:
+        """The nominal machine of each episode."""
+        return self._batch.models
 
     def snapshot(self, index: int) -> Moment:
-        """Return a snapshot of one machine; `ExcavatorEnv.restore` accepts it, too.
+        """Return a snapshot of one machine, see `ExcavatorEnv.snapshot`."""
+        return self._batch.episodes.moment(index)
 
-        Raises:
-            ConfigError: no episode has begun there.
-        """
-        return self._episodes.moment(index)
-
-    def restore(self, index: int, snapshot: Moment) -> NDArray[np.float32]:
-        """Restore one machine to a snapshot of this or another environment.
-
-        Returns:
-            Its observation of that moment, shape (channel,).
-
-        Raises:
-            ConfigError: the snapshot is of an environment that shows other channels.
-        """
-        self._episodes.go_to(index, snapshot)
-        self._episodes.show(index, self._present)
-        self._enter(index)
-        observation: NDArray[np.float32] = self._present[0][index].copy()
-        return observation
-
-    def _begin(self, mask: Bools, seeds: Sequence[int | None], options: dict[str, object]) -> dict[str, object]:
-        """Begin the masked episodes; returns what began."""
-        infos: dict[str, object] = {}
-        for index in np.flatnonzero(mask).tolist():
-            seed = check_seed(seeds[index])
-            if seed is not None:
-                self._generators[index] = gymnasium.utils.seeding.np_random(seed)[0]
-            else:
-                seed = int(self._generators[index].integers(MOST_SEED))
-            start, facts = episode_start(self.settings[index], seed, options)
-            self._episodes.begin(index, start, self._present)
-            self._enter(index)
-            infos = self._add_info(infos, facts, index)
-        return infos
-
-    def _next_at_once(self, truncated: Bools) -> dict[str, object]:
-        """Begin the next episodes in the step in which the last ones ended, and keep what these showed last."""
-        last_observations = np.full(self.num_envs, None, dtype=object)
-        for index in np.flatnonzero(truncated).tolist():
-            last_observations[index] = self._present[0][index].copy()
-        last_truth = self._truth()
-        infos = self._begin(truncated, [None] * self.num_envs, {})
-        infos["final_obs"], infos["_final_obs"] = last_observations, truncated.copy()
-        infos["final_info"], infos["_final_info"] = {"truth": last_truth}, truncated.copy()
-        return infos
-
-    def _enter(self, index: int) -> None:
-        """Take note of an episode's machine and soil."""
-        start = self._episodes.starts[index]
-        if start is None:
-            raise ConfigError(f"episode {index} has not begun; reset it first")
-        if start.machine is not self.models[index].machine:
-            self.models[index] = NominalMachine(start.machine)
-        self._pilots[index], self._begun[index] = start.machine.valves.pilot_pressure, True
-        starts = self._episodes.starts
-        self._in_soil = any(each is not None and bool(each.scenario.material) for each in starts)
-
-    def _truth(self) -> Truth:
-        pilots, episodes = self._pilots.copy(), self._episodes
-        return Truth(self._present[1].copy(), pilots, self._in_soil, episodes.most_faults, episodes.shares())
+    def restore(self, index: int, snapshot: Moment) -> Observations:
+        """Restore one machine to a snapshot, also of another environment, see `ExcavatorEnv.restore`."""
+        self._batch.restore(index, snapshot)
+        self._begun[index], self._ended[index] = True, self._batch.ended[index]
+        return self._batch.observation(index)
 
 
 def _side_by_side(
-    count: int, settings: EnvironmentSpec | Sequence[EnvironmentSpec] | None, changes: dict[str, object]
+    count: int, settings: EnvironmentSpec | Sequence[EnvironmentSpec] | None, changes: Infos
 ) -> list[EnvironmentSpec]:
     """Return the settings of each machine.
 

@@ -16,6 +16,7 @@ from edp.sim.faults.course import MachineCourse, SensorCourse, numbers_of, share
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
 from edp.sim.physics import soil
+from edp.sim.physics.material import load_material
 from edp.sim.physics.plant import Plant
 from edp.sim.scenario import Scenario, SimulationError
 from edp.sim.sensors import alterations, chain, draws
@@ -113,9 +114,7 @@ class Episodes:
         if how == tick.FINE:
             return
         if how == tick.NOT_FINITE_LEVER:
-            raise ConfigError(
-                f"levers of episode {failed} are {levers[failed].tolist()}; give three finite numbers from -1 to 1"
-            )
+            raise not_finite(levers, failed)
         start = self.starts[failed]
         if start is None:
             raise ConfigError(f"episode {failed} has not begun; reset it first")
@@ -191,7 +190,7 @@ class Episodes:
         losses[done:] = _losses(start, len(losses), lost)[done:]
         if start.scenario.material:
             soil.redraw_course(
-                soil.load_material(start.scenario.material),
+                load_material(start.scenario.material),
                 blocks.view(blocks.SOIL_NUMBERS, self.memory[index], drawn)[0],
                 blocks.view(blocks.GROUND_MEMORY, self.memory[index], drawn)[0],
                 blocks.view(blocks.SOIL_COURSE, self.memory[index], drawn),
@@ -208,6 +207,14 @@ class Episodes:
             return
         self.memory, self.drawn = _long_enough(self.memory, len(memory)), _long_enough(self.drawn, len(drawn))
         self.memory[index, : len(memory)], self.drawn[index, : len(drawn)] = memory, drawn
+
+
+def not_finite(levers: Array, index: int) -> ConfigError:
+    """Return the error for levers, shape (episode, 3), that are not finite in one episode."""
+    return ConfigError(
+        f"levers of episode {index} are not finite: {levers[index].tolist()}; expected finite numbers from -1 to 1: "
+        "give three finite positions, boom, arm and bucket"
+    )
 
 
 def _long_enough(rows: Array, length: int) -> Array:

@@ -8,7 +8,6 @@ is larger by c cot(phi). Soil is moved in the height profile, which counts mass.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +15,7 @@ from numpy.typing import NDArray
 from edp.sim.machine import layout as at
 from edp.sim.physics.ground_profile import DEEPEST, GRAVITY, SPACING, height_at, rut_depth
 from edp.sim.physics.jit import compiled
-
-if TYPE_CHECKING:
-    from edp.sim.physics.soil import Material
+from edp.sim.physics.material import Material
 
 Array = NDArray[np.float64]
 # numbers of the back: share pushed ahead (0: the back moves no soil), N/m^2 and N/m of depth, tangent of its friction

@@ -12,22 +12,19 @@ from __future__ import annotations
 
 import math
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.sim.machine import layout as at
+from edp.sim.machine.machine import Machine
 from edp.sim.physics import bucket_back
 from edp.sim.physics.ground_profile import DEEPEST, GRAVITY, press, rut_depth
 from edp.sim.physics.ground_profile import SPACING as SPACING
 from edp.sim.physics.ground_profile import height_at as height_at
 from edp.sim.physics.jit import compiled, inlined
+from edp.sim.physics.material import Material
 from edp.sim.sensors import filters
-
-if TYPE_CHECKING:
-    from edp.sim.machine.machine import Machine
-    from edp.sim.physics.soil import Material
 
 Array = NDArray[np.float64]
 Ground = tuple[Array, ...]

@@ -149,13 +149,13 @@ def solve_base(torque: Doubles, inertia: Doubles, poses: Poses, guess: Machine) 
     return np.asarray(size * np.linalg.lstsq(matrix * size, goal, rcond=None)[0])
 
 
-def convert_bodies(load: Doubles, guess: Machine) -> Bodies:
+def read_bodies(load: Doubles, guess: Machine) -> Bodies:
     """Return the bodies of a grey box with a known linkage from its load parameters; lengths are the guess's."""
     mass, x, y, inertia = load.reshape(-1, BODY_VALUES).T * np.array([[GIGA], [1.0], [1.0], [GIGA]])
     return replace(guess.bodies, mass=_triple(mass), com_x=_triple(x), com_y=_triple(y), inertia=_triple(inertia))
 
 
-def realised(base: Doubles, guess: Machine) -> Bodies:
+def realise_bodies(base: Doubles, guess: Machine) -> Bodies:
     """Return bodies with these nine base parameters, in proportions as near to the guess's as possible.
 
     Raises:

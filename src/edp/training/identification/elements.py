@@ -104,12 +104,13 @@ def full_commands(channels: TwinChannels, elements: Elements, machine: Machine) 
     return [by_kind[kinds[valve.extend]] for valve in elements.valves]
 
 
-def parts_of(twin: GreyTwin, elements: Elements, machine: Machine, celsius: float) -> GreyParts:
+def parts_of(twin: GreyTwin, machine: Machine, celsius: float) -> GreyParts:
     """Return the mapping from grey-box elements to machine parts.
 
     Raises:
         ConfigError: elements that are no excavator front, or pumps that are paired otherwise.
     """
+    elements = twin.spec.elements(twin.channels)
     if elements.motors:
         raise ConfigError(NO_MOTORS)
     names = [cylinder.name for cylinder in elements.cylinders]

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.networks.twin.grey.datasheet import NORMAL, UNEXCITED
+from edp.networks.twin.parameters import FARTHEST, NORMAL, UNEXCITED, interval
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import CYLINDERS
-from edp.training.identification.bodies import NAMES, Poses, base_parameters, convert_bodies, grey_load, solve_base
+from edp.training.identification.bodies import NAMES, Poses, base_parameters, grey_load, read_bodies, solve_base
 from edp.training.identification.machine_numbers import MACHINE_NUMBERS
-from edp.training.identification.tie import STEP, MachineTie
+from edp.training.identification.parametrisation import STEP, MachineParametrisation
 from edp.wording import typed
 
 Doubles = NDArray[np.float64]
@@ -71,39 +71,41 @@ def number_rows(base: Machine, machine: Machine, left: Doubles, excited: NDArray
     """
     rows = []
     for number, share, is_known in zip(MACHINE_NUMBERS, left, excited, strict=True):
-        value, reach = number.of(machine), np.exp(NORMAL * share * number.width)
-        ends = (value / reach, value * reach) if is_known else (value, value)
-        rows.append(
-            IdentifiedNumber(
-                number.label, number.group, number.unit, number.of(base), value, float(ends[0]), float(ends[1]),
-                bool(is_known), bool(is_known and reach <= 1.0 + TOLD),
-            )
-        )  # fmt: skip
+        # Where parts of the logs contradict one another, an interval may have no end.
+        value, deviation = number.of(machine), min(share, FARTHEST) * number.width
+        low, high = interval(value, deviation if is_known else 0.0, positive=True)
+        is_told = bool(is_known and np.exp(NORMAL * deviation) <= 1.0 + TOLD)
+        measured = number.label, number.group, number.unit, number.of(base), value, float(low), float(high)
+        rows.append(IdentifiedNumber(*measured, bool(is_known), is_told))
     return rows
 
 
 def body_rows(
-    tie: MachineTie, load: Doubles, covariance: Doubles, z_of: tuple[Doubles, Doubles], poses: Poses
+    parametrisation: MachineParametrisation,
+    load: Doubles,
+    covariance: Doubles,
+    z_of: tuple[Doubles, Doubles],
+    poses: Poses,
 ) -> tuple[Doubles, list[IdentifiedNumber]]:
     """Return the nine base parameters of the bodies with one row each.
 
     Args:
-        tie: the guess, and which element is which.
-        load: numbers of the load, in units of the grey box.
+        parametrisation: the guess, and which element is which.
+        load: load parameters, in units of the grey box.
         covariance: of their coordinates.
         z_of: middle and scale of the strokes.
         poses: of the logs.
     """
-    base, table = tie.base, tie.parts.table
+    base, table = parametrisation.base, parametrisation.parts.table
 
     def solved(values: Doubles) -> Doubles:
         if table.front is not None:
-            return base_parameters(convert_bodies(values, base))
+            return base_parameters(read_bodies(values, base))
         return solve_base(*grey_load(table, values, z_of, poses), poses, base)
 
     nine, guess = solved(load), base_parameters(base.bodies)
     slopes = np.empty((len(nine), len(load)))
-    for k, size in enumerate(tie.load_slope(load)):
+    for k, size in enumerate(parametrisation.load_priors.slopes(load)):
         moved = np.zeros(len(load))
         moved[k] = STEP * size
         slopes[:, k] = (solved(load + moved) - solved(load - moved)) / (2.0 * STEP)
@@ -112,7 +114,7 @@ def body_rows(
     rows = []
     for i, name in enumerate(NAMES):
         reach, unit = NORMAL * float(left[i]), "kg m" if i < 6 else "kg m^2"
-        ends = (float(nine[i]) - reach, float(nine[i]) + reach)
+        ends = interval(float(nine[i]), float(left[i]), positive=False)
         excited, is_told = bool(left[i] < UNEXCITED * before[i]), reach <= TOLD * abs(float(nine[i]))
         label = f"bodies.{name}"
         rows.append(

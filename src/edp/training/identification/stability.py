@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 
 from edp.data.series import Series
 from edp.networks.twin.greybox import GreyTwin
+from edp.networks.twin.parameters import Parametrisation
 from edp.training.blas import one_blas_thread
-from edp.training.grey_fit import GreyProblem, Tie
+from edp.training.grey_fit import GreyProblem
 
 Doubles = NDArray[np.float64]
 LEAST_BLOCKS, MOST_BLOCKS = 6, 16
@@ -35,12 +36,14 @@ TICKS = 3000
 
 
 @one_blas_thread()
-def covariance(twin: GreyTwin, tie: Tie, theta: Doubles, train: Sequence[Series], seed: int) -> Doubles:
+def covariance(
+    twin: GreyTwin, parametrisation: Parametrisation, theta: Doubles, train: Sequence[Series], seed: int
+) -> Doubles:
     """Return the covariance of the fitted coordinates; the prior's if the logs are too short to be divided.
 
     Args:
         twin: the grey box at the optimum.
-        tie: the coordinates.
+        parametrisation: the coordinates.
         theta: the optimum, in plausible deviations ``(coordinate,)``.
         train: stretches that the fit has learned from.
         seed: of the free runs.
@@ -54,11 +57,12 @@ def covariance(twin: GreyTwin, tie: Tie, theta: Doubles, train: Sequence[Series]
     rng, shape = np.random.default_rng(seed), (len(lengths), len(blocks), size)
     matrices, gradients = np.zeros((len(lengths), 2, size, size)), np.zeros(shape)
     for b, block in enumerate(blocks):
-        problem = GreyProblem(twin, block, tie)
+        problem = GreyProblem(twin, block, parametrisation)
         for k, ticks in enumerate(lengths):
             drawn = problem.draw(ticks, max(4, min(TICKS, twin.spec.fit.ticks) // ticks), rng)
-            matrix, gradients[k, b], _ = problem.losses(theta, drawn, True)
-            matrices[k, b % 2] += matrix
+            equations = problem.normal_equations(theta, drawn, True)
+            gradients[k, b] = equations.gradient
+            matrices[k, b % 2] += equations.matrix
     return spread(theta, matrices, gradients)
 
 

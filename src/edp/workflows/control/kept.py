@@ -24,24 +24,39 @@ from edp.control.models import ControlModels
 from edp.control.plant import PILOTS, PlantInterface
 from edp.control.tasks import ControlTask
 from edp.control.valve_map import SIDES, ValveMap
-from edp.errors import BundleError, StorageError
-from edp.settings.bounds import above
-from edp.signals import TABLE_A1, Channel, Kind
+from edp.errors import StorageError
+from edp.signals import TABLE_A1
 from edp.sim.environment import NominalMachine
 from edp.sim.machine.machine_checks import MACHINE_FILE
 from edp.sim.machine.machine_files import load_machine
 from edp.storage import make_folder, write_bytes, write_json
-from edp.storage.headers import read_header
-from edp.storage.paths import entries_of, is_file_at
-from edp.storage.reading import Table
+from edp.storage.arrays import ArrayRule, checked_arrays
+from edp.storage.paths import is_file_at
 from edp.storage.runs import missing_text
-from edp.training.bundle import add_plugins, check_hash, convert_damage, read_arrays, write_arrays
+from edp.training.bundle import (
+    add_plugins,
+    channel_from_plain,
+    channel_to_plain,
+    convert_damage,
+    read_arrays,
+    remove_old_arrays,
+    sealed_header,
+    write_arrays,
+)
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 
 KEPT, HEADER, MACHINE, TWIN = "controller", "controller.json", "machine.toml", "twin"
 SCHEMA = 1
 GOLDEN_TICKS = 150
 """Stored length of the loop: 1.5 s, in which the machine begins to move."""
+ARRAYS = {
+    "observed": ArrayRule(("ticks", "channels"), is_finite=False),
+    "levers": ArrayRule(("ticks", AXES)),
+    "strokes": ArrayRule(("reference ticks", AXES)),
+    "tip": ArrayRule(("reference ticks", AXES)),
+}
+MAP = {"map_levers": ArrayRule((AXES, len(SIDES), "points")), "map_speeds": ArrayRule((AXES, len(SIDES), "points"))}
+"""Arrays of a valve map."""
 Array = NDArray[np.float64]
 
 
@@ -102,19 +117,18 @@ def keep_controller(
         save_twin(replace(load_twin(twin), ground=None), folder / TWIN)
     machine = MACHINE_FILE.plain(plant.geometry.machine)
     write_bytes(folder / MACHINE, tomli_w.dumps(machine).encode())
+    entry = write_arrays(folder, "arrays", save_arrays({k: np.ascontiguousarray(v) for k, v in arrays.items()}))
     header = {
         "schema": SCHEMA,
         "edp": __version__,
         "rate_hz": plant.rate_hz,
         "source": plant.source,
-        "channels": [{"name": c.name, "kind": str(c.kind), "description": c.description} for c in plant.channels],
+        "channels": [channel_to_plain(channel) for channel in plant.channels],
         "twin": twin is not None,
-        "arrays": write_arrays(folder, "arrays", save_arrays({k: np.ascontiguousarray(v) for k, v in arrays.items()})),
+        "arrays": entry,
     }
     write_json(folder / HEADER, add_plugins(header))
-    for old in entries_of(folder, "arrays-*.safetensors"):
-        if old.name != header["arrays"]["file"]:  # type: ignore[index]
-            old.unlink(missing_ok=True)
+    remove_old_arrays(folder, ("arrays",), (entry["file"],))
     return folder
 
 
@@ -131,19 +145,12 @@ def load_kept(run: str | Path) -> KeptController:
     if not is_file_at(folder / HEADER):
         raise StorageError(missing_text(path, "control", "a run of edp control, or is one of an earlier version"))
     with convert_damage(folder):
-        header = read_header(folder / HEADER, ("schema",))
-        if header["schema"] != SCHEMA:
-            raise BundleError(
-                f"controller '{folder}' has schema {str(header['schema'])[:40]}, this EDP ({__version__}) reads "
-                f"{SCHEMA}; install a newer one, or run edp control again"
-            )
-        check_hash(header, folder / HEADER)
-        channels = tuple(_channel(entry) for entry in header["channels"])
+        header = sealed_header(folder / HEADER, "controller", (SCHEMA,), "run edp control again")
+        channels = tuple(channel_from_plain(entry) for entry in header["channels"])
         arrays = load_arrays(read_arrays(folder, header["arrays"]))
-        valve_map = _check_arrays(arrays, len(channels))
-        rate = above(0.0, 1e6)
-        if not rate.holds(header["rate_hz"]):
-            raise ValueError(f"its rate_hz is {str(header['rate_hz'])[:40]}; {rate.rule('rate_hz')} must hold")
+        rules = ARRAYS | (MAP if {*MAP} & {*arrays} else {})
+        arrays = checked_arrays(arrays, rules, "its arrays", {"channels": len(channels)})
+        valve_map = _valve_map(arrays)
     machine = load_machine(str(folder / MACHINE))
     commands = tuple(TABLE_A1[name] for name in PILOTS)
     nominal = NominalMachine(machine)
@@ -152,30 +159,15 @@ def load_kept(run: str | Path) -> KeptController:
     twin = load_twin(folder / TWIN) if header["twin"] is True else None
     experiment = load_control_experiment(path / "config.toml")
     models = ControlModels(valve_map, None if twin is None else twin.twin)
-    golden = {name: arrays[name].astype(float) for name in ("observed", "levers", "strokes", "tip")}
+    golden = {name: arrays[name] for name in ARRAYS}
     return KeptController(experiment, plant, models, twin, **golden)
 
 
-def _channel(entry: Table) -> Channel:
-    if not all(isinstance(entry[key], str) for key in ("name", "description")):
-        raise TypeError("the name or description of a channel is no text")
-    return Channel(entry["name"], Kind(entry["kind"]), entry["description"])
-
-
-def _check_arrays(arrays: Mapping[str, Array], channels: int) -> ValveMap | None:
-    """Return the valve map if present, after a check of shapes and values of all arrays."""
-    ticks, rows = len(arrays["observed"]), len(arrays["strokes"])
-    shapes = {"observed": (ticks, channels), "levers": (ticks, AXES), "strokes": (rows, AXES), "tip": (rows, AXES)}
-    for name, shape in shapes.items():
-        if arrays[name].shape != shape:
-            raise ValueError(f"'{name}' has shape {arrays[name].shape}, {shape} must hold")
-    for name in ("levers", "strokes", "tip"):
-        if not np.isfinite(arrays[name]).all():
-            raise ValueError(f"'{name}' holds a number that is not finite")
+def _valve_map(arrays: Mapping[str, Array]) -> ValveMap | None:
+    """Return the valve map of checked arrays, if present."""
     if "map_levers" not in arrays:
         return None
     levers, speeds = arrays["map_levers"], arrays["map_speeds"]
-    good = levers.shape == speeds.shape and levers.shape[:2] == (AXES, len(SIDES)) and levers.shape[2:] > (1,)
-    if not good or not np.isfinite(levers).all() or not (np.diff(speeds, axis=2) >= 0.0).all():
-        raise ValueError("its valve map is none: rising speeds (3, 2, points) and as many levers must hold")
-    return ValveMap(levers.astype(float), speeds.astype(float))
+    if levers.shape[2] < 2 or not (np.diff(speeds, axis=2) >= 0.0).all():
+        raise ValueError(f"its valve map has {levers.shape[2]} points; at least two of rising speeds must hold")
+    return ValveMap(levers, speeds)

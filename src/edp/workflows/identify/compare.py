@@ -2,76 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.data.series import Series
-from edp.evaluation.free_run import FreeRuns
-from edp.networks.twin import Twin
-from edp.networks.twin.base import even_starts
-from edp.networks.twin.grey.elements import Elements
 from edp.networks.twin.greybox import GreyTwin
+from edp.networks.twin.windows import MeasuredWindows
 from edp.sim.machine import layout as sim
 from edp.sim.machine.machine import Machine
 from edp.sim.physics.plant import Plant
+from edp.training.identification.elements import full_commands
+from edp.training.identification.mapping import GreyParts
 
 Doubles = NDArray[np.float64]
 LOGGED = slice(sim.HEAD, sim.BRISTLE)
 """Head, rod and pump pressures of a logged sample."""
-
-
-@dataclass(frozen=True, eq=False)
-class MeasuredRuns:
-    """Stretches of recordings along which models run free.
-
-    Attributes:
-        names: recording of each.
-        commands: ``(run, prefix + tick, command)``.
-        truth: ``(run, prefix + tick + 1, answer)``.
-        prefix: measured ticks before the free run.
-    """
-
-    names: tuple[str, ...]
-    commands: NDArray[np.float32]
-    truth: NDArray[np.float32]
-    prefix: int
-
-    @staticmethod
-    def of(twin: Twin, series: Sequence[Series], seconds: float, starts: int) -> MeasuredRuns:
-        """Return evenly spread stretches; `seconds` are at most those of the longest recording.
-
-        Raises:
-            DataError: all starts lie beyond an end stop.
-        """
-        prefix = twin.prefix_ticks
-        longest = max(part.samples for part in series)
-        ticks = max(1, min(round(seconds * twin.channels.rate_hz), longest - prefix - 1))
-        runs = even_starts(twin, series, prefix + ticks + 1, starts)
-        commands = np.stack([part.inputs[at : at + prefix + ticks] for part, at in runs])
-        truth = np.stack([part.targets[at : at + prefix + ticks + 1] for part, at in runs])
-        return MeasuredRuns(tuple(part.name for part, _ in runs), commands, truth, prefix)
-
-    def answered(self, twin: Twin, answers: NDArray[np.float32]) -> FreeRuns:
-        """Return free runs with these answers ``(run, tick, answer)``."""
-        truth = self.truth[:, self.prefix :]
-        return FreeRuns(
-            twin.channels, self.names, answers, truth[:, 1:], truth[:, 0], twin.scales.low, twin.scales.high
-        )
-
-    def by_twin(self, twin: Twin) -> NDArray[np.float32]:
-        """Answers of a twin."""
-        state = twin.reset(self.commands[:, : self.prefix], self.truth[:, : self.prefix])
-        return twin.rollout(self.commands[:, self.prefix :], state)[0]
-
-    def group_by_machine(self, machine: Machine, front: FrontChannels) -> NDArray[np.float32]:
-        """Answers of a machine of the simulator: placed at each measured tick of the prefix, then on its own."""
-        answers = np.empty((len(self.names), self.commands.shape[1] - self.prefix, self.truth.shape[2]), np.float32)
-        for run, (commands, truth) in enumerate(zip(self.commands, self.truth, strict=True)):
-            answers[run] = _simulate(machine, front, commands, truth, self.prefix)
-        return answers
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,15 +39,16 @@ class FrontChannels:
     rate_hz: float
 
     @staticmethod
-    def of(twin: GreyTwin, elements: Elements, valves: Sequence[int], full: Sequence[float]) -> FrontChannels:
+    def from_twin(twin: GreyTwin, parts: GreyParts, machine: Machine) -> FrontChannels:
         """Return the channels of a grey box.
 
         Args:
             twin: the grey box.
-            elements: of it.
-            valves: place of each spool among them, -1: none ``(6,)``.
-            full: what a full command of each valve is.
+            parts: mapping of its elements to the machine.
+            machine: machine whose full commands hold.
         """
+        elements, valves = twin.spec.elements(twin.channels), (*parts.primary, *parts.conflux)
+        full = full_commands(twin.channels, elements, machine)
         sides = np.array([twin.wiring.sides[j] if j >= 0 else (-1, -1) for j in valves])
         whole = np.array([full[j] if j >= 0 else 1.0 for j in valves])
         names = [channel.name for channel in twin.channels.answers]
@@ -124,10 +71,28 @@ class FrontChannels:
         return np.where(places >= 0, row[places], np.nan).astype(np.float64)
 
 
-def _simulate(
+def simulate_machine(
+    machine: Machine, front: FrontChannels, windows: MeasuredWindows, prefix: int
+) -> NDArray[np.float32]:
+    """Simulate a machine in windows of recordings: placed at each measured tick of the prefix, then on its own.
+
+    Args:
+        machine: machine of the simulator.
+        front: channels of the recordings.
+        windows: commands and measured outputs.
+        prefix: measured ticks before the free run.
+
+    Returns:
+        Outputs after the prefix ``(window, tick, output)``.
+    """
+    runs = zip(windows.commands, windows.outputs, strict=True)
+    return np.stack([_simulate_window(machine, front, commands, truth, prefix) for commands, truth in runs])
+
+
+def _simulate_window(
     machine: Machine, front: FrontChannels, commands: NDArray[np.float32], truth: NDArray[np.float32], prefix: int
 ) -> NDArray[np.float32]:
-    """Return answers ``(tick, answer)`` after the prefix."""
+    """Return the outputs of one window after the prefix ``(tick, output)``."""
     demands, (speeds, strokes) = front.demands(commands), front.columns[:, :2].T
     plant = Plant(machine, truth[0, strokes] / np.array(machine.cylinders.stroke), front.rate_hz)
     plant.rest_at(demands[0])

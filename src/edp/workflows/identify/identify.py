@@ -12,19 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.config.twin import TWIN_SETTINGS, TwinExperiment, load_twin_experiment, twin_toml
+from edp.data.oil import FREEZING_K, OIL
 from edp.data.prepared import Prepared
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, DataError, StorageError
-from edp.evaluation.free_run import check_runs, free_run_scores
+from edp.evaluation.free_run import check_runs, free_run_scores, free_runs
 from edp.evaluation.free_run_file import FreeRunScores
 from edp.evaluation.guard import GREY, MACHINE
 from edp.logs.source import DataSource
-from edp.networks.twin import TWINS, TwinSpec, fit_scales
-from edp.networks.twin.grey.datasheet import BASIS, UNEXCITED
-from edp.networks.twin.grey.elements import Elements
+from edp.networks.twin import TWINS, TwinSpec, even_starts, fit_scales
+from edp.networks.twin.grey.datasheet import BASIS
 from edp.networks.twin.greybox import POLYNOMIALS, GreyBox, GreyTwin
 from edp.networks.twin.model_selection import KINDS, AutoTwin
+from edp.networks.twin.parameters import UNEXCITED, posterior_deviations
 from edp.networks.twin.residual import Residual
+from edp.networks.twin.windows import MeasuredWindows
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.settings.results import plain_value
@@ -38,7 +40,7 @@ from edp.storage.paths import is_there
 from edp.storage.provenance import PROVENANCE
 from edp.storage.runs import Run, check_claimable, run_key
 from edp.training.grey_fit import GreyProblem, fit_grey_box
-from edp.training.identification.bodies import Poses, convert_bodies, realised
+from edp.training.identification.bodies import Poses, read_bodies, realise_bodies
 from edp.training.identification.elements import (
     NO_MOTORS,
     check_same_linkage,
@@ -50,21 +52,19 @@ from edp.training.identification.elements import (
 from edp.training.identification.machine_numbers import MACHINE_NUMBERS
 from edp.training.identification.machine_text import machine_text
 from edp.training.identification.mapping import GreyParts
+from edp.training.identification.parametrisation import MachineParametrisation, nearest_machine, reset_to_guess
 from edp.training.identification.rows import TOLD, IdentifiedNumber, body_rows, line_comments, number_rows
 from edp.training.identification.stability import covariance
-from edp.training.identification.tie import MachineTie, deviations, fix_coordinates, nearest
 from edp.training.progress_steps import free_run_steps
 from edp.training.provenance import training_provenance
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 from edp.wording import percent, typed
-from edp.workflows.identify.compare import FrontChannels, MeasuredRuns
+from edp.workflows.identify.compare import FrontChannels, simulate_machine
 from edp.workflows.twin.prepare_twin import cut_recordings
 
 Doubles = NDArray[np.float64]
 KIND, RUN, RESULT, GREY_FOLDER = "identification", ".run", "identification.json", "grey"
 GREY_STAGE = "grey_box"
-OIL = "OilTemperature"
-FREEZING = 273.15
 LAST_STAGES = 2
 """Of the fit's stages, those that refine the machine itself: its free runs are long from the beginning."""
 ROUNDS_THAT_INFORM = 3
@@ -93,18 +93,17 @@ class _Fitted:
     """Grey box of an excavator front, with the information on its numbers."""
 
     twin: GreyTwin
-    elements: Elements
     information: Doubles
 
 
 @dataclass(frozen=True, eq=False)
-class _Tied:
+class _FittedMachine:
     """The machine fitted through its grey box: that at the end of the fit, coordinates, where they ended, and what the
     last rounds knew of them.
     """
 
     twin: GreyTwin
-    tie: MachineTie
+    coordinates: MachineParametrisation
     theta: Doubles
     information: Doubles
 
@@ -167,7 +166,7 @@ def identify(
             fitted = _fit_grey_box(opened, base, machine, grey, (channels, data, settings.training.seed), progress)
         else:
             fitted = _add_information(loaded[0], data, settings.training.seed)
-        parts = parts_of(fitted.twin, fitted.elements, base, celsius)
+        parts = parts_of(fitted.twin, base, celsius)
         notes += _notes(parts)
         progress.note("fitting the machine itself to free runs")
         fit = _refine_machine(opened, base, parts, fitted, (data, settings), progress)
@@ -176,7 +175,9 @@ def identify(
             opened,
             "covariance",
             {"covariance": (len(fit.theta), len(fit.theta))},
-            lambda: {"covariance": covariance(fit.twin, fit.tie, fit.theta, data.train, settings.training.seed)},
+            lambda: {
+                "covariance": covariance(fit.twin, fit.coordinates, fit.theta, data.train, settings.training.seed)
+            },
         )["covariance"]
         machine_found, rows, doubts = _machine(fit, spread, data)
         notes += doubts
@@ -309,7 +310,7 @@ def _fit_grey_box(
     if not isinstance(grey, GreyTwin):
         raise StorageError(f"'{run.file(GREY_FOLDER)}' holds no grey box; remove '{run.path}' and start again")
     count = len(grey.numbers)
-    return _Fitted(grey, elements, _read_stage(run, GREY_STAGE, {"information": (count, count)})["information"])
+    return _Fitted(grey, _read_stage(run, GREY_STAGE, {"information": (count, count)})["information"])
 
 
 def _add_information(twin: GreyTwin, data: Prepared, seed: int) -> _Fitted:
@@ -319,8 +320,8 @@ def _add_information(twin: GreyTwin, data: Prepared, seed: int) -> _Fitted:
     ticks = max(1, round(spec.lengths_s[-1] * twin.channels.rate_hz))
     for _ in range(ROUNDS_THAT_INFORM):
         drawn = problem.draw(ticks, max(8, min(spec.lanes, spec.ticks // ticks)), rng)
-        total += problem.losses(np.zeros(len(twin.numbers)), drawn, True)[0]
-    return _Fitted(twin, twin.spec.elements(twin.channels), total / ROUNDS_THAT_INFORM)
+        total += problem.normal_equations(np.zeros(len(twin.numbers)), drawn, True).matrix
+    return _Fitted(twin, total / ROUNDS_THAT_INFORM)
 
 
 def _refine_machine(
@@ -330,66 +331,63 @@ def _refine_machine(
     fitted: _Fitted,
     logs: tuple[Prepared, TwinExperiment],
     progress: Progress,
-) -> _Tied:
+) -> _FittedMachine:
     """Return the machine fitted to free runs through its grey box."""
     data, settings = logs
-    tie = MachineTie.of(base, parts, fitted.twin.numbers[parts.load])
-    tie = replace(tie, begin=nearest(tie, fitted.twin.numbers, fitted.information))
-    fit = fitted.twin.spec.fit
+    guess = MachineParametrisation.from_guess(base, parts, fitted.twin.numbers[parts.load])
+    own = replace(guess, begin=nearest_machine(guess, fitted.twin.numbers, fitted.information))
+    twin, fit = fitted.twin, fitted.twin.spec.fit
     last = replace(fit, lengths_s=fit.lengths_s[-LAST_STAGES:], rounds=fit.rounds[-LAST_STAGES:], starts=1)
-    twin = fitted.twin
     spec = replace(twin.spec, fit=last)
-    tied = GreyTwin(twin.channels, twin.scales, spec, (twin.table, twin.wiring), tie.numbers(tie.begin), twin.full)
+    tied = GreyTwin(twin.channels, twin.scales, spec, (twin.table, twin.wiring), own.values(own.begin), twin.full)
 
     def refine() -> dict[str, Doubles]:
         result = fit_grey_box(
-            tied, data.train, data.validation, settings.training.seed + 1, free_run_steps(progress), tie
+            tied, data.train, data.validation, settings.training.seed + 1, free_run_steps(progress), own
         )
         return {"theta": result.theta, "information": result.information}
 
-    count = len(tie.begin)
+    count = len(own.begin)
     stage = _stage(run, "machine", {"theta": (count,), "information": (count, count)}, refine)
-    every = replace(twin.spec, fit=fit)
-    end = GreyTwin(twin.channels, twin.scales, every, (twin.table, twin.wiring), tie.numbers(stage["theta"]), twin.full)
-    return _Tied(end, tie, stage["theta"], stage["information"])
+    return _FittedMachine(twin.with_parameters(own.values(stage["theta"])), own, stage["theta"], stage["information"])
 
 
-def _machine(fit: _Tied, spread: Doubles, data: Prepared) -> tuple[Machine, list[IdentifiedNumber], list[str]]:
+def _machine(fit: _FittedMachine, spread: Doubles, data: Prepared) -> tuple[Machine, list[IdentifiedNumber], list[str]]:
     """Return the machine of the coordinates, with undetermined ones reset to the guess; one row per number, and notes.
 
     Where no rigid bodies have the fitted load, as after short logs, the guess's bodies stay: valves and pumps are worth
     having without them.
     """
-    twin, tie, theta, information = fit.twin, fit.tie, fit.theta, fit.information
+    twin, own, theta, information = fit.twin, fit.coordinates, fit.theta, fit.information
     count, left = len(MACHINE_NUMBERS), np.sqrt(np.diag(spread))
     # What the fit had no information of; a number that is told badly stays where the others made up for it.
-    excited = deviations(information)[:count] < UNEXCITED
+    excited = posterior_deviations(information)[:count] < UNEXCITED
     back = np.concatenate([~excited, np.zeros(len(theta) - count, np.bool_)])
-    final = replace(tie, free=excited)
-    settled = fix_coordinates(theta, information, back)
-    machine, load = final.machine(settled), tie.load_at(settled)
+    final = replace(own, free=excited)
+    settled = reset_to_guess(theta, information, back)
+    machine, load = final.machine(settled), own.load_at(settled)
     valves = machine.valves
-    missing = np.array(tie.parts.conflux) < 0
+    missing = np.array(own.parts.conflux) < 0
     shares: dict[str, Any] = {
         key: tuple(0.0 if none else float(v) for v, none in zip(getattr(valves, key), missing, strict=True))
         for key in ("conflux_extend", "conflux_retract")
     }
     machine = replace(machine, valves=replace(valves, **shares))
-    machine = replace(machine, oil=replace(machine.oil, temperature=tie.parts.celsius))
+    machine = replace(machine, oil=replace(machine.oil, temperature=own.parts.celsius))
     speeds = len(twin.channels.velocities)
     strokes = np.concatenate([part.targets[:, speeds : 2 * speeds] for part in data.train]).astype(np.float64)
     poses = Poses.of(machine, strokes)
-    nine, body = body_rows(tie, load, spread[count:, count:], twin.wiring.z_of, poses)
-    numbers = number_rows(tie.base, machine, left[:count], excited)
-    if tie.parts.table.front is not None:
-        return replace(machine, bodies=convert_bodies(load, tie.base)), numbers + body, []
+    nine, body = body_rows(own, load, spread[count:, count:], twin.wiring.z_of, poses)
+    numbers = number_rows(own.base, machine, left[:count], excited)
+    if own.parts.table.front is not None:
+        return replace(machine, bodies=read_bodies(load, own.base)), numbers + body, []
     try:
-        return replace(machine, bodies=realised(nine, tie.base)), numbers + body, []
+        return replace(machine, bodies=realise_bodies(nine, own.base)), numbers + body, []
     except ConfigError as error:
         guessed_rows = [
             replace(row, value=row.base, low=row.base, high=row.base, excited=False, is_told=False) for row in body
         ]
-        return machine, numbers + guessed_rows, [f"bodies are those of machine {tie.base.name}: {error}"]
+        return machine, numbers + guessed_rows, [f"bodies are those of machine {own.base.name}: {error}"]
 
 
 def _check_strokes(channels: TwinChannels, data: Prepared, base: Machine) -> None:
@@ -411,7 +409,7 @@ def _celsius(recordings: Sequence[Recording], base: Machine) -> tuple[float, lis
     if len(logged) < len(recordings):
         celsius = base.oil.temperature
         return celsius, [f"the logs have no {OIL}: {typed(celsius)} degC of machine {base.name} is taken"]
-    celsius = float(np.nanmean(np.concatenate(logged).astype(np.float64))) - FREEZING
+    celsius = float(np.nanmean(np.concatenate(logged).astype(np.float64))) - FREEZING_K
     if not np.isfinite(celsius):
         raise DataError(f"'{OIL}' holds no number; correct the log, or leave the channel out")
     return celsius, [f"leakage, viscous friction and bulk modulus are those at the logs' mean of {celsius:.1f} degC"]
@@ -435,18 +433,19 @@ def _scores(
     """Free runs along held-out recordings: the identified machine, the guess, the grey box and the static map."""
     data, settings = logs
     twin, judge = fitted.twin, settings.judge
-    runs = MeasuredRuns.of(twin, data.test, judge.seconds, judge.starts)
-    full = full_commands(twin.channels, fitted.elements, machines[0])
-    front = FrontChannels.of(twin, fitted.elements, (*parts.primary, *parts.conflux), full)
+    prefix, grey = twin.prefix_ticks, free_runs(twin, data.test, judge.seconds, judge.starts)
+    ticks = prefix + grey.truth.shape[1]
+    windows = MeasuredWindows.read(even_starts(twin, data.test, ticks + 1, judge.starts), ticks)
+    front = FrontChannels.from_twin(twin, parts, machines[0])
     floor: TwinSpec = replace(TWINS["static"](), prefix_ticks=twin.prefix_ticks)
     static = floor.start(twin.channels, twin.scales, data.train, settings.training.seed)
-    answers = {
-        MACHINE: runs.group_by_machine(machines[1], front),
-        f"machine {machines[0].name}": runs.group_by_machine(machines[0], front),
-        GREY: runs.by_twin(twin),
-        "static map": runs.by_twin(static),
+    runs = {
+        MACHINE: replace(grey, answers=simulate_machine(machines[1], front, windows, prefix)),
+        f"machine {machines[0].name}": replace(grey, answers=simulate_machine(machines[0], front, windows, prefix)),
+        GREY: grey,
+        "static map": free_runs(static, data.test, judge.seconds, judge.starts),
     }
-    return {name: free_run_scores(runs.answered(twin, values), judge) for name, values in answers.items()}
+    return {name: free_run_scores(each, judge) for name, each in runs.items()}
 
 
 def _name(out: Path) -> str:

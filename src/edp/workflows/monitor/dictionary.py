@@ -142,7 +142,7 @@ def build_dictionary(
     """
     began = time.process_time()
     _check_machine(monitor.inputs, machine, monitor.rate_hz)
-    rows = [monitor.condition_rows(session) for session in healthy[:HEALTHY_SESSIONS]]
+    rows = [monitor.conditioned_rows(session) for session in healthy[:HEALTHY_SESSIONS]]
     rows = [part[np.isfinite(part).any(axis=1)] for part in rows]
     if not rows:
         raise DataError("a dictionary needs healthy sessions that no network was fitted to; bring more")
@@ -245,7 +245,7 @@ def _mirror(change: Array) -> Array:
 
 def _average_blocks(monitor: Monitor, recording: Recording, onset_s: float) -> Array:
     """Mean features of the blocks at an onset and of those after it, shape (2, features)."""
-    rows = monitor.condition_rows(recording)
+    rows = monitor.conditioned_rows(recording)
     at, after = parts_of(rows[int(onset_s / monitor.block_s) :])
     if at is None or after is None:
         raise _too_short(monitor.block_s)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,26 +13,19 @@ from edp.errors import ConfigError, ExportError, closest, count_of
 from edp.evaluation.monitor_footprint import MonitorFootprint, monitor_footprint
 from edp.export.golden import at_thresholds, grown_tolerance, stream, tolerance
 from edp.export.monitor import (
-    DETECTORS,
-    BalancePart,
-    ChainPart,
-    FlowPart,
     GoldenChain,
     GoldenResiduals,
     MonitorParts,
     NetworkPart,
     SourcePart,
     TwinPart,
-    WatchPart,
     drawn_rows,
     write_monitor,
     write_monitor_fmu,
     write_monitor_ros2,
 )
 from edp.monitor.chain import MonitorChain
-from edp.monitor.conditioning import GROSS, POINT_LIMIT
-from edp.monitor.detectors import DETECTORS as REGISTERED
-from edp.monitor.monitor import IMPOSSIBLE, Monitor
+from edp.monitor.monitor import Monitor
 from edp.monitor.monitor_file import HEADER, load_monitor
 from edp.monitor.residuals.balances import Balances
 from edp.monitor.residuals.base import ResidualSource
@@ -39,13 +33,11 @@ from edp.monitor.residuals.flow_balances import FlowBalances
 from edp.monitor.residuals.look_ahead import SMALLEST_WIDTH, LookAhead
 from edp.monitor.residuals.twin_ports import TwinPorts
 from edp.monitor.residuals.virtual_sensors import VirtualSensors
-from edp.monitor.watches import Watch
 from edp.networks.integer import IntegerPredictor
 from edp.networks.twin import IntegerTwinPlant, TwinPlant
 from edp.storage.paths import is_file_at
 from edp.training.bundle import Bundle
 from edp.training.twin_bundle import plant_bundle
-from edp.workflows.monitor.export_flows import flow_part
 
 FORMS: Mapping[str, tuple[str, ...]] = {"c": (), "fmu": ("version", "binaries"), "ros2": ()}
 """Forms of a monitor with their options; they are forms of networks, too."""
@@ -115,7 +107,7 @@ def monitor_parts(monitor: Monitor, golden: bool = True) -> MonitorParts:
     """
     columns = _places(monitor)
     sources = tuple(part for source in monitor.sources for part in source_parts(source, columns))
-    chain = chain_part(monitor.chain)
+    chain = monitor.chain
     parts = MonitorParts(
         title=f"monitor of {count_of(len(monitor.inputs), 'channel')}",
         digest=str(monitor.provenance.get("digest", "")) or digest_of(chain),
@@ -124,22 +116,27 @@ def monitor_parts(monitor: Monitor, golden: bool = True) -> MonitorParts:
         rate_hz=monitor.rate_hz,
         residuals=monitor.residual_names,
         reads=[tuple(columns[n] for n in reads) for source in monitor.sources for reads in source.reads],
+        columns=columns,
         sources=sources,
         chain=chain,
-        golden_chain=golden_chain(monitor.chain, chain) if golden else NO_CHAIN,
-        golden_residuals=golden_residuals(monitor) if golden else NO_RESIDUALS,
+        golden_chain=NO_CHAIN,
+        golden_residuals=NO_RESIDUALS,
     )
+    # Refused before the self-test is run: a detector without a form in C.
+    if parts.watches and golden:
+        return replace(parts, golden_chain=golden_chain(chain), golden_residuals=golden_residuals(monitor))
     return parts
 
 
-def digest_of(chain: ChainPart) -> str:
+def digest_of(chain: MonitorChain) -> str:
     """Content address of a chain."""
     import hashlib
 
     state = hashlib.blake2b(digest_size=16)
     for watch in chain.watches:
         state.update(watch.matrix.astype("<f8").tobytes() + watch.mean.astype("<f8").tobytes())
-    for values in (chain.centre, chain.spread, chain.scale, chain.usual, chain.wide):
+    summaries, conditioning = chain.summaries, chain.conditioning
+    for values in (summaries.centre, summaries.spread, summaries.scale, conditioning.usual, conditioning.spread):
         state.update(np.ascontiguousarray(values).astype("<f8").tobytes())
     return state.hexdigest()
 
@@ -159,10 +156,8 @@ def source_parts(source: ResidualSource, columns: Mapping[str, int]) -> list[Sou
         return [_look_ahead(source, bundle, columns) for bundle in source.bundles.values()]
     if isinstance(source, TwinPorts):
         return [_twin(source, columns)]
-    if isinstance(source, Balances):
-        return [_balances(source, columns)]
-    if isinstance(source, FlowBalances):
-        return [flow_part(source, columns)]
+    if isinstance(source, Balances | FlowBalances):
+        return [source]
     raise ExportError(
         f"residuals of kind '{type(source).__name__}' have no form in C; fit the monitor without them, or run it in "
         "Python"
@@ -215,71 +210,12 @@ def _twin(source: TwinPorts, columns: Mapping[str, int]) -> TwinPart:
     )
 
 
-def _balances(source: Balances, columns: Mapping[str, int]) -> BalancePart:
-    return BalancePart(
-        reads=tuple(columns[name] for name in source.inputs),
-        middle=source.middle,
-        levels=tuple(source.pairs[:, 0].tolist()),
-        rates=tuple(source.pairs[:, 1].tolist()),
-        steps=source.gains / source.rate_hz,
-        left=1.0 - 1.0 / (source.memories_s * source.rate_hz),
-    )
-
-
-# ---- chain -----------------------------------------------------------------------------------------------------------
-
-
-def chain_part(chain: MonitorChain) -> ChainPart:
-    """Return a chain as numbers.
-
-    Raises:
-        ExportError: a detector without a form in C.
-    """
-    summaries, conditioning = chain.summaries, chain.conditioning
-    return ChainPart(
-        block=summaries.block,
-        centre=summaries.centre,
-        spread=summaries.spread,
-        impossible=IMPOSSIBLE,
-        scale=summaries.scale,
-        change=summaries.change,
-        channel=tuple(summaries.channel.tolist()),
-        level=tuple(summaries.level.tolist()),
-        moving=tuple(summaries.moving.tolist()),
-        drivers=summaries.drivers,
-        point_offset=conditioning.offset,
-        point_width=conditioning.width,
-        point_limit=POINT_LIMIT,
-        usual=conditioning.usual,
-        wide=conditioning.spread,
-        least=conditioning.floor,
-        clip=conditioning.clip,
-        gross=GROSS,
-        drift_step=chain.drift.step,
-        drift_most=chain.drift.most,
-        watches=tuple(map(_watch, chain.watches)),
-        limit=chain.limit,
-        quiet=chain.quiet,
-        settle=chain.settle,
-    )
-
-
-def _watch(watch: Watch) -> WatchPart:
-    name = REGISTERED.name_of(watch.detector)
-    options = {"cusum": "slack", "separate_cusums": "slack", "ewma": "weight", "glr": "window"}
-    if name not in DETECTORS:
-        raise ExportError(
-            f"detector '{name}' has no form in C; these have: {', '.join(DETECTORS)}. Fit the monitor with one of them"
-        )
-    return WatchPart(name, float(getattr(watch.detector, options[name])), watch.mean, watch.matrix, watch.scale)
-
-
 # ---- self-test -------------------------------------------------------------------------------------------------------
 
 
-def golden_chain(chain: MonitorChain, part: ChainPart) -> GoldenChain:
+def golden_chain(chain: MonitorChain) -> GoldenChain:
     """Return the results of the chain for drawn rows."""
-    inputs, residuals = drawn_rows(part)
+    inputs, residuals = drawn_rows(chain)
     verdicts, _ = chain.run(residuals, inputs, chain.initial_state())
     last = [verdict.evidence for verdict in verdicts if verdict.alarm is not None]
     return GoldenChain(
@@ -326,10 +262,8 @@ def _fill_missing(rows: Rows, start: NDArray[np.float64]) -> Rows:
 
 def _compute_tolerance(part: SourcePart, rows: Rows) -> NDArray[np.float64]:
     """Return the tolerance of residuals in C: that of the network's numbers; zero for sums and integers."""
-    if isinstance(part, BalancePart):
-        return np.zeros(len(part.levels))
-    if isinstance(part, FlowPart):
-        return np.zeros(len(part.chambers))
+    if isinstance(part, Balances | FlowBalances):
+        return np.zeros(len(part.names))
     if isinstance(part, TwinPart):
         return _compute_twin_tolerance(part, rows)
     network, ran = part.bundle.predictor, rows[part.first :: part.every]

@@ -12,7 +12,7 @@ from typing import Any
 from edp.data.series import Series
 from edp.data.stretch_folds import StretchFold, stretch_folds
 from edp.errors import ConfigError, DataError, NotFiniteError
-from edp.evaluation.free_run import FreeRuns, free_run_scores, free_runs
+from edp.evaluation.free_run import FreeRunJudgeSpec, FreeRuns, free_run_scores, free_runs
 from edp.evaluation.free_run_file import MAX_TEXT, CandidateRow
 from edp.evaluation.guard import free_run_error
 from edp.networks.twin import TWINS, TwinSpec, fit_scales
@@ -131,9 +131,9 @@ class TwinChoice:
         tried[tried.index(chosen)] = replace(chosen, chosen=True)
         result = self._fit_final(chosen.trial)
         # What chose is no less work than what was chosen.
-        fitted = replace(result.fitted, seconds=sum(one.seconds for one in tried))
-        facts = result.facts | {"chosen": chosen.label, "folds": len(self.folds)}
-        return replace(result, fitted=fitted, facts=facts), tried
+        facts = {**result.fitted.facts, "chosen": chosen.label, "folds": len(self.folds)}
+        fitted = replace(result.fitted, seconds=sum(one.seconds for one in tried), facts=facts)
+        return replace(result, fitted=fitted), tried
 
     @cached_property
     def training(self) -> FreeRunSpec:
@@ -342,10 +342,14 @@ class TwinChoice:
 
     def _error(self, runs: Sequence[FreeRuns], reference: Sequence[FreeRuns]) -> float:
         """Return the error relative to a reference in the same folds."""
-        seconds = self.training.validation_s
-        judge = replace(self.fit.experiment.judge, seconds=seconds, at_s=tuple(sorted({a * seconds for a in AT})))
         ours, theirs = (FreeRuns.joined(some) for some in (runs, reference[: len(runs)]))
-        return free_run_error(free_run_scores(ours, judge), free_run_scores(theirs, judge))
+        return relative_error(ours, theirs, self.fit.experiment.judge, self.training.validation_s)
+
+
+def relative_error(runs: FreeRuns, reference: FreeRuns, judge: FreeRunJudgeSpec, seconds: float) -> float:
+    """Return the error of free runs of a length in seconds, relative to a reference in the same runs."""
+    judge = replace(judge, seconds=seconds, at_s=tuple(sorted({share * seconds for share in AT})))
+    return free_run_error(free_run_scores(runs, judge), free_run_scores(reference, judge))
 
 
 def _least(tried: Sequence[TwinCandidate]) -> float:

@@ -13,19 +13,18 @@ from edp.config.twin import TwinExperiment
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels, TwinChannelSettings
 from edp.errors import ConfigError, DataError
-from edp.evaluation.free_run import free_run_scores, free_runs
-from edp.evaluation.guard import free_run_error
+from edp.evaluation.free_run import free_runs
 from edp.networks.twin import TWINS, Twin
 from edp.networks.twin.model_selection import AutoTwin
-from edp.networks.twin.recurrent import RecurrentTwin, averaged, member_seed
+from edp.networks.twin.recurrent import RecurrentTwin, member_seed
 from edp.networks.twin.recurrent_members import replace_scales, scales_for, separated
-from edp.networks.twin.static_map import StaticMap, StaticTwin
+from edp.networks.twin.static_map import StaticMap
 from edp.storage.runs import PARTS, KeyedRun
-from edp.training.free_run import FittedTwin
-from edp.training.free_run_members import MemberTraining
+from edp.training.fitted_twin import FittedTwin
+from edp.training.free_run_members import MemberTraining, join_members
 from edp.training.twin_bundle import TwinBundle, load_twin, twin_hash
 from edp.wording import typed
-from edp.workflows.twin.choose_twin import AT, LENGTHENED, TwinCandidate, shortened
+from edp.workflows.twin.choose_twin import LENGTHENED, TwinCandidate, relative_error, shortened
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
 
 SHARES = (0.05, 0.15, 0.45)
@@ -175,8 +174,8 @@ class ContinuedTwin:
                 break
         best = min(range(len(tried)), key=lambda i: tried[i].error or math.inf)
         tried[best] = replace(tried[best], chosen=True)
-        fitted = replace(fits[best], seconds=sum(one.seconds for one in tried))
-        return FittedFormulation(self.start.bundle.spec, fitted, facts=self.start.provenance()), tried
+        seconds, facts = sum(one.seconds for one in tried), self.start.provenance()
+        return FittedFormulation(self.start.bundle.spec, replace(fits[best], seconds=seconds, facts=facts)), tried
 
     def _train_members(self, start: RecurrentTwin, share: float) -> FittedTwin:
         """Train each member further from its start, and average them again."""
@@ -192,29 +191,22 @@ class ContinuedTwin:
             folder = self.run.folder.path / PARTS / f"further_{sum(training.updates)}_{which}"
             jobs.append(MemberTraining(label, twin, train, validation, seeded, (folder, self.run.key), True))
         fits = list(self.fit.train_members(jobs, self.fit.on_event))
-        twins = [fit.twin for fit in fits if isinstance(fit.twin, RecurrentTwin)]
+        joined = join_members(fits)
         # One network of members that read one another stays the average that it was said to be.
-        joined = averaged(twins) if len(twins) > 1 else _set_members(twins[0], start.members)
-        several = len(fits) > 1
-        history = [row | ({"member": n} if several else {}) for n, fit in enumerate(fits) for row in fit.history]
-        return FittedTwin(joined, history, sum(fit.seconds for fit in fits))
+        return joined if len(fits) > 1 else replace(joined, twin=_set_members(joined.twin, start.members))
 
     def _error(self, twin: Twin) -> float:
         """Error of free runs of the validation part over the static map's there."""
-        training, validation = self.fit.experiment.training, self.fit.data.validation
-        seconds = training.validation_s
-        judge = replace(self.fit.experiment.judge, seconds=seconds, at_s=tuple(sorted({a * seconds for a in AT})))
+        training, data = self.fit.experiment.training, self.fit.data
+        static = StaticMap(prefix_ticks=twin.prefix_ticks).start(twin.channels, twin.scales, data.train, 0)
         ours, theirs = (
-            free_run_scores(free_runs(one, validation, seconds, training.lanes), judge)
-            for one in (twin, self._static_map(twin))
+            free_runs(one, data.validation, training.validation_s, training.lanes) for one in (twin, static)
         )
-        return free_run_error(ours, theirs)
-
-    def _static_map(self, twin: Twin) -> StaticTwin:
-        spec = StaticMap(prefix_ticks=twin.prefix_ticks)
-        return spec.start(twin.channels, twin.scales, self.fit.data.train, 0)
+        return relative_error(ours, theirs, self.fit.experiment.judge, training.validation_s)
 
 
-def _set_members(twin: RecurrentTwin, members: int) -> RecurrentTwin:
+def _set_members(twin: Twin, members: int) -> Twin:
+    if not isinstance(twin, RecurrentTwin) or twin.members == members:
+        return twin
     parts = (twin.channels, twin.scales, twin.prefix_ticks, twin.network, twin.static)
-    return twin if twin.members == members else RecurrentTwin(*parts, members)
+    return RecurrentTwin(*parts, members)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from edp.config.twin import TwinExperiment
 from edp.data.prepared import Prepared
@@ -13,14 +13,13 @@ from edp.data.twin_channels import TwinChannels
 from edp.jobs import IN_PROCESS, Workers
 from edp.networks.twin import Twin, TwinScales, TwinSpec
 from edp.networks.twin.elements import ElementsTwin
-from edp.networks.twin.grey.datasheet import datasheet
 from edp.networks.twin.greybox import GreyTwin
 from edp.networks.twin.recurrent import Recurrent
 from edp.networks.twin.residual import Residual, ResidualTwin
 from edp.progress import SILENT, Progress
 from edp.storage.runs import KeyedRun
 from edp.training.elements_fit import fit_elements
-from edp.training.free_run import FittedTwin, FreeRunProgress
+from edp.training.fitted_twin import FittedTwin, FreeRunProgress
 from edp.training.free_run_members import MemberTraining, fit_members, member_unit, one_by_one, read_progress_notes
 from edp.training.grey_fit import fit_grey_box
 from edp.training.progress_steps import free_run_steps
@@ -34,16 +33,12 @@ class FittedFormulation:
     Attributes:
         spec: the formulation with the options that were settled.
         fitted: twin, history, processor time.
-        datasheet: numbers of the machine with units and intervals; empty where the formulation has none.
-        facts: what provenance says of it.
         unseen: twins beside stretches that trained none of their weights; they calibrate the intervals. Empty where
             these are the twin itself and the validation part.
     """
 
     spec: TwinSpec
     fitted: FittedTwin
-    datasheet: list[dict[str, object]] = field(default_factory=list)
-    facts: dict[str, object] = field(default_factory=dict)
     unseen: tuple[tuple[Twin, Sequence[Series]], ...] = ()
 
 
@@ -90,23 +85,21 @@ class TwinFit:
         twin = spec.start(self.channels, self.scales, self.data.train, seed)
         if isinstance(twin, ElementsTwin):
             self.progress.note("fitting the elements to free runs")
-            lumped = fit_elements(twin, *parts, seed, self.on_event)
-            return FittedFormulation(spec, FittedTwin(lumped.twin, lumped.history, lumped.seconds), lumped.rows)
+            return FittedFormulation(spec, fit_elements(twin, *parts, seed, self.on_event))
         if not isinstance(twin, GreyTwin):
             return FittedFormulation(spec, FittedTwin(twin, [], time.process_time() - started))
         self.progress.note("fitting the grey box to free runs")
         grey = fit_grey_box(twin, *parts, seed, self.on_event)
-        numbers = datasheet(grey.twin.table, grey.twin.numbers, grey.information)
         # With as many stretches as were chosen: a bundle says how many numbers it has.
         settled = grey.twin.spec
         if not (isinstance(grey.twin, ResidualTwin) and isinstance(spec, Residual)):
-            return FittedFormulation(settled, FittedTwin(grey.twin, grey.history, grey.seconds), numbers)
+            return FittedFormulation(settled, grey)
         self.progress.note("training the network on top of the grey box")
         network = fit_residual(grey.twin, spec, *parts, self.experiment.training, self.on_event, run)
         if not network.helps:
             self.progress.note("the network does not help on the validation part: the grey box stays alone")
-        fitted = FittedTwin(network.twin, grey.history + network.history, grey.seconds + network.seconds)
-        return FittedFormulation(settled, fitted, numbers, {"residual": network.facts()})
+        history, seconds = grey.history + network.history, grey.seconds + network.seconds
+        return FittedFormulation(settled, FittedTwin(network.twin, history, seconds, grey.datasheet, network.facts))
 
     def train_members(
         self, jobs: Sequence[MemberTraining], on_event: Callable[[FreeRunProgress], None] | None

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from edp.data.derived_velocities import matched
-from edp.errors import ConfigError, DataError, closest
+from edp.errors import ConfigError, DataError
 from edp.evaluation.free_run_file import ChannelErrors
 from edp.evaluation.free_run_parts import by_channel
 from edp.logs import write_recording
@@ -24,6 +24,7 @@ from edp.storage import replacing_folder
 from edp.storage.paths import entries_of, is_folder_at, is_there
 from edp.training.twin_bundle import TwinBundle, load_twin
 from edp.wording import typed
+from edp.workflows.twin.prepare_twin import answer_columns
 
 AHEAD = "_in_"
 """Between the name of an answer and the ticks ahead, in the name of a forecast."""
@@ -95,7 +96,8 @@ def forecast_logs(
         check_gain(gain)
     bundle = load_twin(run)
     twin = bundle.twin
-    columns = _columns(twin, answers)
+    velocities = [channel.name for channel in twin.channels.velocities]
+    columns = answer_columns(twin, list(dict.fromkeys(answers or velocities)), "--answer")
     _refuse_used(Path(out))
     recordings = source.read()
     if gain is None:
@@ -124,15 +126,6 @@ def _choose_gain(bundle: TwinBundle, recordings: Sequence[Recording], horizons: 
     task = bundle.twin.channels.task()
     series = [task.series(_check_recording(bundle.twin, logged)) for logged in chosen[:CHOICE_LOGS]]
     return choose_gain(bundle.twin, series, horizons)
-
-
-def _columns(twin: Twin, answers: Sequence[str]) -> list[int]:
-    names = [channel.name for channel in twin.channels.answers]
-    for name in answers:
-        if name not in names:
-            raise ConfigError(f"--answer {name}: the twin does not answer this channel{closest(name, names)}")
-    velocities = [channel.name for channel in twin.channels.velocities]
-    return [names.index(name) for name in dict.fromkeys(answers or velocities)]
 
 
 def _refuse_used(folder: Path) -> None:

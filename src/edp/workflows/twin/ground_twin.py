@@ -10,11 +10,12 @@ from edp.errors import ConfigError
 from edp.evaluation.free_run_file import RUNS, FreeRunFile, StepResponses
 from edp.logs.source import DataSource
 from edp.networks.twin import TWINS
-from edp.networks.twin.grey.datasheet import BASIS, datasheet_text
+from edp.networks.twin.grey.datasheet import BASIS
 from edp.networks.twin.grey.ground import check_grounded
 from edp.networks.twin.greybox import GreyBox
+from edp.networks.twin.parameters import Datasheet
 from edp.progress import SILENT, Progress
-from edp.storage import object_with, read_json, write_bytes, write_json
+from edp.storage import write_bytes
 from edp.storage.paths import is_file_at
 from edp.storage.runs import Run, run_key
 from edp.training.ground_fit import fit_ground
@@ -22,7 +23,7 @@ from edp.training.twin_bundle import TwinBundle, load_twin, save_twin, twin_hash
 from edp.workflows.twin.continue_twin import BaseTwin
 from edp.workflows.twin.prepare_twin import cut_recordings
 
-FOLDER, DATASHEET = "twin", "datasheet"
+FOLDER = "twin"
 JUDGED = (FreeRunFile.NAME, RUNS, StepResponses.NAME)
 """What the judgement of a twin leaves in its run."""
 GROUND_BASIS = (
@@ -67,12 +68,12 @@ def ground_twin(
         progress.note(f"fitting the ground '{experiment.ground}' to forces along the logs")
         twin = check_grounded(base.bundle.twin)
         fitted = fit_ground(experiment.ground, twin, data.train, data.validation, linkage)
-        rows = [*_read_datasheet_rows(base.folder), *fitted.law.rows()]
-        basis = f"{BASIS}; {GROUND_BASIS}"
-        write_json(run.file(f"{DATASHEET}.json"), {"schema": 1, "basis": basis, "numbers": rows})
-        write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(rows, basis).encode())
+        earlier = Datasheet.read(base.folder).numbers if is_file_at(base.folder / Datasheet.NAME) else ()
+        # A ground that is fitted anew replaces the one before.
+        rows = (*(row for row in earlier if row.element != "ground"), *fitted.datasheet)
+        Datasheet(basis=f"{BASIS}; {GROUND_BASIS}", numbers=rows).write(run.path)
         contact = {"source": source.label, "digest": data.digest}
-        facts = fitted.facts() | base.provenance() | {"ground_data": contact}
+        facts = {**fitted.facts, **base.provenance(), "ground_data": contact}
         bundle = replace(base.bundle, ground=fitted.law, provenance=base.bundle.provenance.add_entries(**facts))
         for name in JUDGED:
             # In free air it is the twin that was judged there, so its page needs no evaluation of its own.
@@ -100,13 +101,3 @@ def _base(start: str | Path | None) -> tuple[BaseTwin, str]:
         )
     check_grounded(bundle.twin)
     return BaseTwin(Path(start), bundle, twin_hash(start)), bundle.spec.linkage
-
-
-def _read_datasheet_rows(run: Path) -> list[dict[str, object]]:
-    """Return the datasheet rows of a run; none without a datasheet."""
-    file = run / f"{DATASHEET}.json"
-    if not is_file_at(file):
-        return []
-    rows = object_with(read_json(file), ("numbers",), f"'{file}'")["numbers"]
-    # A ground that is fitted anew replaces the one before.
-    return [row for row in rows if isinstance(row, dict) and row.get("element") != "ground"]

@@ -13,9 +13,9 @@ from edp.data.prepared import Prepared, prepare
 from edp.data.series import Series
 from edp.data.splits import FAMILY
 from edp.data.twin_channels import TwinChannels, same_channels, twin_channels
-from edp.errors import DataError
+from edp.errors import ConfigError, DataError, closest
 from edp.logs.source import DataSource
-from edp.networks.twin.base import check_length
+from edp.networks.twin.base import Twin, check_length
 from edp.recording import Recording
 
 
@@ -81,3 +81,16 @@ def driving_labels(recordings: Sequence[Recording]) -> dict[str, str]:
     """Return the way of driving by name of recording; empty if a recording does not state it."""
     labels = {recording.name: str(recording.meta.get(FAMILY, "")) for recording in recordings}
     return labels if all(labels.values()) else {}
+
+
+def answer_columns(twin: Twin, names: Sequence[str], option: str) -> list[int]:
+    """Return the columns of channels among the outputs of a twin.
+
+    Raises:
+        ConfigError: a channel of the command-line option is not an output.
+    """
+    answers = [channel.name for channel in twin.channels.answers]
+    for name in names:
+        if name not in answers:
+            raise ConfigError(f"{option} {name}: the twin does not answer this channel{closest(name, answers)}")
+    return [answers.index(name) for name in names]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from edp.data.derived_velocities import matched
-from edp.errors import ConfigError, DataError, closest, count_of
+from edp.errors import ConfigError, DataError, count_of
 from edp.evaluation.beyond import RANGES, commands_beyond
 from edp.evaluation.free_run import MOST_SECONDS, FreeRunJudgeSpec, free_run_scores, runs_of
 from edp.evaluation.free_run_file import TWIN, CommandExcess, FreeRunFile, FreeRunScores
@@ -24,6 +24,7 @@ from edp.signals import Channel
 from edp.training.twin_bundle import load_twin
 from edp.wording import setting_text, typed
 from edp.workflows.twin.judge_twin import describe_channels, select_shown_runs
+from edp.workflows.twin.prepare_twin import answer_columns
 
 FREE = "_twin"
 """Behind the name of a channel, for what the twin answered in its place."""
@@ -88,7 +89,7 @@ def rollout_log(run: str | Path, source: DataSource, request: RolloutRequest) ->
     bundle = load_twin(run)
     twin = bundle.twin
     recording = matched(twin.channels, _only(read_as_before(source, bundle.provenance.origin.reader).read()))
-    measured_columns = _columns(twin, request.measured)
+    measured_columns = answer_columns(twin, request.measured, "--measured")
     series = twin.channels.task().series(recording)
     start, ticks = _span(twin, recording, request.seconds, request.start_s)
     first = start - twin.prefix_ticks
@@ -162,14 +163,6 @@ def _span(twin: Twin, recording: Recording, seconds: float, start_s: float | Non
             f"{typed(recording.duration_s)} s; {room}"
         )
     return start, ticks
-
-
-def _columns(twin: Twin, measured: Sequence[str]) -> list[int]:
-    names = [channel.name for channel in twin.channels.answers]
-    for name in measured:
-        if name not in names:
-            raise ConfigError(f"--measured {name}: the twin does not answer this channel{closest(name, names)}")
-    return [names.index(name) for name in measured]
 
 
 def _make_recording(

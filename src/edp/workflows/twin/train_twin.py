@@ -21,16 +21,16 @@ from edp.jobs import IN_PROCESS, Workers
 from edp.logs.source import DataSource
 from edp.networks.twin import fit_scales
 from edp.networks.twin.grey.channel_map import FARTHEST_TURN
-from edp.networks.twin.grey.datasheet import BASIS, datasheet_text
+from edp.networks.twin.grey.datasheet import BASIS
 from edp.networks.twin.greybox import GreyBox
 from edp.networks.twin.model_selection import AutoTwin
+from edp.networks.twin.parameters import Datasheet
 from edp.networks.twin.recurrent_members import scales_for
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.settings.results import plain_value
 from edp.signals import Kind
 from edp.sim.machine.machine_files import load_machine
-from edp.storage import write_bytes, write_json
 from edp.storage.runs import KeyedRun, Run, check_claimable, run_key
 from edp.training.blas import one_blas_thread
 from edp.training.provenance import training_provenance
@@ -43,8 +43,6 @@ from edp.workflows.twin.judge_twin import judge_twin, write_scores
 from edp.workflows.twin.prepare_twin import cut_recordings, driving_labels, prepare_twin
 
 FOLDER = "twin"
-DATASHEET = "datasheet"
-"""Numbers of a grey box with units and intervals, as JSON and as text."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,15 +112,14 @@ def train_twin(
         result = _train_or_choose(fit, KeyedRun(run, key), base)
         fitted = result.fitted
         run.write_history(fitted.history)
-        if result.datasheet:
-            write_json(run.file(f"{DATASHEET}.json"), {"schema": 1, "basis": BASIS, "numbers": result.datasheet})
-            write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(result.datasheet).encode())
+        if fitted.datasheet:
+            Datasheet(basis=BASIS, numbers=fitted.datasheet).write(run.path)
         progress.note("calibrating intervals")
         intervals = calibrated(result.unseen or ((fitted.twin, data.validation),), experiment.judge)
         before = None if base is None else base.bundle.provenance.more.get(RANGES)
         ranges = command_ranges(channels, [*data.train, *data.validation], before)
         provenance = training_provenance(source, data, experiment.training.seed, 1, fitted.seconds).add_entries(
-            **_full_strokes(recordings), **_oil(recordings), **result.facts, **{RANGES: ranges}
+            **_full_strokes(recordings), **_oil(recordings), **fitted.facts, **{RANGES: ranges}
         )
         bundle = TwinBundle(result.spec, fitted.twin, provenance, {}, intervals)
         scores, runs = judge_twin(bundle, experiment, data, labels, progress)

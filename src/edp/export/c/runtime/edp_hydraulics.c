@@ -1,29 +1,10 @@
 /* One tick of a grey box. See edp_hydraulics.h; the equations are those of the Python package's edp.networks.twin.grey. */
 #include "edp_hydraulics.h"
 #include "edp_linkage.h"
+#include "edp_parameter_index.h"
 
 #include <math.h>
 #include <stddef.h>
-
-/* Numbers of one actuator. */
-enum {
-    HEAD_AREA, ROD_AREA, HEAD_DEAD, ROD_DEAD, PISTON_LEAK, SPOOL_LEAK, HEAD_RELIEF, ROD_RELIEF,
-    CUSHION_LENGTH, CUSHION_LEAST, COULOMB, STATIC, STRIBECK, VISCOUS, BRISTLE, BRISTLE_DAMPING,
-    STOP_LOW, STOP_HIGH, STOP_STIFFNESS, ASYMMETRY
-};
-/* Of one pump. */
-enum { FLOW, LEAST, LAG, LINE, BYPASS, BYPASS_CLOSED, RELIEF };
-/* Of the circuit. */
-enum {
-    BULK, AIR, TANK, SUPPLY, MAKE_UP, PORT_SLOPE, RELIEF_SLOPE, POWER, PLAY, DEMAND_START, DEMAND_SPAN
-};
-/* Places of a valve's numbers; those from BAND on by direction. */
-enum {
-    DELAY = 0, PILOT_LAG = 1, SPOOL_LAG = 2, BAND = 3, GAIN = 5, INTO = 7, OUT_OF = 9, REGENERATION = 11,
-    VALVE_PLACES = 13
-};
-/* State of a valve. */
-enum { PILOT_1, PILOT_2, PLAYED, SPOOL_1, SPOOL, VALVE_STATES };
 
 #define ATMOSPHERE 0.1013    /* MPa; pressures are gauge */
 #define LEAST_ABSOLUTE 1e-3  /* MPa below which no oil is left that could boil */

@@ -1,17 +1,12 @@
 /* Bodies of a known linkage. See edp_linkage.h; the equations are those of edp.networks.twin.grey.linkage. */
 #include "edp_linkage.h"
+#include "edp_parameter_index.h"
 
 #include <math.h>
 
-/* Places in the linkage. */
-enum { GRAVITY, LENGTH, JOINTS = 3 };
-/* In the values of a joint, and of a knot. */
-enum { ACTUATOR, KNOT };
-enum { STROKE, ANGLE, SLOPE, CURVATURE, KNOT_VALUES };
-/* Numbers of one body. */
-enum { MASS, CENTRE_X, CENTRE_Y, INERTIA, BODY_VALUES };
+/* In the values of a knot. */
+enum { STROKE, ANGLE, SLOPE, CURVATURE };
 
-#define JOINT_VALUES (KNOT + KNOT_VALUES * EDP_LINKAGE_KNOTS)
 #define BEYOND 1.0 /* share of a stretch by which polynomials are followed beyond the first and last knot */
 
 /* A body as it is: first and second derivative of its joint's angle by the stroke, where it is and how it turns. */
@@ -25,7 +20,7 @@ typedef struct {
 /* Angle of a joint at a stroke, and its derivatives into `b`. */
 static double joint_angle(const float *joint, double stroke, body *b) {
     uint32_t low = 0u;
-    uint32_t high = EDP_LINKAGE_KNOTS - 1u;
+    uint32_t high = LINKAGE_KNOTS - 1u;
     while (high - low > 1u) {
         const uint32_t middle = (low + high) / 2u;
         if ((double)joint[KNOT + KNOT_VALUES * middle + STROKE] > stroke) {
@@ -65,7 +60,7 @@ static void base(const float *linkage, const float *numbers, uint32_t a, body *b
     b->x = mass * x;
     b->y = mass * y;
     b->inertia = (double)own[INERTIA] + mass * (x * x + y * y);
-    for (uint32_t far = a + 1u; far < EDP_BODIES; far++) {
+    for (uint32_t far = a + 1u; far < BODIES; far++) {
         const double length = (double)linkage[LENGTH + a];
         const double behind = (double)numbers[BODY_VALUES * far + MASS];
         b->x += length * behind;
@@ -74,10 +69,10 @@ static void base(const float *linkage, const float *numbers, uint32_t a, body *b
 }
 
 /* Sum over the bodies from `i` and from `k` on: what turns with both joints. */
-static double turned(double coupled[EDP_BODIES][EDP_BODIES], uint32_t i, uint32_t k) {
+static double turned(double coupled[BODIES][BODIES], uint32_t i, uint32_t k) {
     double sum = 0.0;
-    for (uint32_t a = i; a < EDP_BODIES; a++) {
-        for (uint32_t c = k; c < EDP_BODIES; c++) {
+    for (uint32_t a = i; a < BODIES; a++) {
+        for (uint32_t c = k; c < BODIES; c++) {
             sum += coupled[a][c];
         }
     }
@@ -86,13 +81,13 @@ static double turned(double coupled[EDP_BODIES][EDP_BODIES], uint32_t i, uint32_
 
 void edp_linkage_load(const float *linkage, const float *numbers, const double *strokes, const double *v, double *mass,
                       double *force) {
-    body all[EDP_BODIES];
-    double coupled[EDP_BODIES][EDP_BODIES];
-    double torque[EDP_BODIES];
+    body all[BODIES];
+    double coupled[BODIES][BODIES];
+    double torque[BODIES];
     double angle = 0.0;
     double rate = 0.0;
     double bend = 0.0;
-    for (uint32_t a = 0; a < EDP_BODIES; a++) {
+    for (uint32_t a = 0; a < BODIES; a++) {
         const float *const joint = linkage + JOINTS + a * JOINT_VALUES;
         body *const b = &all[a];
         b->actuator = (uint32_t)joint[ACTUATOR];
@@ -108,7 +103,7 @@ void edp_linkage_load(const float *linkage, const float *numbers, const double *
         coupled[a][a] = b->inertia;
         torque[a] = b->inertia * bend + (double)linkage[GRAVITY] * (b->x * b->cosine - b->y * b->sine);
     }
-    for (uint32_t far = 1; far < EDP_BODIES; far++) {
+    for (uint32_t far = 1; far < BODIES; far++) {
         const body *const b = &all[far];
         for (uint32_t near = 0; near < far; near++) {
             const body *const a = &all[near];
@@ -124,11 +119,11 @@ void edp_linkage_load(const float *linkage, const float *numbers, const double *
         }
     }
     double behind = 0.0;
-    for (uint32_t i = EDP_BODIES; i-- > 0u;) {
+    for (uint32_t i = BODIES; i-- > 0u;) {
         behind += torque[i];
         force[all[i].actuator] = all[i].first * behind;
-        for (uint32_t k = 0; k < EDP_BODIES; k++) {
-            mass[all[i].actuator * EDP_BODIES + all[k].actuator] = all[i].first * all[k].first * turned(coupled, i, k);
+        for (uint32_t k = 0; k < BODIES; k++) {
+            mass[all[i].actuator * BODIES + all[k].actuator] = all[i].first * all[k].first * turned(coupled, i, k);
         }
     }
 }

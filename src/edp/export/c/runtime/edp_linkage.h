@@ -4,13 +4,9 @@
 
 #include <stdint.h>
 
-#define EDP_BODIES 3u
-/* Knots of each joint's angle over the stroke of its cylinder. */
-#define EDP_LINKAGE_KNOTS 33u
-
 /* linkage: gravity, lengths of the bodies that carry another one, then for each body its actuator and at each knot
  * stroke, angle, and its first and second derivative by the stroke; numbers: mass, centre along and across and inertia of
- * each body; strokes and v (velocities): (EDP_BODIES), by actuator; mass (EDP_BODIES, EDP_BODIES) and force (EDP_BODIES):
+ * each body; strokes and v (velocities): (BODIES), by actuator; mass (BODIES, BODIES) and force (BODIES):
  * written: inertia, and forces of gravity and of turning. Units are m, s, MN and Gg. */
 void edp_linkage_load(const float *linkage, const float *numbers, const double *strokes, const double *v, double *mass,
                       double *force);

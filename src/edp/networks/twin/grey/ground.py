@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from edp.errors import ConfigError
 from edp.networks.twin.base import Twin, TwinRunner, TwinState
 from edp.networks.twin.disturbance_observer import force_slopes
+from edp.networks.twin.parameters import DatasheetRow, Parameter
 from edp.registry import Registry
 
 if TYPE_CHECKING:
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 RENEWED_TICKS = 5
 """After how many ticks in the ground the effect of a force on the velocities is asked for anew."""
-NORMAL = 1.96
-"""Deviations on either side of an interval of 95 % of a normal distribution."""
 
 
 class GroundContact(ABC):
@@ -59,7 +58,7 @@ class GroundLaw(ABC):
 
     @classmethod
     @abstractmethod
-    def fitted(cls, twin: GreyTwin, logs: Sequence[tuple[Array, Array, Array]], machine: str) -> GroundLaw:
+    def from_logs(cls, twin: GreyTwin, logs: Sequence[tuple[Array, Array, Array]], machine: str) -> GroundLaw:
         """Return the law fitted to logs.
 
         Args:
@@ -72,8 +71,8 @@ class GroundLaw(ABC):
         """
 
     @abstractmethod
-    def explained(self, twin: GreyTwin, logs: Sequence[tuple[Array, Array, Array]]) -> float:
-        """Share of the squares of the forces that the law explains where the tip moves in the ground; NaN: nowhere."""
+    def r_squared(self, twin: GreyTwin, logs: Sequence[tuple[Array, Array, Array]]) -> float:
+        """Return the R^2 of the forces where the tip moves in the ground; NaN without such a sample."""
 
     @abstractmethod
     def contact(self, twin: GreyTwin) -> GroundContact:
@@ -92,19 +91,16 @@ class GroundLaw(ABC):
             ValueError: it is damaged; likewise KeyError and TypeError.
         """
 
+    @property
     @abstractmethod
-    def names(self) -> list[tuple[str, str]]:
-        """Name and unit of each number."""
+    def parameters(self) -> list[Parameter]:
+        """Parameters of the law."""
 
-    def rows(self) -> list[dict[str, object]]:
-        """Return datasheet rows in the form of `edp.networks.twin.grey.datasheet.datasheet`."""
-        rows = []
-        for (name, unit), value, deviation in zip(self.names(), self.numbers, self.deviations, strict=True):
-            excited = bool(np.isfinite(deviation))
-            reach = NORMAL * float(deviation) if excited else 0.0
-            row = {"element": "ground", "name": name, "unit": unit, "value": float(value)}
-            rows.append(row | {"low": float(value) - reach, "high": float(value) + reach, "excited": excited})
-        return rows
+    def rows(self) -> list[DatasheetRow]:
+        """Return the rows of the datasheet. A parameter that the logs do not tell has no interval."""
+        is_finite = np.isfinite(self.deviations)
+        columns = zip(self.parameters, self.numbers, np.where(is_finite, self.deviations, 0.0), is_finite, strict=True)
+        return [one.row(value, deviation / one.width, excited) for one, value, deviation, excited in columns]
 
 
 GROUNDS: Registry[type[GroundLaw]] = Registry("ground")

@@ -26,6 +26,7 @@ from edp.errors import DataError
 from edp.networks.twin.disturbance_observer import LOG_SHARE
 from edp.networks.twin.grey import ground_contact as contact
 from edp.networks.twin.grey.ground import GROUNDS, GroundContact, GroundLaw
+from edp.networks.twin.parameters import Parameter, Priors
 from edp.settings.bounds import above, span
 
 if TYPE_CHECKING:
@@ -34,8 +35,14 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Logs = Sequence[tuple[Array, Array, Array]]
 DIRECTIONS = ("inwards", "outwards", "downwards", "upwards")
-PLAUSIBLE = np.array([2e4, 1e5, 1e5] * len(DIRECTIONS) + [5e4])
-"""Deviations of the numbers before logs are seen: edge (N), by depth (N/m) and by its square (N/m^2); across (N/m)."""
+PARAMETERS = [
+    Parameter("ground", f"{direction}_{part}", unit, 1.0, 0.0, width, positive=False)
+    for direction in DIRECTIONS
+    for part, unit, width in (("edge", "N", 2e4), ("by_depth", "N/m", 1e5), ("by_depth_squared", "N/m^2", 1e5))
+]
+PARAMETERS += [Parameter("ground", "across_by_depth", "N/m", 1.0, 0.0, 5e4, positive=False)]
+PLAUSIBLE = Priors.from_parameters(PARAMETERS).width
+"""Prior standard deviations of the numbers."""
 LEAST_DEPTH, LEAST_SPEED = -0.1, 0.03
 """Rows of a fit are at least as deep (m), and at least as fast (m/s): at rest friction answers, whatever the ground."""
 CLEAR_M = 0.3
@@ -88,8 +95,8 @@ class DragLaw(GroundLaw):
     surface_m: float
 
     @classmethod
-    def fitted(cls, twin: GreyTwin, logs: Logs, machine: str) -> DragLaw:
-        """See `GroundLaw.fitted`."""
+    def from_logs(cls, twin: GreyTwin, logs: Logs, machine: str) -> DragLaw:
+        """See `GroundLaw.from_logs`."""
         # Here: a simulator compiles its own code.
         from edp.sim.machine.machine_files import load_machine
 
@@ -106,7 +113,7 @@ class DragLaw(GroundLaw):
         numbers, deviations = _solve_parameters(terms, forces, blocks)
         return replace(empty, numbers=numbers, deviations=deviations)
 
-    def explained(self, twin: GreyTwin, logs: Logs) -> float:
+    def r_squared(self, twin: GreyTwin, logs: Logs) -> float:
         terms, forces, _ = self._rows_of(twin, logs)
         if not len(forces):
             return float("nan")
@@ -139,10 +146,9 @@ class DragLaw(GroundLaw):
             raise ValueError("its ground has a bucket or a surface that no machine has")
         return cls(numbers, deviations, float(bucket), float(surface))
 
-    def names(self) -> list[tuple[str, str]]:
-        parts = (("edge", "N"), ("by_depth", "N/m"), ("by_depth_squared", "N/m^2"))
-        rows = [(f"{direction}_{part}", unit) for direction in DIRECTIONS for part, unit in parts]
-        return [*rows, ("across_by_depth", "N/m")]
+    @property
+    def parameters(self) -> list[Parameter]:
+        return PARAMETERS
 
     def _front(self, twin: GreyTwin) -> tuple[Array, float]:
         return twin.table.linkage, self.bucket_m

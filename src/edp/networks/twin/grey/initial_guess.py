@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.data.series import Series
+from edp.networks.twin.descent import DescentLimits, NormalEquations, descend
 from edp.networks.twin.grey import parameter_index as at
-from edp.networks.twin.grey.initial_bodies import balance_bodies, balance_columns
+from edp.networks.twin.grey.bodies import forces_by_moments, moments_of
 from edp.networks.twin.grey.parameters import ParameterTable
 
 Array = NDArray[np.float64]
@@ -26,7 +27,13 @@ FEW = 40_000
 LEAST_INERTIA = 0.02
 """Of what is plausible."""
 SHARE_RANGE = (0.2, 1.0)
-"""Of rod area by head area; what is moments outside is not believed."""
+"""Of rod area by head area; values outside are not believed."""
+LEAST_ERROR = 0.02
+"""Of the forces, as a share of their deviation: rows never agree better with what the bodies leave out."""
+INDEPENDENT = 1_000
+"""Rows that many rows count as: neighbours say the same."""
+LIMITS = DescentLimits(steps=30, tries=12, radius=np.inf, ftol=1e-9)
+"""The balance is nearly linear in the bodies, so steps are not bounded."""
 
 
 def load_start(
@@ -74,16 +81,55 @@ def load_start(
         goal[i] /= size
     flat = matrix.reshape(-1, matrix.shape[2]), goal.reshape(-1)
     if table.front is not None:
-        values, others = balance_bodies(table, *flat)
+        values, others = _balance_bodies(table, *flat)
         return _insert_friction(table, others, declared, values)
-    solution = _ridge(*flat)
-    return _insert_solution(table, solution, declared, values)
+    return _insert_solution(table, _ridge(*flat), declared, values)
+
+
+def _balance_bodies(table: ParameterTable, matrix: Array, goal: Array) -> tuple[Array, Array]:
+    """Return all parameters, with the bodies that balance the forces, and the coefficients of the other columns.
+
+    Args:
+        table: parameters, with a linkage.
+        matrix: balance in deviations of the forces: base parameters of the bodies, then all else ``(row, column)``.
+        goal: forces in the same unit ``(row,)``.
+    """
+    bodies, others = matrix[:, : at.BASE], matrix[:, at.BASE :]
+    # All else is solved for, given the bodies: what is left is a square form in the nine numbers.
+    normal = others.T @ others
+    normal += 1e-9 * np.diag(np.maximum(np.diag(normal), 1e-30))
+    of_bodies, of_goal = np.linalg.solve(normal, others.T @ bodies), np.linalg.solve(normal, others.T @ goal)
+    left, sought = bodies - others @ of_bodies, goal - others @ of_goal
+    free = np.linalg.lstsq(left, sought, rcond=None)[0]
+    error = max(float(np.mean((left @ free - sought) ** 2)), LEAST_ERROR**2)
+    weight = INDEPENDENT / len(goal) / error
+    square, span = weight * left.T @ left, slice(table.inertia_at, table.potential_at)
+
+    def problem(theta: Array, full: bool) -> NormalEquations:
+        values = _with_bodies(table, theta)
+        moments = moments_of(values, table.inertia_at, table.linkage)
+        apart, slopes = moments.values - free, moments.slopes * table.priors.slopes(values)[span]
+        return NormalEquations(
+            slopes.T @ square @ slopes, slopes.T @ square @ apart, np.array([0.5 * apart @ square @ apart])
+        )
+
+    descent = descend(problem, np.zeros(span.stop - span.start), LIMITS, damping=1e-3)
+    values = _with_bodies(table, descent.theta)
+    return values, of_goal - of_bodies @ moments_of(values, table.inertia_at, table.linkage).values
+
+
+def _with_bodies(table: ParameterTable, theta: Array) -> Array:
+    """Return all grey-box parameters, with rigid-body parameters from `theta` (in prior standard deviations)."""
+    every = np.zeros(len(table.numbers))
+    every[table.inertia_at : table.potential_at] = theta
+    return table.priors.values(every)
 
 
 def _load_columns(table: ParameterTable, rows: Array, z_of: tuple[Array, Array]) -> Array:
     """Return the actuator forces per linear load parameter ``(actuator, row, column)``."""
     if table.front is not None:
-        return balance_columns(table, rows)
+        speeds, pulls, strokes = (np.ascontiguousarray(rows[:, :, k]) for k in range(3))
+        return np.moveaxis(forces_by_moments(strokes, speeds, pulls, table.linkage), 0, 1)
     n, exponents, pull = rows.shape[1], table.exponents, rows[:, :, 1]
     z, inertia = (rows[:, :, 2] - z_of[0]) * z_of[1], _entries(n)
     matrix = np.zeros((n, len(rows), len(inertia) + len(exponents) - 1))

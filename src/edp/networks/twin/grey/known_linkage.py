@@ -13,7 +13,7 @@ from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError
 from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.elements import Elements
-from edp.networks.twin.grey.priors import GreyParameter
+from edp.networks.twin.parameters import Parameter
 from edp.networks.twin.scales import TwinScales
 from edp.wording import typed
 
@@ -107,7 +107,7 @@ class KnownLinkage:
         """For a bundle."""
         return {"linkage": self.values.astype(np.float32), "bodies": self.bodies.astype(np.float32)}
 
-    def numbers(self) -> list[GreyParameter]:
+    def numbers(self) -> list[Parameter]:
         """Return masses, centres of gravity and inertias, beginning with the first body."""
         lengths = [*self.values[at.LENGTH : at.JOINTS], 0.0]
         rows = []
@@ -117,10 +117,10 @@ class KnownLinkage:
             element = f"{name}_body"
             along, across = (share * size for share in CENTRE_WIDTH)
             rows += [
-                GreyParameter(element, "mass", "kg", GIGA, own[at.MASS], MASS_WIDTH),
-                GreyParameter(element, "centre_along", "m", 1.0, own[at.CENTRE_X], along, False),
-                GreyParameter(element, "centre_across", "m", 1.0, own[at.CENTRE_Y], across, False),
-                GreyParameter(element, "inertia_about_centre", "kg m^2", GIGA, own[at.INERTIA], INERTIA_WIDTH),
+                Parameter(element, "mass", "kg", GIGA, own[at.MASS], MASS_WIDTH),
+                Parameter(element, "centre_along", "m", 1.0, own[at.CENTRE_X], along, False),
+                Parameter(element, "centre_across", "m", 1.0, own[at.CENTRE_Y], across, False),
+                Parameter(element, "inertia_about_centre", "kg m^2", GIGA, own[at.INERTIA], INERTIA_WIDTH),
             ]
         return rows
 

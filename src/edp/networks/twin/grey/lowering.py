@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from edp.ir import Builder
 from edp.ir.base import INPUT
 from edp.ir.builder import indices
-from edp.ir.hydraulics import NONE, HydraulicTick
-from edp.ir.reference import STEPS
+from edp.ir.hydraulics import NONE, SOLVERS, HydraulicTick
 from edp.networks.twin.grey.correction import OutputBounds
 from edp.networks.twin.grey.equations import GreyForm
 from edp.networks.twin.grey.program import program_of
@@ -117,4 +116,4 @@ def _tick(
     return np.asarray(scaled[ports[:, 0] != 1], commands.dtype)
 
 
-STEPS[HydraulicTick] = _tick
+SOLVERS[:] = [_tick]

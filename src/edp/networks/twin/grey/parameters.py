@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations_with_replacement
 from math import comb
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,6 @@ from edp.networks.twin.grey.known_linkage import KnownLinkage
 from edp.networks.twin.grey.priors import (
     MEGA,
     STRETCHES,
-    GreyParameter,
     Travel,
     circuit_numbers,
     cylinder_numbers,
@@ -30,6 +28,7 @@ from edp.networks.twin.grey.priors import (
     pump_numbers,
     valve_numbers,
 )
+from edp.networks.twin.parameters import Parameter, Priors
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -52,7 +51,7 @@ class ParameterTable:
     With a known linkage `inertia_at` is the place of the first body's, and the load has no terms.
     """
 
-    numbers: tuple[GreyParameter, ...]
+    numbers: tuple[Parameter, ...]
     valve_at: IntArray
     actuator_at: IntArray
     pump_at: IntArray
@@ -88,45 +87,30 @@ class ParameterTable:
         """Positions as read by compiled code."""
         return self.inertia_at, self.inertia_terms, self.potential_at, self.circuit_at
 
-    @property
-    def leader(self) -> IntArray:
-        """Place of the number whose value each one has: mostly its own."""
-        return np.array([index - number.leader for index, number in enumerate(self.numbers)], dtype=np.int64)
+    @cached_property
+    def priors(self) -> Priors:
+        """Priors about the nominal values, cached, since a fit reads them thousands of times."""
+        return Priors.from_parameters(self.numbers)
 
     @cached_property
-    def _columns(self) -> dict[str, NDArray[Any]]:
-        # A fit asks for them thousands of times.
-        names = ("positive", "nominal", "width", "factor")
-        return {name: np.array([getattr(number, name) for number in self.numbers]) for name in names}
+    def factor(self) -> Array:
+        """Value of one unit of each parameter in SI units."""
+        return np.array([number.factor for number in self.numbers])
 
     @property
     def positive(self) -> NDArray[np.bool_]:
         """Mask of the parameters fitted by their logarithm."""
-        return self._columns["positive"].copy()
+        return self.priors.positive
 
     @property
     def nominal(self) -> Array:
-        """Initial values of a fit."""
-        return self._columns["nominal"].copy()
+        """Initial values of a fit, a copy."""
+        return self.priors.origin.copy()
 
     @property
     def width(self) -> Array:
-        """Plausible deviations."""
-        return self._columns["width"].copy()
-
-    @property
-    def factor(self) -> Array:
-        """Value of one unit of each parameter in SI units."""
-        return self._columns["factor"].copy()
-
-    def values(self, theta: Array) -> Array:
-        """Numbers from coordinates of a fit, in which the nominal is 0."""
-        grown = self.nominal * np.exp(np.clip(theta, -12.0, 12.0))
-        return np.where(self.positive, grown, self.nominal + self.width * theta)
-
-    def slope(self, values: Array) -> Array:
-        """Return the derivative of the parameters by the coordinates."""
-        return np.where(self.positive, values, self.width)
+        """Prior standard deviations."""
+        return self.priors.width
 
 
 def monomials(variables: int, degree: int) -> IntArray:
@@ -160,7 +144,7 @@ def number_table(
     """
     degrees = degrees if front is None else (0, 0)
     _check_size(elements, degrees)
-    numbers: list[GreyParameter] = []
+    numbers: list[Parameter] = []
     actuator_at, areas = [], []
     for actuator, travel in zip(elements.actuators, travels, strict=True):
         actuator_at.append(len(numbers))
@@ -248,7 +232,7 @@ def _load_exponents(elements: Elements, degree: int) -> IntArray:
     return exponents
 
 
-def _inertia(actuators: Sequence[Actuator], areas: Sequence[float], exponents: IntArray) -> list[GreyParameter]:
+def _inertia(actuators: Sequence[Actuator], areas: Sequence[float], exponents: IntArray) -> list[Parameter]:
     """Coefficients of the root of the inertia, row by row."""
     numbers = []
     for a, actuator in enumerate(actuators):
@@ -259,13 +243,13 @@ def _inertia(actuators: Sequence[Actuator], areas: Sequence[float], exponents: I
                 # 10 t on the diagonal of a cylinder: a start for where nothing is measured.
                 start = 0.1 * size if a == c and b == 0 else 0.0
                 label = f"inertia_root_{actuator.name}_{actuators[c].name}_{_power(exponent)}"
-                numbers.append(GreyParameter("load", label, unit, 1e3, start, 0.05 * size, False))
+                numbers.append(Parameter("load", label, unit, 1e3, start, 0.05 * size, False))
     return numbers
 
 
 def _potential(
     actuators: Sequence[Actuator], areas: Sequence[float], travels: Sequence[Travel], exponents: IntArray
-) -> list[GreyParameter]:
+) -> list[Parameter]:
     """Return the coefficients of the potential without the constant one."""
     # Work of a motor's oil over half of its angle, where a cylinder has 30 kJ.
     sizes = [
@@ -273,7 +257,7 @@ def _potential(
         for one, area, travel in zip(actuators, areas, travels, strict=True)
     ]
     return [
-        GreyParameter(
+        Parameter(
             "load", f"potential_{_power(exponent)}", "J", MEGA, 0.0,
             0.03 * max(size for size, power in zip(sizes, exponent, strict=True) if power), False,
         )
@@ -281,7 +265,7 @@ def _potential(
     ]  # fmt: skip
 
 
-def _fix_parameter(number: GreyParameter, value: float) -> GreyParameter:
+def _fix_parameter(number: Parameter, value: float) -> Parameter:
     """Return the parameter fixed at a value."""
     return replace(number, nominal=value, width=0.0, positive=False)
 

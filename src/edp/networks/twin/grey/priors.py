@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from edp.networks.twin.grey import parameter_index as at
 from edp.networks.twin.grey.elements import Actuator, MotorElement
+from edp.networks.twin.parameters import Parameter
 from edp.wording import typed
 
 Array = NDArray[np.float64]
@@ -42,36 +43,6 @@ def opening_knots(stretches: int) -> Array:
 
 
 @dataclass(frozen=True)
-class GreyParameter:
-    """One number of a grey box.
-
-    Attributes:
-        element: that it belongs to.
-        name: what it is.
-        unit: SI; of the value times `factor`.
-        factor: from the units of the grey box to SI.
-        nominal: where a fit starts, in units of the grey box.
-        width: plausible deviation: of the logarithm where `positive`, else in units of the grey box; 0: not fitted.
-        positive: whether it is fitted by its logarithm.
-        leader: how many places before it the number lies whose value it always has; 0: it has its own.
-    """
-
-    element: str
-    name: str
-    unit: str
-    factor: float
-    nominal: float
-    width: float = 1.0
-    positive: bool = True
-    leader: int = 0
-
-    @property
-    def label(self) -> str:
-        """Element and name."""
-        return f"{self.element}.{self.name}"
-
-
-@dataclass(frozen=True)
 class Travel:
     """Measured range of one actuator: stroke from `low` to `high` (m or rad), largest speed, largest pressures."""
 
@@ -98,7 +69,7 @@ def load_size(actuator: Actuator, area: float) -> float:
     return area / PLAUSIBLE_AREAS[0] if isinstance(actuator, MotorElement) else 1.0
 
 
-def cylinder_numbers(name: str, travel: Travel, areas: tuple[float, float], declared: bool) -> list[GreyParameter]:
+def cylinder_numbers(name: str, travel: Travel, areas: tuple[float, float], declared: bool) -> list[Parameter]:
     """Return the parameters of a cylinder in the order of `parameter_index`; `declared`: its areas are given."""
     head, rod = areas
     length = travel.high - travel.low
@@ -123,15 +94,15 @@ def cylinder_numbers(name: str, travel: Travel, areas: tuple[float, float], decl
         ("bristle_stiffness", "N/m", MEGA, 15.0 * head / 0.015, 1.0),
         ("bristle_damping", "N s/m", MEGA, 0.1 * head / 0.015, 1.0),
     ]
-    numbers = [GreyParameter(name, label, unit, factor, start, width) for label, unit, factor, start, width in rows]
-    numbers.append(GreyParameter(name, "stop_closed", "m", 1.0, travel.low + 0.4 * play, play, False))
-    numbers.append(GreyParameter(name, "stop_open", "m", 1.0, travel.high - 0.4 * play, play, False))
-    numbers.append(GreyParameter(name, "stop_stiffness", "N/m", MEGA, 100.0 * head / 0.015, 0.7))
-    numbers.append(GreyParameter(name, "friction_asymmetry", "N", MEGA, 0.0, 0.005 * hard, False))
+    numbers = [Parameter(name, label, unit, factor, start, width) for label, unit, factor, start, width in rows]
+    numbers.append(Parameter(name, "stop_closed", "m", 1.0, travel.low + 0.4 * play, play, False))
+    numbers.append(Parameter(name, "stop_open", "m", 1.0, travel.high - 0.4 * play, play, False))
+    numbers.append(Parameter(name, "stop_stiffness", "N/m", MEGA, 100.0 * head / 0.015, 0.7))
+    numbers.append(Parameter(name, "friction_asymmetry", "N", MEGA, 0.0, 0.005 * hard, False))
     return numbers
 
 
-def motor_numbers(name: str, travel: Travel, areas: tuple[float, float], declared: bool) -> list[GreyParameter]:
+def motor_numbers(name: str, travel: Travel, areas: tuple[float, float], declared: bool) -> list[Parameter]:
     """Return the parameters of a motor in the order of a cylinder's.
 
     Speed-dependent where a cylinder's depend on stroke.
@@ -162,15 +133,14 @@ def motor_numbers(name: str, travel: Travel, areas: tuple[float, float], declare
         ("stop_stiffness", "N m/rad", MEGA, 0.0, 0.0),
     ]
     numbers = [
-        GreyParameter(name, label, unit, factor, start, width, width > 0.0)
-        for label, unit, factor, start, width in rows
+        Parameter(name, label, unit, factor, start, width, width > 0.0) for label, unit, factor, start, width in rows
     ]
     numbers[at.ROD_AREA] = replace(numbers[at.ROD_AREA], leader=at.ROD_AREA - at.HEAD_AREA)
-    numbers.append(GreyParameter(name, "friction_asymmetry", "N m", MEGA, 0.0, 0.005 * hard, False))
+    numbers.append(Parameter(name, "friction_asymmetry", "N m", MEGA, 0.0, 0.005 * hard, False))
     return numbers
 
 
-def pump_numbers(name: str, flow: float, highest: float) -> list[GreyParameter]:
+def pump_numbers(name: str, flow: float, highest: float) -> list[Parameter]:
     """Numbers of a pump, from a plausible flow (m^3/s) and the highest pressure of its line (MPa)."""
     rows = [
         ("full_flow", "m^3/s", 1.0, flow, 0.5),
@@ -181,10 +151,10 @@ def pump_numbers(name: str, flow: float, highest: float) -> list[GreyParameter]:
         ("open_centre_closed_at", "1", 1.0, 0.35, 0.4),
         ("relief", "Pa", MEGA, max(highest / 1.1 * 0.96, 1.0), 0.1),
     ]
-    return [GreyParameter(name, label, unit, factor, start, width) for label, unit, factor, start, width in rows]
+    return [Parameter(name, label, unit, factor, start, width) for label, unit, factor, start, width in rows]
 
 
-def circuit_numbers(highest: float, flow: float) -> list[GreyParameter]:
+def circuit_numbers(highest: float, flow: float) -> list[Parameter]:
     """Return the parameters common to all elements, from the highest pressure (MPa) and total pump flow (m^3/s)."""
     rows = [
         ("bulk_modulus", "Pa", MEGA, 1400.0, 0.3),
@@ -199,7 +169,7 @@ def circuit_numbers(highest: float, flow: float) -> list[GreyParameter]:
         ("demand_start", "1", 1.0, 0.1, 0.3),
         ("demand_span", "1", 1.0, 0.75, 0.2),
     ]
-    return [GreyParameter("circuit", label, unit, factor, start, width) for label, unit, factor, start, width in rows]
+    return [Parameter("circuit", label, unit, factor, start, width) for label, unit, factor, start, width in rows]
 
 
 def valve_numbers(
@@ -210,10 +180,10 @@ def valve_numbers(
     places: IntArray,
     first: int,
     knots: Array,
-) -> list[GreyParameter]:
+) -> list[Parameter]:
     """Return the parameters of a spool with opening curves between `knots`; `places` is filled in."""
     rows = [("dead_time", "s", 0.04, 0.5), ("pilot_lag", "s", 0.025, 0.5), ("spool_lag", "s", 0.02, 0.5)]
-    numbers = [GreyParameter(name, label, unit, 1.0, start, width) for label, unit, start, width in rows]
+    numbers = [Parameter(name, label, unit, 1.0, start, width) for label, unit, start, width in rows]
     places[at.DELAY : at.BAND] = first + np.arange(3)
     linear, square = START_CURVE
     curve = np.diff(knots * (linear + square * knots))
@@ -221,20 +191,18 @@ def valve_numbers(
     for d, way in enumerate(("extend", "retract")):
         into, out = (areas[0], areas[1]) if d == 0 else (areas[1], areas[0])
         places[at.BAND + d], places[at.GAIN + d] = first + len(numbers), first + len(numbers) + 1
-        numbers.append(GreyParameter(name, f"dead_band_{way}", "1", 1.0, 0.12, 0.4))
-        numbers.append(GreyParameter(name, f"pump_demand_{way}", "1", 1.0, 0.9, 0.5))
+        numbers.append(Parameter(name, f"dead_band_{way}", "1", 1.0, 0.12, 0.4))
+        numbers.append(Parameter(name, f"pump_demand_{way}", "1", 1.0, 0.9, 0.5))
         fed = [("into", at.INTO, into * travel.fastest / np.sqrt(2.0))]
         if meter_out:
             fed.append(("out_of", at.OUT_OF, out * travel.fastest / np.sqrt(1.5)))
         for label, column, area in fed:
             places[column + d] = first + len(numbers)
             numbers += [
-                GreyParameter(
-                    name, f"{label}_{way}_{typed(100 * knots[k + 1], 6)}", "m^3/s/Pa^0.5", 1e-3, area * step, 1.0
-                )
+                Parameter(name, f"{label}_{way}_{typed(100 * knots[k + 1], 6)}", "m^3/s/Pa^0.5", 1e-3, area * step, 1.0)
                 for k, step in enumerate(curve)
             ]
         if meter_out and regeneration:
             places[at.REGENERATION + d] = first + len(numbers)
-            numbers.append(GreyParameter(name, f"regeneration_{way}", "1", 1.0, 0.1, 2.0))
+            numbers.append(Parameter(name, f"regeneration_{way}", "1", 1.0, 0.1, 2.0))
     return numbers

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, closest
+from edp.networks.twin.parameters import Parameter
 from edp.networks.twin.scales import TwinScales
 
 Doubles = NDArray[np.float64]
@@ -73,27 +74,6 @@ class Parts:
     tanks: tuple[TankElement, ...]
     masses: tuple[MassElement, ...]
     lags: tuple[LagElement, ...]
-
-
-@dataclass(frozen=True)
-class LumpedNumber:
-    """A number of an element.
-
-    Attributes:
-        element: that it belongs to.
-        name: of the number.
-        unit: SI.
-        nominal: plausible value.
-        width: plausible deviation; of a positive number that of its logarithm.
-        positive: whether it is.
-    """
-
-    element: str
-    name: str
-    unit: str
-    nominal: float
-    width: float
-    positive: bool = True
 
 
 def default_parts(channels: TwinChannels) -> Parts:
@@ -169,11 +149,11 @@ def check_parts(parts: Parts, channels: TwinChannels) -> None:
             )
 
 
-def list_lumped_parameters(parts: Parts, channels: TwinChannels, scales: TwinScales) -> list[LumpedNumber]:
+def lumped_parameters(parts: Parts, channels: TwinChannels, scales: TwinScales) -> list[Parameter]:
     """Return all parameters in a fixed order (tanks, masses, lags), with typical values from the channel scales."""
     answers = [c.name for c in channels.answers]
     commands = {c.name: float(w) for c, w in zip(channels.commands, scales.command_width, strict=True)}
-    rows: list[LumpedNumber] = []
+    rows: list[Parameter] = []
     measured = [answers.index(tank.level) for tank in parts.tanks if tank.level]
     # A level crosses its own spread as fast as the changes from tick to tick say.
     speed = [float(scales.change_width[i] / scales.answer_width[i]) * channels.rate_hz for i in measured]
@@ -182,35 +162,35 @@ def list_lumped_parameters(parts: Parts, channels: TwinChannels, scales: TwinSca
         first = tank.source in commands
         full = float(scales.high[answers.index(tank.level)]) if tank.level else 1.0
         rows += [
-            LumpedNumber(tank.name, "inflow", "1/s", rate / (2.0 * commands[tank.source]) if first else rate, 1.0),
-            LumpedNumber(tank.name, "inflow_offset", "1", 0.0, commands[tank.source], False)
+            Parameter(tank.name, "inflow", "1/s", 1.0, rate / (2.0 * commands[tank.source]) if first else rate, 1.0),
+            Parameter(tank.name, "inflow_offset", "1", 1.0, 0.0, commands[tank.source], False)
             if first
-            else LumpedNumber(tank.name, "spilled_into", "1", 0.7, 0.5),
-            LumpedNumber(tank.name, "outflow", "1/s", rate, 1.0),
-            LumpedNumber(tank.name, "exponent", "1", 0.5, 0.4),
+            else Parameter(tank.name, "spilled_into", "1", 1.0, 0.7, 0.5),
+            Parameter(tank.name, "outflow", "1/s", 1.0, rate, 1.0),
+            Parameter(tank.name, "exponent", "1", 1.0, 0.5, 0.4),
             # Nothing tells how high a tank is whose level is not measured: it counts in shares of its height.
-            LumpedNumber(tank.name, "edge", "m", 1.03 * full, 0.1)
+            Parameter(tank.name, "edge", "m", 1.0, 1.03 * full, 0.1)
             if tank.level
-            else LumpedNumber(tank.name, "start", "1", 0.6, 0.3),
+            else Parameter(tank.name, "start", "1", 1.0, 0.6, 0.3),
             # A gauge reads zero somewhere near the orifice, not at it.
-            *([LumpedNumber(tank.name, "zero", "m", 0.0, ZERO * full, False)] if tank.level else []),
+            *([Parameter(tank.name, "zero", "m", 1.0, 0.0, ZERO * full, False)] if tank.level else []),
         ]
     for mass in parts.masses:
         i = answers.index(mass.velocity)
         push = float(scales.answer_width[i]) * 2.0
         rows += [
-            LumpedNumber(mass.name, "gain", "m/s^2", push / commands[mass.command], 1.0),
-            LumpedNumber(mass.name, "viscous", "1/s", 2.0, 0.7),
-            LumpedNumber(mass.name, "viscous_asymmetry", "1", 0.0, 0.2, False),
-            LumpedNumber(mass.name, "coulomb", "m/s^2", 0.2 * push, 1.0),
-            LumpedNumber(mass.name, "offset", "m/s^2", 0.0, 0.2 * push, False),
+            Parameter(mass.name, "gain", "m/s^2", 1.0, push / commands[mass.command], 1.0),
+            Parameter(mass.name, "viscous", "1/s", 1.0, 2.0, 0.7),
+            Parameter(mass.name, "viscous_asymmetry", "1", 1.0, 0.0, 0.2, False),
+            Parameter(mass.name, "coulomb", "m/s^2", 1.0, 0.2 * push, 1.0),
+            Parameter(mass.name, "offset", "m/s^2", 1.0, 0.0, 0.2 * push, False),
         ]
     for lag in parts.lags:
         i = answers.index(lag.pressure)
         wide = float(scales.answer_width[i])
         rows += [
-            LumpedNumber(lag.name, "gain", "Pa", 0.0, wide / commands[lag.command], False),
-            LumpedNumber(lag.name, "offset", "Pa", float(scales.answer_offset[i]), wide, False),
-            LumpedNumber(lag.name, "lag", "s", 0.2, 1.0),
+            Parameter(lag.name, "gain", "Pa", 1.0, 0.0, wide / commands[lag.command], False),
+            Parameter(lag.name, "offset", "Pa", 1.0, float(scales.answer_offset[i]), wide, False),
+            Parameter(lag.name, "lag", "s", 1.0, 0.2, 1.0),
         ]
     return rows
