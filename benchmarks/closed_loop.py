@@ -49,7 +49,7 @@ NOISY = ("velocity", "pressure", "joint_rate_deg")
 LOAM = "sandy_loam"
 DRAWS = (0, 100, 200)
 """First seeds of three draws of lines, each with noise of its own; tunings use seeds from 1,000,000 on."""
-LEAST_MM = 1e-3
+MIN_MM = 1e-3
 PLAN = (2, 3, 4, 8, 14, 29)
 """Blocks of the judged plan on a network, 0.6 s, 0.4 s by default: better on unjudged lines, slower."""
 ATTITUDE_M = 2.0
@@ -290,11 +290,11 @@ def check(bench: Bench, rows: Mapping[str, Mapping[str, Any]]) -> None:
         ours = mean(by_name["nmpc"]["path_rms_mm"])
         if name != "as it was":
             ask(f"nmpc, path error, mean, {name}", ours, bounds.get(name, 1.5 * 3.0))
-        ask(f"nmpc, path error, {name}, against pi", ours, max(LEAST_MM, mean(by_name["pi"]["path_rms_mm"])))
+        ask(f"nmpc, path error, {name}, against pi", ours, max(MIN_MM, mean(by_name["pi"]["path_rms_mm"])))
         position = [mean(by_name[who]["position_rms_mm"]) for who in ("nmpc", "pi")]
         ask(f"nmpc, position error, {name}, against pi", *position)
         pairs = zip(by_name["nmpc"]["path_rms_mm"], by_name["pi"]["path_rms_mm"], strict=True)
-        worst = max(own / max(LEAST_MM, rival) for own, rival in pairs)
+        worst = max(own / max(MIN_MM, rival) for own, rival in pairs)
         ask(f"nmpc, path error over that of pi, {name}, on the line where it is largest", worst, 1.0, "1")
     violated = sum(row["violations"] for by_name in rows.values() for row in by_name.values())
     ask("violated limits, all controllers and variants, plus one", violated + 1.0, 1.0, "1")

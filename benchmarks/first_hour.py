@@ -27,10 +27,10 @@ from typing import Any
 
 from common import DATA_AND_PARTS, Bench, Skipped, benchmark, option, table
 
-MOST_COMMANDS = 5
+MAX_COMMANDS = 5
 WAYS_OUT = {"inspect": (0, 3), "evaluate": (0, 6)}
 """Exit codes that say something of the data or the model: 3, the logs have faults; 6, a baseline is better."""
-MOST_PERSON_S = 180.0
+MAX_PERSON_S = 180.0
 DECIDING = ("init", "inspect")
 """Commands whose answers ask for decisions."""
 KEY_S, PREPARED_S = 0.28, 1.35
@@ -265,8 +265,8 @@ def main(bench: Bench) -> object:
     finished = sum(bool(one["report_bytes"]) and not one["stuck"] for one in results.values())
     bench.check("channels mapped right, worst set (against 90 %)", least, 0.9, ">= 1", "share")
     bench.check("columns silently wrong and one (against one)", silent + 1, 1, "<= 1", "columns")
-    bench.check("commands to the report, worst set (against 5)", most, MOST_COMMANDS, "<= 1", "commands")
-    bench.check("person's time by a model, worst set (against 3 min)", longest, MOST_PERSON_S, "<= 1", "s")
+    bench.check("commands to the report, worst set (against 5)", most, MAX_COMMANDS, "<= 1", "commands")
+    bench.check("person's time by a model, worst set (against 3 min)", longest, MAX_PERSON_S, "<= 1", "s")
     bench.check("sets with a report (against all)", finished, len(results), ">= 1", "sets")
     bench.keep = not bench.options.names
     return {name: shown_of(one) for name, one in results.items()}

@@ -44,7 +44,7 @@ from edp.workflows.transfer import FinetuneSpec
 SPEEDUP, SHARE, NEAR = 1.8, 0.03, 1.05
 UNITS = 1_000
 PARTS = ("before", "full", "delta")
-LEAST_S = 1.0
+MIN_S = 1.0
 """Processor time of one process, below which two are not compared with it: the system counts in hundredths, and the
 start of a worker differs by tenths."""
 BASELINES = ("persistence", "ridge_arx", "small_mlp")
@@ -277,7 +277,7 @@ def two_against_one(command: Command) -> dict[str, Any]:
     return {
         "one process, s": alone, "two: coordinator, s": here, "two: busier worker, s": max(workers),
         "two: both workers, s": sum(workers), "starting a worker, s": started,
-        "times": alone / (here + max(workers)) if alone >= LEAST_S else None,
+        "times": alone / (here + max(workers)) if alone >= MIN_S else None,
     }  # fmt: skip
 
 

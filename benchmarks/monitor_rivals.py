@@ -22,7 +22,7 @@ from edp.monitor.whitening import Whitening
 Floats = NDArray[np.float64]
 PYOD = {"CBLOF": {"random_state": 0}, "GMM": {"n_components": 8, "random_state": 0}}
 """Detectors that were the best of ten, with options where the defaults are random or of one component."""
-MOST_ROWS = 5_000
+MAX_ROWS = 5_000
 """Blocks that a PyOD detector is fitted to: neighbours of more take hours."""
 CHARTS: dict[str, DetectorSpec] = {"ewma": EwmaSpec(), "cusum": CusumSpec(slack=0.25)}
 
@@ -92,7 +92,7 @@ class Pyod(OfBlocks):
     def learn(self, rows: Floats) -> None:
         """On a draw of the blocks."""
         rng = np.random.default_rng(self.seed)
-        self.model.fit(rows[rng.permutation(len(rows))[:MOST_ROWS]])
+        self.model.fit(rows[rng.permutation(len(rows))[:MAX_ROWS]])
 
     def scores(self, rows: Floats) -> Floats:
         """Its score; the logarithm where it spans decades, as charts are made for bells."""

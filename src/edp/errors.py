@@ -7,14 +7,14 @@ from collections.abc import Iterable
 
 from edp.wording import figure
 
-MOST_CHARACTERS = 8_000
+MAX_CHARACTERS = 8_000
 """Of a message: two screens. Names and values in it come from files, which may hold a hundred thousand characters."""
 
 
 class EdpError(Exception):
     """Base of every error that the user can repair; the command line prints it without a traceback.
 
-    A message that is longer than `MOST_CHARACTERS` loses its middle: the file stands at the beginning, the advice at
+    A message that is longer than `MAX_CHARACTERS` loses its middle: the file stands at the beginning, the advice at
     the end.
 
     Attributes:
@@ -24,8 +24,8 @@ class EdpError(Exception):
     exit_code = 1
 
     def __init__(self, message: str = "", *others: object) -> None:
-        message, half = str(message), MOST_CHARACTERS // 2
-        if len(message) > MOST_CHARACTERS:
+        message, half = str(message), MAX_CHARACTERS // 2
+        if len(message) > MAX_CHARACTERS:
             message = f"{message[:half]} ... ({len(message) - 2 * half:,} characters left out) ... {message[-half:]}"
         super().__init__(message, *others)
 

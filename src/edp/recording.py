@@ -18,7 +18,7 @@ FloatArray = NDArray[np.float32]
 MACHINE = "machine"
 """Where the meta of a recording says which machine it is of."""
 
-MOST_ROWS = 1 << 22
+MAX_ROWS = 1 << 22
 """Rows that screening and coverage hold at a time: eleven and a half hours at 100 Hz."""
 STRETCH_S = 120.0
 """Of the stretches that a large data set is looked at by."""
@@ -167,7 +167,7 @@ def columns(values: FloatArray, places: Sequence[int]) -> FloatArray:
     return values[:, list(places)]
 
 
-def spread_stretches(lengths: Sequence[int], length: int, most: int = MOST_ROWS) -> list[tuple[int, int, int]]:
+def spread_stretches(lengths: Sequence[int], length: int, most: int = MAX_ROWS) -> list[tuple[int, int, int]]:
     """Stretches that are evenly spread over sequences of rows: number of the sequence, first row, one after the last.
 
     Args:
@@ -196,7 +196,7 @@ def spread_stretches(lengths: Sequence[int], length: int, most: int = MOST_ROWS)
     return chosen
 
 
-def spread_recordings(recordings: Sequence[Recording], seconds: float, most: int = MOST_ROWS) -> list[Recording]:
+def spread_recordings(recordings: Sequence[Recording], seconds: float, most: int = MAX_ROWS) -> list[Recording]:
     """Return the recordings, or evenly spaced segments of the given length in seconds if they are longer.
 
     Samples on disk are not loaded.

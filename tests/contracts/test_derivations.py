@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from edp.config.experiment import build
-from edp.data.features import DERIVATIONS, MOST_LAG, Derived, FeatureSet, derive
+from edp.data.features import DERIVATIONS, MAX_LAG, Derived, FeatureSet, derive
 from edp.data.scaling import feature_matrix
 from edp.data.series import Series
 from edp.data.task import TargetMode, Task
@@ -117,4 +117,4 @@ def test_spans_that_cannot_be_are_one_error(options, message):
 def test_spans_are_read_from_settings_and_rounded_to_ticks():
     derived = build(Derived, {"name": "d", "source": "a", "how": "change", "seconds": 0.03}, "test")
     assert (derived.ticks(100.0), derived.ticks(50.0), derived.gain(1000.0)) == (3, 2, 30.0)
-    assert Derived("d", "a", "change", seconds=MOST_LAG / RATE).ticks(RATE) == MOST_LAG
+    assert Derived("d", "a", "change", seconds=MAX_LAG / RATE).ticks(RATE) == MAX_LAG

@@ -220,7 +220,7 @@ def test_the_header_says_that_the_time_of_a_tick_varies_and_what_stack_it_takes(
 
 
 def test_a_machine_whose_tick_needs_too_large_a_stack_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(model, "MOST_STACK", 1000)
+    monkeypatch.setattr(model, "MAX_STACK", 1000)
     with pytest.raises(ExportError, match=r"works in [0-9,]+ bytes of stack; at most 1,000.*smaller twin"):
         make_target("c").write(bench(), "predictor", tmp_path / "made")
     assert not (tmp_path / "made").exists()

@@ -16,7 +16,7 @@ from edp.errors import BusyError, ExportError, StorageError
 from edp.export import folder as room
 from edp.export.c.model import _check
 from edp.export.folder import LIST, UNFINISHED, write_export
-from edp.export.sizes import MOST_COLUMNS, check_numbers, check_sizes
+from edp.export.sizes import MAX_COLUMNS, check_numbers, check_sizes
 from edp.ir import Graph, layers
 from edp.ir.base import INPUT
 from edp.storage import hold
@@ -182,16 +182,16 @@ def test_sizes_beyond_an_index_of_the_code_are_refused():
     with pytest.raises(ExportError, match="window: 2,147,483,648"):
         check_sizes({"window": 2**31})
     columns = tuple(range(0, 40, 2))
-    for inputs, last in ((MOST_COLUMNS, MOST_COLUMNS - 1), (MOST_COLUMNS + 1, MOST_COLUMNS)):
+    for inputs, last in ((MAX_COLUMNS, MAX_COLUMNS - 1), (MAX_COLUMNS + 1, MAX_COLUMNS)):
         chosen = layers.Gather(name="chosen", inputs=(INPUT,), columns=(*columns, last))
         graph = Graph(inputs, (chosen,), {"prediction": "chosen"})
         model = SimpleNamespace(graph=graph, bundle=bundle_with(), plan=None, adapts=False, state_bytes=lambda: 0)
-        if last < MOST_COLUMNS:
+        if last < MAX_COLUMNS:
             _check(model)
         else:
             with pytest.raises(ExportError, match="chooses from: 65,537"):
                 _check(model)
-    assert np.uint16(MOST_COLUMNS - 1) == MOST_COLUMNS - 1
+    assert np.uint16(MAX_COLUMNS - 1) == MAX_COLUMNS - 1
 
 
 def test_a_killed_export_leaves_nothing_behind_the_next_one(tmp_path):

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edp.control.fmu.archive import MOST_ENTRIES, MOST_XML, FmuArchive
-from edp.control.fmu.description import MOST_ELEMENTS, MOST_VARIABLES, read_description
+from edp.control.fmu.archive import MAX_XML, MOST_ENTRIES, FmuArchive
+from edp.control.fmu.description import MAX_ELEMENTS, MAX_VARIABLES, read_description
 from edp.control.fmu.ports import ports_of
 from edp.control.plants import plant_of
 from edp.errors import ConfigError, DataError
@@ -139,7 +139,7 @@ def test_too_many_entries_are_refused(tmp_path):
 
 
 def test_a_description_as_large_as_a_bomb_is_refused(tmp_path):
-    assert "modelDescription.xml" in refused(whole(tmp_path, described(variables=" " * (MOST_XML + 1))))
+    assert "modelDescription.xml" in refused(whole(tmp_path, described(variables=" " * (MAX_XML + 1))))
 
 
 @pytest.mark.parametrize(
@@ -225,7 +225,7 @@ def test_descriptions_that_are_wrong_are_refused(tmp_path, xml, text):
 
 
 def test_too_many_variables_are_refused():
-    xml = described(variables=PILOT * (MOST_VARIABLES + 1))
+    xml = described(variables=PILOT * (MAX_VARIABLES + 1))
     with pytest.raises(DataError, match="variables"):
         read_description(xml, "a test")
 
@@ -337,4 +337,4 @@ def test_damage_anywhere_ends_in_one_of_our_errors_or_in_a_sound_description(tmp
 
 def test_a_description_of_elements_without_end_is_refused():
     with pytest.raises(DataError, match="elements"):
-        read_description(b"<a>" + b"<b/>" * (MOST_ELEMENTS + 1) + b"</a>", "a test")
+        read_description(b"<a>" + b"<b/>" * (MAX_ELEMENTS + 1) + b"</a>", "a test")

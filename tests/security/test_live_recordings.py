@@ -9,7 +9,7 @@ import pytest
 
 from edp.errors import DataError
 from edp.logs import read_recording
-from edp.logs.formats.mcap_json import LONGEST_MESSAGE, MOST_PATHS, read_json_mcap
+from edp.logs.formats.mcap_json import LONGEST_MESSAGE, MAX_PATHS, read_json_mcap
 from edp.signals import SignalMap
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -72,7 +72,7 @@ def test_topics_with_the_same_names_are_told_apart(tmp_path):
         ([channel(), message(b'{"a":' + b"9" * 5000 + b"}")], "not valid JSON"),
         ([channel(), message(b"\xff\xfe")], "damaged"),
         ([channel(), message(b'{"a":"' + b"x" * LONGEST_MESSAGE + b'"}')], "a message of"),
-        ([channel(), message(json.dumps({f"c{n}": n for n in range(MOST_PATHS + 1)}).encode())], "more than 4096"),
+        ([channel(), message(json.dumps({f"c{n}": n for n in range(MAX_PATHS + 1)}).encode())], "more than 4096"),
         ([message(b"{}")], "which nothing describes"),
         ([channel(encoding="protobuf"), message(b"\0")], r"encodings: protobuf"),
         ([channel(), message(b'{"a":"text"}')], "no numbers"),

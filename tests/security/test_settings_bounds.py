@@ -23,7 +23,7 @@ from edp.ir.rls import AdaptationSpec
 from edp.networks.losses import AdaptiveWeights
 from edp.networks.predictor import ModelSpec, Predictor, build_model
 from edp.networks.size import size_at_most
-from edp.settings.bounds import MOST_SEED, Bound, shown
+from edp.settings.bounds import MAX_SEED, Bound, shown
 from edp.signals import Kind
 from edp.training.bundle import blank_scaler
 from edp.training.compression.distillation import DistillationSpec, SoftmaxDivergence
@@ -221,8 +221,8 @@ def test_bounds_know_numbers():
     assert [bound.holds(v) for v in (0, 1, 2, 2.5, True, "1", None, math.nan, np.float64(1.5))] == [
         False, True, True, False, False, False, False, False, True,
     ]  # fmt: skip
-    assert Bound(0, MOST_SEED, integer=True).holds(np.int64(5))
-    assert not Bound(0, MOST_SEED, integer=True).holds(5.0)
+    assert Bound(0, MAX_SEED, integer=True).holds(np.int64(5))
+    assert not Bound(0, MAX_SEED, integer=True).holds(5.0)
 
 
 def prepared(task, ticks=400):

@@ -302,7 +302,7 @@ def test_a_machine_that_rests_and_is_measured_in_steps_is_left_at_rest(tmp_path)
     assert errors["network"]["rmse"] < 1.05 * errors["ridge_arx"]["rmse"]
 
 
-SMALLER = {"UNITS": 16, "LEAST_STEPS": 100, "CENTRES": 100}
+SMALLER = {"UNITS": 16, "MIN_STEPS": 100, "CENTRES": 100}
 """Sizes of a committee that trains in a fraction of the time; `make test-slow` takes the preset's own."""
 
 

@@ -12,7 +12,7 @@ from sklearn.linear_model import Ridge
 import edp.training.bagging.table
 from edp.config.experiment import build
 from edp.data.features import FeatureSet
-from edp.data.fold_ridge import LEAST_GAIN, PENALTIES, fold_ridge
+from edp.data.fold_ridge import MIN_GAIN, PENALTIES, fold_ridge
 from edp.data.folds import make_block_folds, recording_folds
 from edp.data.prepared import prepare
 from edp.data.splits import ByRecording, ByTime
@@ -529,7 +529,7 @@ def test_fold_ridge_is_the_ridge_regression_of_each_fold(of_fold):
         truth = np.concatenate([own[fold][folds.left_out(fold)] for fold in range(4)])
         guess = np.concatenate([found[folds.left_out(fold)] for fold in range(4)])
         error = np.mean(np.square(guess - truth))
-        if error < best * (1.0 - LEAST_GAIN):
+        if error < best * (1.0 - MIN_GAIN):
             best, wanted = error, found
     np.testing.assert_allclose(fold_ridge(table, targets, folds, [np.arange(12)]).left_out, wanted, rtol=1e-8)
 

@@ -233,7 +233,7 @@ def test_a_scaler_takes_one_pass(logs, monkeypatch):
 
 @pytest.mark.parametrize("count", [1, 2, 5, 1000, 1 << 14])
 def test_an_order_that_is_not_listed_is_a_permutation(count, monkeypatch):
-    monkeypatch.setattr("edp.data.order.MOST_LISTED", 0)
+    monkeypatch.setattr("edp.data.order.MAX_LISTED", 0)
     orders = [RandomOrder(np.random.default_rng(seed), count) for seed in (1, 1, 2)]
     parts = [np.concatenate([one.part(at, at + 13) for at in range(0, count, 13)]) for one in orders]
     assert sorted(parts[0]) == list(range(count))
@@ -249,7 +249,7 @@ def test_quantiles_of_many_values_are_right_to_a_thousandth(monkeypatch):
     values = np.random.default_rng(0).lognormal(size=20_000)
     exact, binned = QuantileSketch(), QuantileSketch()
     exact.update(values)
-    monkeypatch.setattr("edp.stats.sketch.MOST_EXACT", 1_000)
+    monkeypatch.setattr("edp.stats.sketch.MAX_EXACT", 1_000)
     for part in np.split(values, 20):
         binned.update(part)
     shares = (0.1, 0.5, 0.95, 0.99)
@@ -269,7 +269,7 @@ def test_scores_of_many_ticks_are_those_of_all_at_once(monkeypatch):
     predicted = truth + rng.normal(size=truth.shape)
     exact, summed = Tally(("x", "y")), Tally(("x", "y"))
     exact.update(predicted, truth)
-    for name in ("edp.evaluation.tally.MOST_EXACT", "edp.stats.sketch.MOST_EXACT"):
+    for name in ("edp.evaluation.tally.MAX_EXACT", "edp.stats.sketch.MAX_EXACT"):
         monkeypatch.setattr(name, 500)
     for start in range(0, 9_000, 400):
         summed.update(predicted[start : start + 400], truth[start : start + 400])
@@ -287,7 +287,7 @@ def test_scores_of_parts_that_are_added_are_those_of_all_at_once(monkeypatch, mo
     rng = np.random.default_rng(2)
     truth = rng.normal(size=(6_000, 2)) * 40.0
     predicted = truth + rng.normal(size=truth.shape)
-    for name in ("edp.evaluation.tally.MOST_EXACT", "edp.stats.sketch.MOST_EXACT"):
+    for name in ("edp.evaluation.tally.MAX_EXACT", "edp.stats.sketch.MAX_EXACT"):
         monkeypatch.setattr(name, most)
     whole, added = Tally(("x", "y")), Tally(("x", "y"))
     whole.update(predicted, truth)
@@ -325,7 +325,7 @@ def test_stretches_of_recordings_and_series_are_views():
 
 
 def test_a_large_data_set_is_screened_on_stretches_of_it(monkeypatch):
-    monkeypatch.setattr("edp.data.screening.table.MOST_ROWS", 8_000)
+    monkeypatch.setattr("edp.data.screening.table.MAX_ROWS", 8_000)
     monkeypatch.setattr("edp.recording.spread_stretches.__defaults__", (8_000,))
     rng = np.random.default_rng(0)
     recordings = []

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 _LANGUAGES = {".py": "python", ".toml": "toml", ".json": "json", ".c": "c", ".h": "c", ".sh": "sh", ".md": "markdown"}
-MOST_SHOWN = 60_000
+MAX_SHOWN = 60_000
 """Bytes of a file that a page shows whole: measured figures can be megabytes."""
-MOST_LISTED = 60
+MAX_LISTED = 60
 """Files of a folder that a page lists."""
 _HIDDEN = "---\nsearch:\n  exclude: true\n---\n\n"
 """The search of the site shall find what is said of a file, not each line of it."""
@@ -22,7 +22,7 @@ def file_page(path: Path, name: str) -> str:
     """
     size = path.stat().st_size
     try:
-        text = path.read_text(encoding="utf-8") if size <= MOST_SHOWN else ""
+        text = path.read_text(encoding="utf-8") if size <= MAX_SHOWN else ""
     except UnicodeDecodeError:
         text = ""
     if not text:
@@ -40,5 +40,5 @@ def folder_page(folder: Path, name: str, linked: dict[str, str]) -> str:
         linked: by file name, the page that shows it.
     """
     names = sorted(path.name for path in folder.iterdir() if not path.name.startswith((".", "__")))
-    rows = [f"* [{entry}]({linked[entry]})" if entry in linked else f"* {entry}" for entry in names[:MOST_LISTED]]
+    rows = [f"* [{entry}]({linked[entry]})" if entry in linked else f"* {entry}" for entry in names[:MAX_LISTED]]
     return f"{_HIDDEN}# {name}\n\n" + "\n".join(rows) + "\n"

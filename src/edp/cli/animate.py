@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out
-from edp.cli.options import MOST_SECONDS, MapOption, check_effects, within
+from edp.cli.options import MAX_SECONDS, MapOption, check_effects, within
 from edp.errors import ConfigError
 from edp.settings.bounds import above, span
 from edp.storage.paths import full_path
@@ -32,10 +32,10 @@ def animate(
     machine: Annotated[
         str | None, typer.Option(help="Machine name or file (.toml) to draw; default: the recording's.")
     ] = None,
-    start: Annotated[float, typer.Option(callback=within(span(0.0, MOST_SECONDS)), help="First second shown.")] = 0.0,
+    start: Annotated[float, typer.Option(callback=within(span(0.0, MAX_SECONDS)), help="First second shown.")] = 0.0,
     seconds: Annotated[
         float | None,
-        typer.Option(callback=within(above(0.0, MOST_SECONDS)), help="How many seconds; default: up to 600."),
+        typer.Option(callback=within(above(0.0, MAX_SECONDS)), help="How many seconds; default: up to 600."),
     ] = None,
     horizon: Annotated[
         int | None, typer.Option(min=1, help="Samples ahead of the run's predictions; default: its furthest.")

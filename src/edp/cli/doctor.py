@@ -27,9 +27,9 @@ from edp.wording import figure, number
 BROKEN = 3
 """Exit code where something is missing or broken that edp cannot do without."""
 _PACKAGE = "excavator-dynamics-predictor"
-_LEAST_DISK = 2e9
+_MIN_DISK = 2e9
 """Bytes: a demo takes half of that, a search several."""
-_LEAST_MEMORY = 2e9
+_MIN_MEMORY = 2e9
 """Bytes: 10 h of 45 channels train in 1.5 GB."""
 _EXTRAS: Mapping[str, tuple[str, str]] = {
     "mdf": ("asammdf", "MDF 4 logs"),
@@ -154,11 +154,11 @@ def machine(folder: Path) -> list[InstallationCheck]:
         InstallationCheck(
             "threads", "ok", f"{cores} cores{'; ' if limits else ''}{limits}", "training.threads, --workers"
         ),
-        _size("memory", free_bytes(), _LEAST_MEMORY, "training; free now"),
+        _size("memory", free_bytes(), _MIN_MEMORY, "training; free now"),
     ]
     there = next((path for path in (folder.absolute(), *folder.absolute().parents) if is_folder_at(path)), Path("/"))
     try:
-        checks.append(_size("disk", shutil.disk_usage(there).free, _LEAST_DISK, f"runs below {there}"))
+        checks.append(_size("disk", shutil.disk_usage(there).free, _MIN_DISK, f"runs below {there}"))
     except OSError as error:
         checks.append(InstallationCheck("disk", "broken", error.strerror or "unreadable", f"runs below {there}"))
     if not os.access(there, os.W_OK):

@@ -11,8 +11,8 @@ import typer
 
 from edp.cli.console import JsonFlag, emit, out, print_table, table
 from edp.cli.options import (
-    MOST_HOURS,
-    MOST_MINUTES,
+    MAX_HOURS,
+    MAX_MINUTES,
     ClusterOption,
     DataOption,
     MapOption,
@@ -51,7 +51,7 @@ def evaluate(
     minutes: Annotated[
         float | None,
         typer.Option(
-            callback=within(span(0.0, MOST_MINUTES)),
+            callback=within(span(0.0, MAX_MINUTES)),
             help="After these begin no further baseline; cheap ones come first.",
         ),
     ] = None,
@@ -59,7 +59,7 @@ def evaluate(
         float | None,
         typer.Option(
             "--at-most",
-            callback=within(above(0.0, MOST_HOURS)),
+            callback=within(above(0.0, MAX_HOURS)),
             help="Judge on evenly spread stretches of at most so many hours, about.",
         ),
     ] = None,

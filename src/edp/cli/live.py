@@ -12,7 +12,7 @@ from edp.cli.consent import ask_for_fmus
 from edp.cli.console import JsonFlag, emit, err, out
 from edp.cli.options import MapOption
 from edp.errors import ConfigError
-from edp.settings.bounds import MOST_SEED
+from edp.settings.bounds import MAX_SEED
 from edp.storage.paths import full_path
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def live(
     machine: Annotated[str | None, typer.Option(help="Machine or machine file (.toml) of the side view.")] = None,
     rate: Annotated[float | None, typer.Option(help="Rate (Hz) where no model says it.")] = None,
     seed: Annotated[
-        int | None, typer.Option(min=0, max=MOST_SEED, help="Of the simulator or the loop; default: 0.")
+        int | None, typer.Option(min=0, max=MAX_SEED, help="Of the simulator or the loop; default: 0.")
     ] = None,
     excitation: Annotated[str | None, typer.Option(help="Operator of --sim; default: combined.")] = None,
     fault: Annotated[list[str], typer.Option("--fault", help="Fault of --sim, as edp simulate takes it.")] = [],  # noqa: B006

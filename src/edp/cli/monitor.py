@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 # Scripts can tell alarms by the exit code.
 ALARMS = 5
-MOST_SHOWN = 50
+MAX_SHOWN = 50
 """Changes that are printed; the files have all alarms."""
 ALARM_HEADS = ["", "raised, s", "since, s", "severity", "alarms", ""]
 
@@ -203,11 +203,11 @@ def run(
             for first, *again in watched.changes
         ]
         if rows:
-            table("changes, and how often each raised an alarm", ALARM_HEADS, rows[:MOST_SHOWN])
+            table("changes, and how often each raised an alarm", ALARM_HEADS, rows[:MAX_SHOWN])
         if mdf is not None:
             out.print(f"logs with their alarms as events in {mdf}")
-        if len(rows) > MOST_SHOWN:
-            out.print(f"and {len(rows) - MOST_SHOWN:,} more")
+        if len(rows) > MAX_SHOWN:
+            out.print(f"and {len(rows) - MAX_SHOWN:,} more")
         count = f"{len(watched.alarms):,} alarms" if watched.alarms else "no alarm"
         out.print(f"{count} in {figure(watched.hours, 3)} h; {watched.monitor.limit.sentence()}")
         for line in watched.silence:

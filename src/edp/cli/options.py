@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from edp.jobs import Workers
     from edp.logs.source import DataSource
 
-MOST_WORKERS = 256
+MAX_WORKERS = 256
 MOST_LOOPS = 10_000
 MOST_TICKS = 1_000_000
 """Of a reference recording: three hours at 100 Hz."""
-MOST_SECONDS, MOST_MINUTES, MOST_HOURS = 1e6, 1e6, 1e6
+MAX_SECONDS, MAX_MINUTES, MAX_HOURS = 1e6, 1e6, 1e6
 """Lengths of runs and logs, processor time, and lengths of data sets: more than anybody has."""
 LogsArgument = Annotated[
     list[Path],
@@ -46,7 +46,7 @@ SettingsOption = Annotated[
     typer.Option("--config", help="Settings (TOML): the table of this command, and tables of its trainings."),
 ]
 WorkersOption = Annotated[
-    int, typer.Option(min=0, max=MOST_WORKERS, help="Processes side by side; 0: one for each core.")
+    int, typer.Option(min=0, max=MAX_WORKERS, help="Processes side by side; 0: one for each core.")
 ]
 ClusterOption = Annotated[
     str,

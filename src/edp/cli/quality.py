@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from edp.cli.console import out, table
-from edp.cli.options import MOST_HOURS, within
+from edp.cli.options import MAX_HOURS, within
 from edp.errors import count_of
 from edp.settings.bounds import above
 from edp.wording import figure, number, percent
@@ -21,14 +21,14 @@ AtMostOption = Annotated[
     float | None,
     typer.Option(
         "--at-most",
-        callback=within(above(0.0, MOST_HOURS)),
+        callback=within(above(0.0, MAX_HOURS)),
         help="Of a store, look at evenly spread stretches of at most so many hours, about; default: all.",
     ),
 ]
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
-_MOST_KINDS = 12
+_MAX_KINDS = 12
 """Kinds of findings of one severity that are shown without --details."""
-_MOST_NAMED = 4
+_MAX_NAMED = 4
 """Logs that are named beside one."""
 VERDICT_TEXTS = {
     "good": "good: use them as they are",
@@ -93,13 +93,13 @@ def show_lines(quality: DataQuality) -> None:
         if severity == "note" and chosen:
             out.print(f"  {count_of(len(chosen), 'kind')} of notes; --details shows all")
             break
-        for each in sorted(chosen, key=len, reverse=True)[:_MOST_KINDS]:
+        for each in sorted(chosen, key=len, reverse=True)[:_MAX_KINDS]:
             show_finding(each[0][1])
             if len(quality.reports) > 1:
-                names = ", ".join(name for name, _ in each[:_MOST_NAMED]) + (", ..." if len(each) > _MOST_NAMED else "")
+                names = ", ".join(name for name, _ in each[:_MAX_NAMED]) + (", ..." if len(each) > _MAX_NAMED else "")
                 out.print(f"    in {len(each)} of {count_of(len(quality.reports), 'log')}: {names}")
-        if len(chosen) > _MOST_KINDS:
-            out.print(f"  and {len(chosen) - _MOST_KINDS} more kinds of {severity}s; --details shows them")
+        if len(chosen) > _MAX_KINDS:
+            out.print(f"  and {len(chosen) - _MAX_KINDS} more kinds of {severity}s; --details shows them")
     out.print()
 
 

@@ -17,7 +17,7 @@ from edp.wording import number
 if TYPE_CHECKING:
     from edp.logs.store import StoreIndex
 
-MOST_REFUSED = 20
+MAX_REFUSED = 20
 """Refused logs that are printed; the index has all of them."""
 
 app = typer.Typer(
@@ -107,9 +107,9 @@ def _show(index: StoreIndex, folder: Path, as_json: bool) -> None:
         table(f"store {folder}", ["", ""], rows)
         if index.refused:
             out.print()
-            listing("refused", ["log", "why"], [(refused.log, refused.why) for refused in index.refused[:MOST_REFUSED]])
-            if len(index.refused) > MOST_REFUSED:
-                out.print(f"and {len(index.refused) - MOST_REFUSED} more")
+            listing("refused", ["log", "why"], [(refused.log, refused.why) for refused in index.refused[:MAX_REFUSED]])
+            if len(index.refused) > MAX_REFUSED:
+                out.print(f"and {len(index.refused) - MAX_REFUSED} more")
         if index.recordings:
             out.print(f"next: edp inspect {folder}; edp train {folder} --out runs/first")
 

@@ -11,7 +11,7 @@ import typer
 
 from edp.cli.console import JsonFlag, duration, emit, err, out, table
 from edp.cli.options import (
-    MOST_WORKERS,
+    MAX_WORKERS,
     ClusterOption,
     LogsArgument,
     MapOption,
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 AUTO = "auto"
 """`edp.config.experiment.AUTO`, known here without loading that module."""
-MOST_EXPECTED = 12
+MAX_EXPECTED = 12
 """Outputs of which the terminal says what to expect; the report has all."""
 
 
@@ -56,7 +56,7 @@ def train(
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     workers: Annotated[
-        int, typer.Option(min=0, max=MOST_WORKERS, help="Of the preset auto: parallel trainings; 0: one for each core.")
+        int, typer.Option(min=0, max=MAX_WORKERS, help="Of the preset auto: parallel trainings; 0: one for each core.")
     ] = 0,
     cluster: ClusterOption = "",
     open_cluster: OpenOption = False,
@@ -149,7 +149,7 @@ def _print_expected_errors(choice: AutoChoice) -> None:
             *(figure(values[target]) for values in expected),
             number(skill.promise[horizon][target], 2),
         ]
-        for target in list(promised[horizon])[:MOST_EXPECTED]
+        for target in list(promised[horizon])[:MAX_EXPECTED]
     ]
     beside = "persistence's" if skill.against == "persistence" else "the linear model's"
     heads = ["output", "error", "90 % of tests: from", "to", f"over {beside}"]

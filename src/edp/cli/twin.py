@@ -10,9 +10,9 @@ import typer
 
 from edp.cli.console import JsonFlag, duration, emit, out, table
 from edp.cli.options import (
-    MOST_MINUTES,
-    MOST_SECONDS,
-    MOST_WORKERS,
+    MAX_MINUTES,
+    MAX_SECONDS,
+    MAX_WORKERS,
     ClusterOption,
     LogsArgument,
     MapOption,
@@ -45,15 +45,13 @@ def twin(
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     start: Annotated[Path | None, typer.Option(help="Run folder of a twin that goes on with these recordings.")] = None,
-    workers: Annotated[
-        int, typer.Option(min=0, max=MOST_WORKERS, help="Parallel trainings; 0: one for each core.")
-    ] = 0,
+    workers: Annotated[int, typer.Option(min=0, max=MAX_WORKERS, help="Parallel trainings; 0: one for each core.")] = 0,
     cluster: ClusterOption = "",
     open_cluster: OpenOption = False,
     minutes: Annotated[
         float | None,
         typer.Option(
-            callback=within(span(MIN_MINUTES, MOST_MINUTES)),
+            callback=within(span(MIN_MINUTES, MAX_MINUTES)),
             help="Of a choice without twin.kind: processor time of its networks at most; default: no bound.",
         ),
     ] = None,
@@ -138,13 +136,13 @@ def rollout(
     run: Annotated[Path, typer.Argument(help="Run folder of edp twin.")],
     log: Annotated[Path, typer.Argument(help="One log.")],
     seconds: Annotated[
-        float, typer.Option(callback=within(above(0.0, MOST_SECONDS)), help="Length of the free run.")
+        float, typer.Option(callback=within(above(0.0, MAX_SECONDS)), help="Length of the free run.")
     ] = 60.0,
     start_s: Annotated[
         float | None,
         typer.Option(
             "--from",
-            callback=within(span(0.0, MOST_SECONDS)),
+            callback=within(span(0.0, MAX_SECONDS)),
             help="Start in the log, in seconds; default: as early as possible.",
         ),
     ] = None,

@@ -13,7 +13,7 @@ from edp.control.controllers.pi import ProportionalIntegral
 from edp.control.tasks import TASKS, TaskSpec
 from edp.control.tasks.grade import Grade
 from edp.errors import ConfigError
-from edp.settings.bounds import MOST_SEED, above, check_bounds, integer, span
+from edp.settings.bounds import MAX_SEED, above, check_bounds, integer, span
 from edp.settings.tree import SettingsTree
 from edp.wording import setting_text, typed
 
@@ -52,7 +52,7 @@ class ControlExperiment:
             "control",
             self,
             loops=integer(1, MOST_LOOPS),
-            seed=integer(0, MOST_SEED - MOST_LOOPS),
+            seed=integer(0, MAX_SEED - MOST_LOOPS),
             rate_hz=above(0.0, 1000.0),
             deadline_ms=span(0.0, 1e6),
         )

@@ -17,7 +17,7 @@ from edp.monitor.residuals.committees import CommitteeOptions
 from edp.monitor.residuals.flow_balances import FlowBalancesSpec
 from edp.monitor.residuals.look_ahead import LookAheadSpec
 from edp.monitor.residuals.virtual_sensors import VirtualSensorsSpec
-from edp.settings.bounds import MIN_MINUTES, MOST_NAMES, SEED, above, between, check_bounds, check_count, integer, span
+from edp.settings.bounds import MAX_NAMES, MIN_MINUTES, SEED, above, between, check_bounds, check_count, integer, span
 from edp.settings.tree import SettingsTree
 
 MONITOR_SETTINGS = SettingsTree({"residuals": RESIDUALS, "detector": DETECTORS}, what="settings")
@@ -69,7 +69,7 @@ class DictionarySpec:
             after_s=span(20.0, 3600.0),
             minutes=span(MIN_MINUTES, 1e5),
         )
-        check_count("dictionary", "kinds", self.kinds, MOST_NAMES)
+        check_count("dictionary", "kinds", self.kinds, MAX_NAMES)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,8 +110,8 @@ class MonitorExperiment:
             minutes=span(MIN_MINUTES, 1e5),
             seed=SEED,
         )
-        check_count("monitor", "channels", self.channels, MOST_NAMES)
-        check_count("monitor", "groups", self.groups, MOST_NAMES)
+        check_count("monitor", "channels", self.channels, MAX_NAMES)
+        check_count("monitor", "groups", self.groups, MAX_NAMES)
         check_count("monitor", "residuals", self.residuals, 16, least=1)
         kinds = [RESIDUALS.name_of(part) for part in self.residuals]
         if len(set(kinds)) < len(kinds):

@@ -24,7 +24,7 @@ from edp.registry import Registry
 from edp.wording import typed
 
 Array = NDArray[np.float64]
-MOST_EVENTS = 1_000
+MAX_EVENTS = 1_000
 """Events that a loop logs; a sensor that flickers must not fill the memory."""
 
 
@@ -44,11 +44,11 @@ class ControlEvent:
 
 
 def log_event(events: list[ControlEvent], tick: int, text: str) -> None:
-    """Append an event. A continuing event is extended; only the first `MOST_EVENTS` are stored."""
+    """Append an event. A continuing event is extended; only the first `MAX_EVENTS` are stored."""
     last = events[-1] if events else None
     if last is not None and last.text == text and last.tick + last.ticks == tick:
         events[-1] = ControlEvent(last.tick, last.ticks + 1, text)
-    elif len(events) < MOST_EVENTS:
+    elif len(events) < MAX_EVENTS:
         events.append(ControlEvent(tick, 1, text))
 
 
@@ -76,7 +76,7 @@ class Controller(ABC):
         spared: those of them without which it has one, where a guard does not trust them.
 
     Attributes:
-        events: what was logged since `reset`, at most `MOST_EVENTS`.
+        events: what was logged since `reset`, at most `MAX_EVENTS`.
         info: figures of the last tick, such as the iterations of a solver; numbers only.
 
     Raises:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from edp.control.base import MOST_EVENTS, ControlEvent
+from edp.control.base import MAX_EVENTS, ControlEvent
 from edp.control.score import LoopScore
 from edp.settings.bounds import check_count
 from edp.settings.results import ResultFile
@@ -68,8 +68,8 @@ class LoopEntry:
     warnings: tuple[ControlEvent, ...]
 
     def __post_init__(self) -> None:
-        check_count("loop", "events", self.events, MOST_EVENTS)
-        check_count("loop", "warnings", self.warnings, MOST_EVENTS)
+        check_count("loop", "events", self.events, MAX_EVENTS)
+        check_count("loop", "warnings", self.warnings, MAX_EVENTS)
 
 
 @dataclass(frozen=True, kw_only=True)

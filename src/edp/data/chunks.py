@@ -16,7 +16,7 @@ from edp.data.augment import AugmentationSpec, input_deviation
 from edp.data.order import RandomOrder
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError
-from edp.settings.bounds import MOST_BATCH, MOST_TICKS, check_bounds, integer
+from edp.settings.bounds import MAX_BATCH, MOST_TICKS, check_bounds, integer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,10 +52,10 @@ class ChunkSpec:
             "chunks",
             self,
             length=integer(1, MOST_TICKS),
-            batch=integer(1, MOST_BATCH),
+            batch=integer(1, MAX_BATCH),
             burn_in=integer(0, MOST_TICKS),
-            consecutive=integer(1, MOST_BATCH),
-            carried=integer(0, MOST_BATCH),
+            consecutive=integer(1, MAX_BATCH),
+            carried=integer(0, MAX_BATCH),
         )
         if self.batch % self.consecutive:
             raise ConfigError(

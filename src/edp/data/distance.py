@@ -15,7 +15,7 @@ from edp.recording import Recording
 Array = NDArray[np.float64]
 REFERENCES, QUERIES = 20_000, 4_000
 """Samples searched in and searched for: distances shrink with the references, so both sides get equally many."""
-MOST_STATES = 1 << 20
+MAX_STATES = 1 << 20
 """Maximum number of states to draw from. Longer data are thinned evenly first."""
 EARLIER_S = 0.2
 """Commands are looked at now and this long ago: the delay of a hydraulic axis."""
@@ -67,7 +67,7 @@ def split_distance(recordings: Sequence[Recording], axes: Sequence[Axis], split:
 def _states(recordings: Sequence[Recording], axes: Sequence[Axis], stretches: Sequence[Stretch]) -> Array:
     """Commands now and a little earlier, velocities and pressures, shape ``(sample, signal)``."""
     parts = []
-    every = -(-sum(stretch.stop - stretch.start for stretch in stretches) // MOST_STATES)
+    every = -(-sum(stretch.stop - stretch.start for stretch in stretches) // MAX_STATES)
     for stretch in stretches:
         recording = recordings[stretch.recording]
         # A stretch shorter than the delay keeps its last sample.

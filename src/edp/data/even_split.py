@@ -12,13 +12,13 @@ from edp.errors import DataError
 from edp.recording import Recording
 from edp.wording import typed
 
-LEAST_OF_SHARE = 0.25
+MIN_OF_SHARE = 0.25
 """Minimum weight of a part relative to its fraction of the data. Without it, a draw of whole recordings of 300 s and 4
 s trained on the 4 s."""
 MOVES = 0.5
 """Fraction of a channel's root-mean-square change above which a sample counts as motion. Steps of an encoder are
 smaller."""
-BLOCKS, LEAST_GAPS = 15, 8
+BLOCKS, MIN_GAPS = 15, 8
 """Blocks of a recording, three of which test, and gaps that one is long at least."""
 EVERY = 5
 HISTORY = 32
@@ -57,7 +57,7 @@ def is_even(
     gap: int,
     weights: Sequence[NDArray[np.bool_]],
 ) -> bool:
-    """Return whether each part has at least `LEAST_OF_SHARE` of the weight expected from its fraction of the data.
+    """Return whether each part has at least `MIN_OF_SHARE` of the weight expected from its fraction of the data.
 
     Args:
         split: division of the recordings.
@@ -72,7 +72,7 @@ def is_even(
     total = sum(int(weight.sum()) for weight in weights)
     return all(
         sum(int(weights[one.recording][one.start : one.stop].sum()) for one in getattr(parts, part))
-        >= LEAST_OF_SHARE * share * total
+        >= MIN_OF_SHARE * share * total
         for part, share in _shares(split).items()
     )
 
@@ -202,5 +202,5 @@ def _evenness(
 def blocks_of_motion(recordings: Sequence[Recording], gap: int) -> ByBlocks:
     """Return a split whose test blocks are spread over the recording, so that standstill at one end is distributed."""
     shortest = min(recording.samples / recording.rate_hz for recording in recordings)
-    least = LEAST_GAPS * gap / min(recording.rate_hz for recording in recordings)
+    least = MIN_GAPS * gap / min(recording.rate_hz for recording in recordings)
     return ByBlocks(block_s=max(shortest / BLOCKS, least), every=EVERY)

@@ -11,17 +11,17 @@ import numpy as np
 from edp.errors import ConfigError, DataError
 from edp.recording import FloatArray, Recording
 from edp.registry import Registry
-from edp.settings.bounds import MOST_NAMES, MOST_TICKS, above, check_bounds, check_count, integer
+from edp.settings.bounds import MAX_NAMES, MOST_TICKS, above, check_bounds, check_count, integer
 from edp.signals import TABLE_A1, VOCABULARY, Kind
 from edp.wording import setting_text, typed
 
 STARTING = "starting"
 """The feature that tells a network whether channels of the start are read at this tick."""
 
-MOST_SECONDS = 31_557_600.0  # a year; how many ticks a span may have is checked where the rate is known
+MAX_SECONDS = 31_557_600.0  # a year; how many ticks a span may have is checked where the rate is known
 ROUNDING = 1e-6
 """Ticks by which a span may miss a whole number of them."""
-MOST_LAG = 4096
+MAX_LAG = 4096
 """Longest span in ticks that a layer before a network looks back; a longer memory is the work of a recurrent layer."""
 Gain = Callable[[int, float], float]
 """(ticks of the span, rate in Hz) to a factor."""
@@ -89,25 +89,25 @@ class Derived:
                 f"leave it out, or take {' or '.join(timed)}"
             )
         if self.seconds is not None:
-            check_bounds(f"derived '{self.name}'", self, seconds=above(0.0, MOST_SECONDS))
+            check_bounds(f"derived '{self.name}'", self, seconds=above(0.0, MAX_SECONDS))
 
     def ticks(self, rate_hz: float) -> int:
         """How many ticks it looks back at a rate, n of its derivation; 1 where it takes no span.
 
         Raises:
-            ConfigError: a span shorter than the derivation allows, or longer than `MOST_LAG`.
+            ConfigError: a span shorter than the derivation allows, or longer than `MAX_LAG`.
         """
         if self.seconds is None:
             return 1
         exact, least = self.seconds * rate_hz, DERIVATIONS[self.how].least_ticks
         # A hair below, so that 0.03 s at 100 Hz, which floats make 2.9999 ticks, are 3.
-        if exact < least - ROUNDING or round(exact) > MOST_LAG:
+        if exact < least - ROUNDING or round(exact) > MAX_LAG:
             raise ConfigError(
                 f"derived '{self.name}': seconds = {setting_text(self.seconds)} are {typed(exact)} ticks at "
                 f"{typed(rate_hz)} Hz; from "
-                f"{least} to {MOST_LAG} ticks must hold for how = '{self.how}': choose from {typed(least / rate_hz)} "
+                f"{least} to {MAX_LAG} ticks must hold for how = '{self.how}': choose from {typed(least / rate_hz)} "
                 "to "
-                f"{typed(MOST_LAG / rate_hz)} s"
+                f"{typed(MAX_LAG / rate_hz)} s"
             )
         return round(exact)
 
@@ -140,7 +140,7 @@ class FeatureSet:
     def __post_init__(self) -> None:
         check_bounds(f"feature set '{self.name}'", self, starting_ticks=integer(1, MOST_TICKS))
         for part in ("channels", "derived", "hidden", "starting"):
-            check_count(f"feature set '{self.name}'", part, getattr(self, part), MOST_NAMES)
+            check_count(f"feature set '{self.name}'", part, getattr(self, part), MAX_NAMES)
         names = [*self.channels, *self.starting, *self.hidden, *(d.name for d in self.derived)]
         twice = sorted(name for name, count in Counter(names).items() if count > 1)
         if twice:

@@ -14,7 +14,7 @@ from edp.data.lags import DoubleArray
 PENALTIES = tuple(10.0 ** (half / 2) for half in range(-14, 5))
 """Penalties per row on columns of unit spread, half a decade apart: from almost none to strong."""
 
-LEAST_GAIN = 1e-4
+MIN_GAIN = 1e-4
 """A further set of columns or a weaker penalty must lower the squared error by this share; rounding does less."""
 
 
@@ -61,7 +61,7 @@ def fold_ridge(
             solved = [spectrum.solve(penalty) for spectrum in spectra]
             losses = [share * one.squared_error(*maps) for share, one, maps in zip(shares, others, solved, strict=True)]
             loss = np.sum(losses, axis=0)
-            better = loss < best * (1.0 - LEAST_GAIN)
+            better = loss < best * (1.0 - MIN_GAIN)
             if better.any():
                 best[better] = loss[better]
                 # Columns of the set chosen before must not stay beside those of the new one.

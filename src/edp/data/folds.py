@@ -12,7 +12,7 @@ from edp.errors import DataError
 
 FEWEST_ROWS = 20
 """Rows that a fold must have; fewer say nothing about an error."""
-FEWEST_RECORDINGS, LEAST_TRAINING = 3, 0.3
+FEWEST_RECORDINGS, MIN_TRAINING = 3, 0.3
 """Recordings from which on folds can leave out whole ones, and the share of the rows that each fold keeps for training
 then: of two recordings, or where one has nearly all rows, a fold would learn next to nothing of the machine."""
 
@@ -99,7 +99,7 @@ def recording_folds(lengths: Sequence[int], recordings: Sequence[str], folds: in
         folds: number of folds at most.
 
     Returns:
-        None where there are fewer than `FEWEST_RECORDINGS`, or one fold would train on less than `LEAST_TRAINING`.
+        None where there are fewer than `FEWEST_RECORDINGS`, or one fold would train on less than `MIN_TRAINING`.
     """
     names = list(dict.fromkeys(recordings))
     if len(names) < FEWEST_RECORDINGS:
@@ -112,7 +112,7 @@ def recording_folds(lengths: Sequence[int], recordings: Sequence[str], folds: in
     for name in sorted(names, key=lambda name: -rows[name]):
         fold_of[name] = filled.index(min(filled))
         filled[fold_of[name]] += rows[name]
-    if max(filled) > (1.0 - LEAST_TRAINING) * sum(filled) or min(filled) < FEWEST_ROWS:
+    if max(filled) > (1.0 - MIN_TRAINING) * sum(filled) or min(filled) < FEWEST_ROWS:
         return None
     owner = np.repeat([fold_of[name] for name in recordings], lengths)
     return Folds(owner, tuple(np.flatnonzero(owner != fold) for fold in range(count)))

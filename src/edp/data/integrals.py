@@ -12,7 +12,7 @@ from edp.wording import typed
 
 WINDOW_S = 1.0
 """Over which changes are compared: lags of sensors and noise of velocities are small in it, drift as well."""
-LEAST_TICKS = 5
+MIN_TICKS = 5
 TOLD = 0.9
 """Correlation from which the two say the same; below it noise, drift or another actuator may be the reason."""
 LOW, HIGH = 0.8, 1.25
@@ -47,7 +47,7 @@ def integral_fit(pairs: Sequence[tuple[Rows, Rows]], rate_hz: float) -> Integral
         pairs: velocity and stroke of each stretch ``(tick,)``, in units that belong together.
         rate_hz: sample rate.
     """
-    ticks = max(LEAST_TICKS, round(WINDOW_S * rate_hz))
+    ticks = max(MIN_TICKS, round(WINDOW_S * rate_hz))
     of_stroke, of_velocity, both = 0.0, 0.0, 0.0
     for velocity, stroke in pairs:
         speed = velocity.astype(np.float64)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-MOST_LISTED = 1 << 24
+MAX_LISTED = 1 << 24
 """Things whose order is a list of 8 bytes each, 128 MB; 46 hours of windows at 100 Hz."""
 ROUNDS = 6
 """Number of rounds of the network. Four make it indistinguishable from random for ideal functions (Luby and Rackoff,
@@ -16,7 +16,7 @@ Numbers = NDArray[np.int64]
 class RandomOrder:
     """A permutation of ``range(count)`` that is computed where it is read.
 
-    Up to `MOST_LISTED` it is NumPy's. Beyond, a Feistel network with random keys permutes the next power of four, and
+    Up to `MAX_LISTED` it is NumPy's. Beyond, a Feistel network with random keys permutes the next power of four, and
     numbers outside of the range are permuted again until they fall into it (cycle walking, Black and Rogaway 2002).
 
     Args:
@@ -26,7 +26,7 @@ class RandomOrder:
 
     def __init__(self, rng: np.random.Generator, count: int) -> None:
         self.count = count
-        self._listed: Numbers | None = rng.permutation(count) if count <= MOST_LISTED else None
+        self._listed: Numbers | None = rng.permutation(count) if count <= MAX_LISTED else None
         self._bits = max(1, ((count - 1).bit_length() + 1) // 2)
         self._keys = rng.integers(1, 1 << 62, size=(ROUNDS, 2), dtype=np.uint64) if self._listed is None else None
 

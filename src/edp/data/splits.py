@@ -15,14 +15,14 @@ import numpy as np
 from edp.errors import ConfigError, DataError, closest
 from edp.recording import MACHINE, Recording
 from edp.registry import Registry
-from edp.settings.bounds import MOST_NAMES, SEED, above, below, check_bounds, integer, shown, span
+from edp.settings.bounds import MAX_NAMES, SEED, above, below, check_bounds, integer, shown, span
 from edp.wording import setting_text, typed
 
 PARTS = ("train", "validation", "test")
 PART = below(0.0, 1.0)
 """Fraction of a data set for test or validation. The whole data set would leave no training data."""
-MOST_BLOCK_S = 31_557_600.0  # a year
-MOST_MASS_T = 10_000.0  # the largest excavator weighs about a tenth of this
+MAX_BLOCK_S = 31_557_600.0  # a year
+MAX_MASS_T = 10_000.0  # the largest excavator weighs about a tenth of this
 FAMILY = "excitation"
 """Key of the driving task in the metadata of a simulated recording."""
 MASS = "mass_t"
@@ -205,8 +205,8 @@ class ByBlocks:
         check_bounds(
             "split",
             self,
-            block_s=above(0.0, MOST_BLOCK_S),
-            every=integer(2, MOST_NAMES),
+            block_s=above(0.0, MAX_BLOCK_S),
+            every=integer(2, MAX_NAMES),
             validation_share=PART,
         )
 
@@ -276,7 +276,7 @@ class ByMachine:
             validation_share=PART,
             test_share=PART,
             seed=SEED,
-            test_masses=span(0.0, MOST_MASS_T),
+            test_masses=span(0.0, MAX_MASS_T),
         )
         if self.test_masses and (len(self.test_masses) != 2 or self.test_masses[0] > self.test_masses[1]):
             raise ConfigError(

@@ -14,7 +14,7 @@ from edp.data.gathered import read_stored_columns
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError, closest
 from edp.recording import MACHINE, FloatArray, Recording
-from edp.settings.bounds import MOST_HORIZONS, MOST_NAMES, MOST_TICKS, above, check_bounds, check_count, integer
+from edp.settings.bounds import MAX_HORIZONS, MAX_NAMES, MOST_TICKS, above, check_bounds, check_count, integer
 from edp.signals import Kind
 from edp.wording import typed
 
@@ -28,7 +28,7 @@ class TargetMode(StrEnum):
 
 CHECKED_ROWS = 65_536
 """Number of rows per block of checked values, so that recordings on disk need little memory."""
-MOST_RATE_HZ = 1e6
+MAX_RATE_HZ = 1e6
 """Maximum sample rate of a sensor. Faster clocks count something else."""
 
 
@@ -53,15 +53,15 @@ def check_ends(task: Ends) -> None:
     """
     if not task.targets:
         raise ConfigError("task: no targets; name at least one channel to predict")
-    check_count("task", "horizons", task.horizons, MOST_HORIZONS, least=1)
+    check_count("task", "horizons", task.horizons, MAX_HORIZONS, least=1)
     check_bounds("task", task, horizons=integer(0, MOST_TICKS))
     for part in ("targets", "integrate"):
         names = getattr(task, part)
-        check_count("task", part, names, MOST_NAMES)
+        check_count("task", part, names, MAX_NAMES)
         twice = sorted(name for name, count in Counter(names).items() if count > 1)
         if twice:
             raise ConfigError(f"task: {part} names {', '.join(twice)} twice; keep one entry each")
-    check_count("task", "derived_targets", task.derived_targets, MOST_NAMES)
+    check_count("task", "derived_targets", task.derived_targets, MAX_NAMES)
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Task:
 
     def __post_init__(self) -> None:
         check_ends(self)
-        check_bounds("task", self, rate_hz=above(0.0, MOST_RATE_HZ))
+        check_bounds("task", self, rate_hz=above(0.0, MAX_RATE_HZ))
         if list(self.horizons) != sorted(set(self.horizons)):
             raise ConfigError(
                 f"task: horizons = {list(self.horizons)}; samples >= 0, increasing, each once, at least one"

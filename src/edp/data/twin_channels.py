@@ -15,7 +15,7 @@ from edp.data.roles import roles_of
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError, DataError
 from edp.recording import Recording
-from edp.settings.bounds import MOST_NAMES, check_count
+from edp.settings.bounds import MAX_NAMES, check_count
 from edp.signals import Channel, Kind
 
 INTEGRAL = {Kind.VELOCITY: Kind.POSITION, Kind.ANGULAR_VELOCITY: Kind.ANGLE}
@@ -43,7 +43,7 @@ class TwinChannelSettings:
 
     def __post_init__(self) -> None:
         for entry in fields(self):
-            check_count("channels", entry.name, getattr(self, entry.name), MOST_NAMES)
+            check_count("channels", entry.name, getattr(self, entry.name), MAX_NAMES)
         counts = Counter(name for entry in fields(self) for name in getattr(self, entry.name))
         twice = sorted(name for name, count in counts.items() if count > 1)
         if twice:

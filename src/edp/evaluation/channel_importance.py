@@ -26,7 +26,7 @@ from edp.evaluation.conditional import OthersModel
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
 from edp.progress import SILENT, Progress
-from edp.settings.bounds import MOST_NAMES, MOST_ROWS, MOST_TICKS, SEED, check_bounds, integer
+from edp.settings.bounds import MAX_NAMES, MAX_ROWS, MOST_TICKS, SEED, check_bounds, integer
 from edp.signals import KINDS
 
 Array = NDArray[np.float64]
@@ -61,10 +61,10 @@ class ChannelImportanceSpec:
         check_bounds(
             "channel importance",
             self,
-            repeats=integer(1, MOST_NAMES),
+            repeats=integer(1, MAX_NAMES),
             lags=integer(0, MOST_TICKS),
-            rows=integer(100, MOST_ROWS),
-            skip=integer(0, MOST_ROWS),
+            rows=integer(100, MAX_ROWS),
+            skip=integer(0, MAX_ROWS),
             seed=SEED,
         )
         if 0 not in self.lags or min(self.lags) < 0:

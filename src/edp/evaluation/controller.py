@@ -21,7 +21,7 @@ STACK_BYTES = 1_024  # an allowance: a tick was seen to take 340 (``benchmarks/c
 BOARD_TYPICAL, BOARD_SLOW = 1.26, 1.43
 
 
-MOST_GRANTED = 2**53
+MAX_GRANTED = 2**53
 """Cycles or bytes: beyond it not every integer is a float, in which estimates are computed."""
 
 
@@ -122,7 +122,7 @@ class Budget:
         if self.core not in CORES:
             raise ConfigError(f"budget: core = '{self.core}' is not known{closest(self.core, CORES)}")
         limits = ("cycles", "parameter_bytes", "ram_bytes", "flash_bytes")
-        check_bounds("budget", self, **dict.fromkeys(limits, integer(1, MOST_GRANTED)))
+        check_bounds("budget", self, **dict.fromkeys(limits, integer(1, MAX_GRANTED)))
 
 
 @dataclass(frozen=True)

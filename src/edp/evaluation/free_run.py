@@ -30,11 +30,11 @@ from edp.evaluation.free_run_parts import (
 )
 from edp.networks.twin import FreeRunIntervals, Twin, TwinScales, calibrate, even_starts, starts_within
 from edp.networks.twin.windows import MeasuredWindows
-from edp.settings.bounds import MOST_BATCH, MOST_NAMES, MOST_TICKS, above, between, check_bounds, check_count, integer
+from edp.settings.bounds import MAX_BATCH, MAX_NAMES, MOST_TICKS, above, between, check_bounds, check_count, integer
 from edp.wording import figure
 
 Array = NDArray[np.float32]
-MOST_SECONDS = 86_400.0
+MAX_SECONDS = 86_400.0
 """Maximum length of a free-run simulation: one day."""
 ASTRAY = 0.5
 """Fraction of the stroke range; a run with a larger stroke error counts as diverged."""
@@ -75,13 +75,13 @@ class FreeRunJudgeSpec:
     ahead_ticks: int = 10
 
     def __post_init__(self) -> None:
-        length = above(0.0, MOST_SECONDS)
-        count = integer(1, MOST_BATCH)
+        length = above(0.0, MAX_SECONDS)
+        count = integer(1, MAX_BATCH)
         check_bounds("judge", self, seconds=length, at_s=length, starts=count, calibration_starts=count)
         check_bounds("judge", self, covered_at_s=length, coverage=between(0.0, 1.0), ahead_ticks=integer(1, MOST_TICKS))
-        check_count("judge", "at_s", self.at_s, MOST_NAMES, least=1)
-        check_count("judge", "covered_at_s", self.covered_at_s, MOST_NAMES, least=1)
-        check_count("judge", "floors", self.floors, MOST_NAMES)
+        check_count("judge", "at_s", self.at_s, MAX_NAMES, least=1)
+        check_count("judge", "covered_at_s", self.covered_at_s, MAX_NAMES, least=1)
+        check_count("judge", "floors", self.floors, MAX_NAMES)
 
 
 @dataclass(frozen=True, eq=False)

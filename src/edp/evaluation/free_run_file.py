@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from edp.errors import ConfigError
-from edp.settings.bounds import MOST_ROWS, above, check_bounds, integer
+from edp.settings.bounds import MAX_ROWS, above, check_bounds, integer
 from edp.settings.results import ResultFile, read_part
 
 TWIN = "twin"
@@ -16,7 +16,7 @@ PARTS = ("velocities", "strokes", "pressures")
 RUNS = "free_runs.safetensors"
 MAX_TEXT = 2_000
 """Characters of a label or reason of a candidate."""
-POSITIVE, COUNT = above(0.0, 1e12), integer(0, MOST_ROWS)
+POSITIVE, COUNT = above(0.0, 1e12), integer(0, MAX_ROWS)
 ByChannel = Mapping[str, float | None]
 
 

@@ -33,7 +33,7 @@ from edp.networks.running import stream_groups, streamed
 from edp.progress import SILENT, Progress
 from edp.settings.bounds import MOST_TICKS, SEED, check_bounds, integer
 from edp.stats.metrics import weighted_interval_score
-from edp.stats.sketch import MOST_EXACT
+from edp.stats.sketch import MAX_EXACT
 from edp.storage.memory import check_setting
 
 Predictions = list[NDArray[np.float32]]
@@ -41,9 +41,9 @@ B = TypeVar("B", bound=Baseline)
 KEPT_RECORDINGS, KEPT_TICKS = 6, 60_000
 """Maximum number of recordings and samples whose predictions are stored for pictures: ten minutes at 100 Hz."""
 SHOWN_MODELS = ("network", "ridge_arx")
-MOST_VALIDATED = 1 << 20
+MAX_VALIDATED = 1 << 20
 """Ticks of the validation part that baselines are judged on, about; three hours at 100 Hz."""
-PART_TICKS, MOST_PARTS = 1 << 17, 64
+PART_TICKS, MAX_PARTS = 1 << 17, 64
 """Ticks of a part of the test recordings that a worker judges the network on, 22 min at 100 Hz, which take far longer
 than to hand them out; and how many parts there are at most, as each brings back megabytes of what it measured."""
 SKIP = integer(0, MOST_TICKS)
@@ -186,7 +186,7 @@ class JudgedPart:
 def network_parts(data: Prepared) -> int:
     """Parts that a network is run along the test part in: by its size alone, whoever runs them."""
     ticks = sum(part.samples for part in data.test)
-    return max(1, min(MOST_PARTS, ticks // PART_TICKS, len(stream_groups(data.test))))
+    return max(1, min(MAX_PARTS, ticks // PART_TICKS, len(stream_groups(data.test))))
 
 
 def _groups_of_part(data: Prepared, number: int) -> list[list[int]]:
@@ -313,7 +313,7 @@ def _score_on_validation(baseline: Baseline, data: Prepared, skip: int) -> ByHor
     if max((part.samples for part in data.validation), default=0) - data.task.max_horizon <= skip:
         return {}
     # As epochs are judged: of a large validation part evenly spread stretches.
-    parts = spread_series(data.validation, 100 * (skip + data.task.max_horizon), MOST_VALIDATED)
+    parts = spread_series(data.validation, 100 * (skip + data.task.max_horizon), MAX_VALIDATED)
     ruler = Ruler(replace(data, test=parts), skip)
     return ruler.measure(_predict_parts(baseline, data, parts)).overall
 
@@ -322,7 +322,7 @@ def _check_memory(predictor: Predictor, data: Prepared, spec: JudgeSpec) -> None
     """Refuse more horizons than the memory holds the truth and predictions of, for the recordings of a step."""
     task = data.task
     ends = len(task.horizons) * len(task.targets)
-    ticks = max(series.samples for series in data.test) + min(MOST_EXACT, sum(series.samples for series in data.test))
+    ticks = max(series.samples for series in data.test) + min(MAX_EXACT, sum(series.samples for series in data.test))
     each = 4 * (2 + 2 * len(predictor.spec.output.coverages)) + 3 * 8  # predictions, intervals; truth, errors: doubles
     check_setting(
         ticks * ends * each,

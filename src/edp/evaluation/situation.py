@@ -13,12 +13,12 @@ from edp.evaluation.scores_file import DataSituation, OutsideRange, TargetChange
 
 MARGIN = 0.01
 """Fraction of the training range by which a value must leave it, because sensors are noisy."""
-LEAST_SHARE = 0.05
+MIN_SHARE = 0.05
 """Minimum fraction of samples outside the training range for a warning. Two of seven measured data sets have 1 and 3 %
 of such samples, and their expected errors were as accurate as the others."""
-LEAST_BEYOND = 0.005
+MIN_BEYOND = 0.005
 """Minimum fraction of changes larger than any training change for a warning: a few decide a root-mean-square error."""
-LEAST_RATIO = 2.0
+MIN_RATIO = 2.0
 """Times that targets change more, or less, than in training before it is said."""
 
 
@@ -35,7 +35,7 @@ def situation_of(data: Prepared) -> DataSituation:
         for target, before, now, share in zip(data.task.targets, usual, size, beyond, strict=True):
             # Of a target that never moved in training, or rests now, the ratio would say nothing.
             ratio = float(now / before) if before > 0 and now > 0 else 1.0
-            if share >= LEAST_BEYOND or not 1 / LEAST_RATIO <= ratio <= LEAST_RATIO:
+            if share >= MIN_BEYOND or not 1 / MIN_RATIO <= ratio <= MIN_RATIO:
                 changes.append(TargetChange(target=target, horizon=int(horizon), ratio=ratio, beyond=float(share)))
     return DataSituation(outside=outside, changes=tuple(changes))
 
@@ -60,7 +60,7 @@ def _outside(
         ticks += len(part)
     shares = count / max(ticks, 1)
     order = sorted(range(len(names)), key=lambda i: -shares[i])
-    return tuple(OutsideRange(channel=names[i], share=float(shares[i])) for i in order if shares[i] >= LEAST_SHARE)
+    return tuple(OutsideRange(channel=names[i], share=float(shares[i])) for i in order if shares[i] >= MIN_SHARE)
 
 
 def _changes(

@@ -15,9 +15,9 @@ from edp.signals import KINDS, Channel
 
 LENGTH_S = 2.0
 """Length of a response, within which a hydraulic axis settles."""
-MOMENTS, MOST_STARTS = 24, 8
+MOMENTS, MAX_STARTS = 24, 8
 """Steps of which the middle is shown, and of one recording."""
-POINTS, MOST_COMMANDS = 100, 12
+POINTS, MAX_COMMANDS = 100, 12
 SPAN = (0.05, 0.95)
 """Quantiles of a command between which its range is; half of it is a step."""
 
@@ -39,7 +39,7 @@ def step_responses(twin: Twin, series: Sequence[Series]) -> StepResponses:
         DataError: no stretch is long enough.
     """
     channels, prefix = twin.channels, twin.prefix_ticks
-    starts = even_starts(twin, series, prefix + 1, MOST_STARTS)
+    starts = even_starts(twin, series, prefix + 1, MAX_STARTS)
     chosen = np.unique(np.linspace(0, len(starts) - 1, MOMENTS).astype(np.int64))
     lanes = [starts[i] for i in chosen]
     before = np.stack([part.inputs[at : at + prefix] for part, at in lanes])
@@ -51,7 +51,7 @@ def step_responses(twin: Twin, series: Sequence[Series]) -> StepResponses:
     steps = []
     with threadpool_limits(limits=1, user_api="blas"):
         base = twin.rollout(constant, twin.reset(before, measured))[0]
-        for column, command in enumerate(channels.commands[:MOST_COMMANDS]):
+        for column, command in enumerate(channels.commands[:MAX_COMMANDS]):
             size = 0.5 * float(high[column] - low[column])
             if not size > 0.0:
                 continue

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edp.data.moments import Moments, MomentsState
 from edp.evaluation.scores_file import MEAN, ByTarget
 from edp.stats.metrics import Scores, composite, mean_scores, score
-from edp.stats.sketch import MOST_EXACT, QuantileSketch
+from edp.stats.sketch import MAX_EXACT, QuantileSketch
 
 Values = NDArray[np.float64]
 
@@ -38,7 +38,7 @@ class TallyState:
 class Tally:
     """Errors of all targets at one horizon.
 
-    Up to `MOST_EXACT` ticks are kept and scored as they are; beyond, sums go on in double precision, and percentiles
+    Up to `MAX_EXACT` ticks are kept and scored as they are; beyond, sums go on in double precision, and percentiles
     come from bins of a thousandth.
 
     Args:
@@ -55,7 +55,7 @@ class Tally:
         """Take in ticks, each ``(tick, target)`` in report units."""
         self.count += len(truth)
         self._kept.append((predicted, truth))
-        if self.count > MOST_EXACT or self._sums is not None:
+        if self.count > MAX_EXACT or self._sums is not None:
             self._sum_all()
 
     def state(self) -> TallyState:

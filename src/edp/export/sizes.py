@@ -10,7 +10,7 @@ from edp.training.bundle import Bundle
 
 LARGEST = 2**31 - 1
 """Bytes, numbers and ticks: C counts in ``uint32_t``, MATLAB, Simulink and FMI in ``int32_t``."""
-MOST_COLUMNS = 2**16
+MAX_COLUMNS = 2**16
 """Numbers of a value from which a table of columns chooses: entries are ``uint16_t``."""
 
 

@@ -29,7 +29,7 @@ def constant(values: Any) -> Array:
     return array
 
 
-MOST_INDEX = 2**16 - 1
+MAX_INDEX = 2**16 - 1
 """Largest index of a table: tables of 16 bits take half of the flash of tables of words."""
 
 
@@ -37,12 +37,12 @@ def indices(values: Any) -> Indices:
     """Return integers, an array or a tensor as a new uint16 array.
 
     Raises:
-        ExportError: one of them is not from 0 to `MOST_INDEX`.
+        ExportError: one of them is not from 0 to `MAX_INDEX`.
     """
     array = np.asarray(values.detach().cpu().numpy() if hasattr(values, "detach") else values)
-    if array.size and not 0 <= array.min() <= array.max() <= MOST_INDEX:
+    if array.size and not 0 <= array.min() <= array.max() <= MAX_INDEX:
         raise ExportError(
-            f"an index of the network is {array.max() if array.min() >= 0 else array.min()}; 0 to {MOST_INDEX} must "
+            f"an index of the network is {array.max() if array.min() >= 0 else array.min()}; 0 to {MAX_INDEX} must "
             "hold: let it read fewer columns"
         )
     return np.array(array, dtype=np.uint16, order="C")

@@ -26,7 +26,7 @@ from edp.errors import DataError
 T = TypeVar("T")
 _NESTED = (list, dict)
 TREE, KIND, VALUE = "tree", "of", "is"
-MOST_DEPTH = 40
+MAX_DEPTH = 40
 
 
 def pack(value: Any) -> bytes:
@@ -92,8 +92,8 @@ def unpack(data: bytes, kind: type[T], also: Iterable[type] = ()) -> T:
 
 
 def _together(tree: Any, tensors: dict[str, NDArray[Any]], classes: Mapping[str, type], depth: int) -> Any:
-    if depth > MOST_DEPTH:
-        raise ValueError(f"nested deeper than {MOST_DEPTH} levels")
+    if depth > MAX_DEPTH:
+        raise ValueError(f"nested deeper than {MAX_DEPTH} levels")
     if not isinstance(tree, _NESTED):
         return tree
     if isinstance(tree, list):

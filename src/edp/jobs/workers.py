@@ -24,7 +24,7 @@ from edp.jobs.cluster import RayPool
 from edp.jobs.perform import call
 from edp.jobs.processes import LocalPool
 from edp.progress import SILENT, Progress
-from edp.settings.bounds import MOST_THREADS, check_bounds, integer
+from edp.settings.bounds import MAX_THREADS, check_bounds, integer
 from edp.storage.ledger import (
     Ledger,
     Record,
@@ -127,7 +127,7 @@ class Workers:
     executor: Executor | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        check_bounds("workers", self, count=integer(0, MOST_THREADS), threads=integer(1, MOST_THREADS))
+        check_bounds("workers", self, count=integer(0, MAX_THREADS), threads=integer(1, MAX_THREADS))
         if self.cluster and self.count > 1:
             raise ConfigError(
                 f"workers: got {self.count} and the cluster '{self.cluster}', expected one of the two; leave the "

@@ -16,9 +16,9 @@ from edp.errors import DataError
 ROWS, PAST = 1, 2
 HEAD = struct.Struct("<4I d")
 """Kind, first tick, number of rows, number of columns; time of the newest tick (s since 1970)."""
-MOST_REQUEST = 256
+MAX_REQUEST = 256
 """Bytes of a request."""
-MOST_PAST = 12_000
+MAX_PAST = 12_000
 """Rows of one answer: two minutes at 100 Hz."""
 REQUESTS = {"past": ("first", "count"), "pause": ("value",), "speed": ("value",), "ahead": ("tick",)}
 """Requests of a page with the names of their numbers. None of them reaches a machine, a disk or a setting."""
@@ -49,8 +49,8 @@ def request_of(message: Any) -> Request:
     Raises:
         DataError: anything else.
     """
-    if not isinstance(message, str) or len(message) > MOST_REQUEST:
-        raise DataError(f"a request is a text of at most {MOST_REQUEST} characters")
+    if not isinstance(message, str) or len(message) > MAX_REQUEST:
+        raise DataError(f"a request is a text of at most {MAX_REQUEST} characters")
     try:
         entry = json.loads(message)
         name, names = entry["do"], REQUESTS[entry["do"]]

@@ -22,7 +22,7 @@ from websockets.http11 import Response
 from edp.errors import ConfigError, DataError
 from edp.live.addresses import LOOPBACK, resolve_bind
 from edp.live.pace import Pace
-from edp.live.protocol import MOST_PAST, MOST_REQUEST, PAST, ROWS, Request, request_of, rows_message, text_message
+from edp.live.protocol import MAX_PAST, MAX_REQUEST, PAST, ROWS, Request, request_of, rows_message, text_message
 from edp.live.saved import live_page, session_page
 from edp.live.session import LiveSession
 from edp.live.viewer import SEND_BUFFER, Viewer
@@ -30,13 +30,13 @@ from edp.live.viewer import SEND_BUFFER, Viewer
 FLUSH_S = 0.04
 """Time between messages of rows: 25 pictures per second, and at most this delay."""
 STATE_S = 1.0
-MOST_ROWS = 3000
+MAX_ROWS = 3000
 """Maximum number of rows per message. A faster source omits rows; the page counts and shows them."""
 BACKLOG_S = 30.0
 """Length of the rows that a new viewer receives at once."""
-MOST_AHEAD_S = 600.0
-MOST_VIEWERS = 32
-MOST_BREAKS = 50
+MAX_AHEAD_S = 600.0
+MAX_VIEWERS = 32
+MAX_BREAKS = 50
 """New beginnings that a page is told of."""
 TOKEN_BYTES = 24
 HEADERS = {
@@ -102,7 +102,7 @@ class LiveServer:
                 self.port,
                 process_request=self._answer,
                 compression=None,
-                max_size=MOST_REQUEST,
+                max_size=MAX_REQUEST,
                 max_queue=8,
                 write_limit=SEND_BUFFER,
                 open_timeout=5.0,
@@ -151,8 +151,8 @@ class LiveServer:
         waiting = session.ticks - self._sent
         if waiting <= 0:
             return
-        self.skipped += max(0, waiting - MOST_ROWS)
-        first, rows = session.read(session.ticks - min(waiting, MOST_ROWS), MOST_ROWS)
+        self.skipped += max(0, waiting - MAX_ROWS)
+        first, rows = session.read(session.ticks - min(waiting, MAX_ROWS), MAX_ROWS)
         self._sent = first + len(rows)
         if self.viewers:
             message = rows_message(ROWS, first, rows, session.stamp)
@@ -177,7 +177,7 @@ class LiveServer:
             preparing=session.preparing if session.ticks == 0 else "",
             skipped=self.skipped,
             viewers=len(self.viewers),
-            breaks=session.breaks[-MOST_BREAKS:],
+            breaks=session.breaks[-MAX_BREAKS:],
         )
 
     async def _answer(self, connection: ServerConnection, request: HttpRequest) -> Response | None:
@@ -196,8 +196,8 @@ class LiveServer:
             # A page of another server may open sockets to this one; its origin gives it away.
             if request.headers.get("Origin") != f"http://{host}":
                 return _text(HTTPStatus.FORBIDDEN, "the live view takes viewers from its own page only")
-            if len(self.viewers) >= MOST_VIEWERS:
-                return _text(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_VIEWERS} viewers are connected; close one")
+            if len(self.viewers) >= MAX_VIEWERS:
+                return _text(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_VIEWERS} viewers are connected; close one")
             return None
         if what == "":
             page, policy = live_page(self.session.layout.title, host)
@@ -228,7 +228,7 @@ class LiveServer:
         """One viewer, from its first message to its end."""
         viewer = Viewer(connection)
         session = self.session
-        backlog = min(round(BACKLOG_S * session.layout.rate_hz), MOST_PAST)
+        backlog = min(round(BACKLOG_S * session.layout.rate_hz), MAX_PAST)
         self.viewers.add(viewer)
         viewer.tell(text_message("layout", layout=session.layout.to_plain(), steered=self.pace is not None))
         for event in session.events():
@@ -262,7 +262,7 @@ class LiveServer:
     def _do(self, viewer: Viewer, request: Request) -> None:
         if request.name == "past":
             first, count = (int(number) for number in request.numbers)
-            start, rows = self.session.read(max(first, 0), min(max(count, 0), MOST_PAST))
+            start, rows = self.session.read(max(first, 0), min(max(count, 0), MAX_PAST))
             viewer.offer(rows_message(PAST, start, rows, self.session.stamp), 0)
         elif self.pace is None:
             raise DataError("this source runs by itself: nobody can pause it or change its speed")
@@ -272,7 +272,7 @@ class LiveServer:
             self.pace.set_speed(request.numbers[0])
         else:
             # Of a source without an end a viewer may skip some minutes, not send it off for good.
-            most = self.session.layout.ticks or self.session.ticks + round(MOST_AHEAD_S * self.session.layout.rate_hz)
+            most = self.session.layout.ticks or self.session.ticks + round(MAX_AHEAD_S * self.session.layout.rate_hz)
             self.pace.run_ahead(min(int(request.numbers[0]), most))
 
 

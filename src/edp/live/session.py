@@ -16,7 +16,7 @@ from edp.live.layout import LiveLayout
 Rows = NDArray[np.float32]
 HISTORY_BYTES = 64 << 20
 """Maximum size of the stored rows: 46 minutes of 60 columns at 100 Hz."""
-MOST_EVENTS, MOST_TEXT = 500, 400
+MAX_EVENTS, MOST_TEXT = 500, 400
 """Events that are kept, and characters of one."""
 KINDS = ("note", "warning", "alarm")
 
@@ -66,8 +66,8 @@ class LiveSession:
         capacity = max(1, history_bytes // (4 * layout.width))
         # A source whose end is known needs no more; pages of memory are taken as they are written.
         self._rows = np.zeros((min(capacity, layout.ticks or capacity), layout.width), np.float32)
-        self._events: deque[LiveEvent] = deque(maxlen=MOST_EVENTS)
-        self._breaks: deque[int] = deque(maxlen=MOST_EVENTS)
+        self._events: deque[LiveEvent] = deque(maxlen=MAX_EVENTS)
+        self._breaks: deque[int] = deque(maxlen=MAX_EVENTS)
         self._counted, self._lock = 0, threading.Lock()
 
     @property

@@ -13,9 +13,9 @@ from edp.live.protocol import text_message
 
 SEND_BUFFER = 1 << 16
 """Bytes on the way to a viewer; the system's megabytes would show a slow one what was seconds ago."""
-MOST_WAITING = 50
+MAX_WAITING = 50
 """Messages of rows: two seconds."""
-MOST_TEXTS = 1000
+MAX_TEXTS = 1000
 """Other messages; a viewer that takes none of so many is gone."""
 REQUESTS_PER_S = 30.0
 
@@ -41,14 +41,14 @@ class Viewer:
 
     def offer(self, message: bytes, ticks: int) -> None:
         """Rows; the oldest that wait are dropped where there are too many."""
-        if len(self._rows) >= MOST_WAITING:
+        if len(self._rows) >= MAX_WAITING:
             self.dropped += self._rows.popleft()[1]
         self._rows.append((message, ticks))
         self._ready.set()
 
     def tell(self, text: str) -> None:
         """Anything else."""
-        if len(self._texts) < MOST_TEXTS:
+        if len(self._texts) < MAX_TEXTS:
             self._texts.append(text)
             self._ready.set()
 

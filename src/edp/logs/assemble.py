@@ -22,7 +22,7 @@ from edp.wording import typed
 
 _CACHED_ROWS = 4096
 """Rows written at a time: blocks of 1,000 to 4,000 are fastest, 500 or 8,000 take 1.5 to 2 times as long (findings)."""
-_MOST_EMPTY = 0.5
+_MAX_EMPTY = 0.5
 """Maximum fraction of a log that is omitted because a channel has no value yet."""
 _TICK_BYTES = 25
 """Memory per sample for the time rule: time, row and gap flag."""
@@ -237,7 +237,7 @@ def _drop_empty_start(assembly: Assembly) -> Assembly:
     """Remove the samples before every channel has its first value, since earlier values cannot be held.
 
     Raises:
-        DataError: more than `_MOST_EMPTY` of the log would be left out.
+        DataError: more than `_MAX_EMPTY` of the log would be left out.
     """
     late = np.full(len(assembly.sources), -1)
     # The first row by itself: most logs have all their values there.
@@ -253,7 +253,7 @@ def _drop_empty_start(assembly: Assembly) -> Assembly:
     if not first and (late >= 0).all():
         return assembly
     name = assembly.sources[slowest].channel.name
-    if late[slowest] < 0 or first > _MOST_EMPTY * assembly.samples:
+    if late[slowest] < 0 or first > _MAX_EMPTY * assembly.samples:
         reason = "holds no number" if late[slowest] < 0 else f"has its first number in row {first}"
         raise DataError(
             f"'{assembly.raw.path}': channel '{name}' {reason} of {assembly.samples:,}; leave it out of the signal "

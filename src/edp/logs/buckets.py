@@ -30,7 +30,7 @@ CONNECT_S, ANSWER_S, STEP_S = 10.0, 30.0, 120.0
 retries."""
 ATTEMPTS = 3
 PIECE_BYTES = 8 * 2**20
-MOST_OBJECTS = 1_000_000
+MAX_OBJECTS = 1_000_000
 HELP = {
     "s3": "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION, or a profile; AWS_ENDPOINT_URL for another server",
     "gs": "GOOGLE_APPLICATION_CREDENTIALS; STORAGE_EMULATOR_HOST for another server",
@@ -102,9 +102,9 @@ class BucketReader:
         files = [entry for entry in self._run_step(listed, address) if entry.type == FileType.File]
         if not files:
             raise DataError(f"'{address}' does not exist: the bucket has no object of this name and none below it")
-        if len(files) > MOST_OBJECTS:
+        if len(files) > MAX_OBJECTS:
             raise DataError(
-                f"'{address}' has {len(files):,} objects; at most {MOST_OBJECTS:,} are listed: give a part of it"
+                f"'{address}' has {len(files):,} objects; at most {MAX_OBJECTS:,} are listed: give a part of it"
             )
         objects = [
             RemoteFile(f"{self.scheme}://{entry.path}", int(entry.size), int(entry.mtime_ns or 0)) for entry in files

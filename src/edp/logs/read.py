@@ -23,7 +23,7 @@ from edp.wording import typed
 
 TEXT = (".txt", ".dat")
 """Endings that logs share with other files: taken where a folder holds no logs of other endings."""
-_MOST_FILES = 10_000
+_MAX_FILES = 10_000
 """Maximum number of files in a folder without logs whose endings are examined."""
 RATE_TOLERANCE = 1e-3
 """Relative tolerance between the rates of logs in one data set. Loggers state one rate with different digits."""
@@ -153,7 +153,7 @@ def find_recordings(path: str | Path) -> tuple[Path, ...]:
 
 def _instead(folder: Path) -> str:
     """Return advice on the most frequent unsupported files of a folder; otherwise empty."""
-    endings = Counter(entry.suffix.lower() for entry in islice(files_below(folder), _MOST_FILES))
+    endings = Counter(entry.suffix.lower() for entry in islice(files_below(folder), _MAX_FILES))
     advised = [(suffix, export_advice(suffix)) for suffix, _ in endings.most_common()]
     return next((f". {endings[suffix]} end in '{suffix}': {advice}" for suffix, advice in advised if advice), "")
 

@@ -43,7 +43,7 @@ _EVEN = 1e-4
 """Fraction of a step below which distances from a line count as rounding."""
 _REPEATED = 0.3
 """Fraction of rows with repeated stamps above which the clock is coarser than the rows."""
-_MOST_REPEATS = 1000
+_MAX_REPEATS = 1000
 """Rows that one stamp may stand for."""
 _MIN_ROLLOVERS = 5
 """Ticks by which a rounded rate must leave the grid behind before lost rows are ruled out."""
@@ -199,7 +199,7 @@ def _fit_repeated_line(stamps: Stamps, steps: Stamps) -> tuple[float, float] | N
     if float(steps.min()) < 0 or len(rising) > (1.0 - _REPEATED) * len(steps):
         return None
     # One long step is a gap; many of one length are the clock's own.
-    if float(np.mean(rising > 0.7 * largest)) < 0.2 or len(steps) > _MOST_REPEATS * len(rising):
+    if float(np.mean(rising > 0.7 * largest)) < 0.2 or len(steps) > _MAX_REPEATS * len(rising):
         return None
     rows = np.arange(len(stamps)) - 0.5 * (len(stamps) - 1)
     mean = float(stamps.mean())

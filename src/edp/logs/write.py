@@ -55,7 +55,7 @@ def write_with_events(recording: Recording, path: str | Path, events: Sequence[L
     Args:
         recording: recording to write.
         path: an existing file is replaced only by a complete new one.
-        events: events, at most `edp.logs.formats.mdf_events.MOST_EVENTS`.
+        events: events, at most `edp.logs.formats.mdf_events.MAX_EVENTS`.
 
     Raises:
         DataError: an ending other than MDF's, nothing to write, too many events, or the package asammdf is missing.

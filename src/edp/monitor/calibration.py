@@ -20,9 +20,9 @@ CONFIDENCE = 0.95
 LANES = 48
 """Limits that one pass over the sessions tries; three passes place a limit to 1 in 1e5 of the range."""
 PASSES = 3
-LEAST_PART = 1e-6
+MIN_PART = 1e-6
 """Minimum part of an alarm. Smaller parts are rounding of the division."""
-MOST_HOURS = above(0.0, 1e6)
+MAX_HOURS = above(0.0, 1e6)
 
 
 @dataclass(frozen=True)
@@ -87,8 +87,8 @@ def calibrated(spec: DetectorSpec, sessions: Sequence[Array], rows_per_s: float,
         DataError: there are no sessions, or they have other numbers of residuals.
     """
     for name, value in (("rows_per_s", rows_per_s), ("promised_hours", promised_hours)):
-        if not MOST_HOURS.holds(value):
-            raise ConfigError(f"calibration: {name} = {shown(value)}; {MOST_HOURS.rule(name)} must hold")
+        if not MAX_HOURS.holds(value):
+            raise ConfigError(f"calibration: {name} = {shown(value)}; {MAX_HOURS.rule(name)} must hold")
     widths = {np.asarray(session).shape[1:] for session in sessions}
     if len(widths) != 1 or len(next(iter(widths))) != 1:
         raise DataError(f"calibration: {len(sessions)} sessions of widths {sorted(widths)}; give all of one width")
@@ -106,7 +106,7 @@ def calibrated(spec: DetectorSpec, sessions: Sequence[Array], rows_per_s: float,
     whole = [session for session in sessions if len(session)]
     peaks = [_range(spec, session) for session in whole]
     limit = _lowest(spec, whole, peaks, allowed)
-    if part > LEAST_PART:
+    if part > MIN_PART:
         limit -= part * (limit - _lowest(spec, whole, peaks, allowed + 1))
     # A session whose largest statistic does not pass a limit has no alarm at it.
     loud = [session for session, (_, most) in zip(whole, peaks, strict=True) if most > limit]

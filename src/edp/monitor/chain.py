@@ -23,8 +23,8 @@ from edp.storage.arrays import ArrayRule, arrays_under, checked_arrays
 from edp.storage.reading import Table
 
 Array = NDArray[np.float64]
-MOST_SUMMARIES = 5_000
-MOST_WATCHES = 16
+MAX_SUMMARIES = 5_000
+MAX_WATCHES = 16
 MEAN, WIDTHS, MATRIX = (ArrayRule(shape) for shape in (("summaries",), ("summaries",), ("summaries", "columns")))
 """Arrays of a watch in a file: its mean, and a width of each summary or a matrix."""
 _TREE = SettingsTree({"detector": DETECTORS}, what="monitor")
@@ -198,8 +198,8 @@ class MonitorChain:
             ValueError: values that cannot be; files are data from outside.
         """
         summaries = BlockSummaries.of(plain["summaries"], arrays_under(arrays, "summaries."))
-        if summaries.width > MOST_SUMMARIES:
-            raise ValueError(f"it has {summaries.width} summaries; at most {MOST_SUMMARIES} must hold")
+        if summaries.width > MAX_SUMMARIES:
+            raise ValueError(f"it has {summaries.width} summaries; at most {MAX_SUMMARIES} must hold")
         clip = _number(plain["clip"], "clip")
         conditioning = Conditioning.of(arrays_under(arrays, "conditioning."), clip, summaries.width, summaries.points)
         watches = _watches(plain["watches"], arrays, summaries.width)
@@ -211,8 +211,8 @@ class MonitorChain:
 
 
 def _watches(entries: Sequence[Any], arrays: Mapping[str, NDArray[Any]], summaries: int) -> tuple[Watch, ...]:
-    if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_WATCHES:
-        raise ValueError(f"it has no list of 1 to {MOST_WATCHES} watches")
+    if not isinstance(entries, list) or not 1 <= len(entries) <= MAX_WATCHES:
+        raise ValueError(f"it has no list of 1 to {MAX_WATCHES} watches")
     watches = []
     for index, entry in enumerate(entries):
         spec = _TREE.build(_Form, {"detector": entry["detector"]}, "of its watches").detector

@@ -29,7 +29,7 @@ TRIMMED = 4.0
 """Residuals of the regression in robust deviations, beyond which a row does not count in the second round."""
 GROSS = 1e3
 """Largest size of a conditioned summary where gross deviations are to be told from large ones."""
-LEAST_WIDTH = 0.3
+MIN_WIDTH = 0.3
 """Minimum width relative to the usual width, for operating points at which the regression for the width falls below
 it."""
 
@@ -145,7 +145,7 @@ def fit_conditioning(summaries: Sequence[Array], points: Sequence[Array], clip: 
         off = np.abs(y - x @ line)
         size = max(float(off[near].std()), float(off[near].mean()), 1e-9)
         wide = _ridge(square, x.T @ np.where(near, off, 0.0), count_near)
-        floor[column] = LEAST_WIDTH * size
+        floor[column] = MIN_WIDTH * size
         # The mean absolute deviation of a normal variable is 0.798 of its standard deviation.
         usual[column], spread[column] = line, wide / 0.798
     # Single precision: a controller stores half as much, and the bits stay the same.

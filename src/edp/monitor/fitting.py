@@ -32,7 +32,7 @@ from edp.settings.bounds import above, below, check_bounds, check_count, integer
 from edp.signals import Channel
 
 Array = NDArray[np.float64]
-LEAST_SESSIONS = 4
+MIN_SESSIONS = 4
 """Minimum number of sessions for conditioning and limits."""
 NO_FOLD = -1
 """Index of a fold when no fold is left out."""
@@ -184,7 +184,7 @@ def count_watched_blocks(spec: ChainSpec, sessions: Sequence[Recording]) -> list
 
 
 def _check_sessions(spec: ChainSpec, count: int) -> None:
-    least = min(spec.folds, LEAST_SESSIONS)
+    least = min(spec.folds, MIN_SESSIONS)
     if count < least:
         raise DataError(
             f"{count} healthy sessions are left for conditioning and limits; {least} at least must hold: "

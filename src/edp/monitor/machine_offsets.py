@@ -21,12 +21,12 @@ from edp.wording import figure
 Array = NDArray[np.float64]
 FIRST_S = 120.0
 """Start of a log whose means are compared with those of healthy sessions, s."""
-LEAST_THERE = 0.5
+MIN_THERE = 0.5
 """Minimum fraction of the log in which a balance must be available."""
 OFF = 3.0
 """Healthy deviations of such a mean beyond which an axis is off. Of 65 healthy sessions the axis that is off least
 reaches 2.5, of sister machines within 1 % 2.9 to 15."""
-LEAST_AXES = 2
+MIN_AXES = 2
 """Minimum number of axes: one axis alone may have a fault."""
 
 
@@ -65,7 +65,7 @@ def other_machine(
     for columns in _axes(sources, chain).values():
         sizes = [float(np.nan_to_num(part[columns]).max()) for part in (start, whole)]
         least.append(min(sizes))
-    if len(least) < LEAST_AXES or min(least) <= OFF:
+    if len(least) < MIN_AXES or min(least) <= OFF:
         return ""
     return (
         f"balances of flow of all {len(least)} axes are off from its start on, by {figure(min(least), 2)} to "
@@ -98,4 +98,4 @@ def _means(rows: Array, first: int) -> Array:
     there = np.isfinite(rows)
     counts = there.sum(axis=0)
     means = np.where(there, rows, 0.0).sum(axis=0) / np.maximum(counts, 1)
-    return np.where(counts >= LEAST_THERE * first, means, np.nan)
+    return np.where(counts >= MIN_THERE * first, means, np.nan)

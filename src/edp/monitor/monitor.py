@@ -15,7 +15,7 @@ from edp.errors import DataError, closest
 from edp.monitor.alarms import MonitorAlarm
 from edp.monitor.calibration import AlarmLimit
 from edp.monitor.chain import BlockVerdict, ChainState, MonitorChain
-from edp.monitor.diagnosis.diagnose import AFTER_S, MOST_ROWS, diagnosed, onset_of
+from edp.monitor.diagnosis.diagnose import AFTER_S, MAX_ROWS, diagnosed, onset_of
 from edp.monitor.diagnosis.signatures import Dictionary
 from edp.monitor.machine_offsets import other_machine
 from edp.monitor.residuals.base import ResidualSource, Rows, SourceState, rows_of
@@ -28,7 +28,7 @@ from edp.wording import figure, number
 Array = NDArray[np.float64]
 PIECE = 4096
 """Ticks of a recording that are taken at once: long enough for speed, short enough for memory."""
-MOST_EVIDENCE = 8
+MAX_EVIDENCE = 8
 """Summaries that an alarm names."""
 OTHER_MACHINE = 6.0
 """Healthy deviations of a session's mean of a channel, beyond which the channel is not that of this machine."""
@@ -255,7 +255,7 @@ class Monitor:
         if verdict.alarm is None:
             raise DataError(f"block {verdict.block} raised no alarm")
         watch, names = self.chain.watches[verdict.alarm], self.summary_names
-        order = np.argsort(-np.abs(verdict.evidence), kind="stable")[:MOST_EVIDENCE]
+        order = np.argsort(-np.abs(verdict.evidence), kind="stable")[:MAX_EVIDENCE]
         evidence = tuple((names[i], float(verdict.evidence[i])) for i in order.tolist())
         detector = type(watch.detector).__name__.removesuffix("Spec").lower()
         alarm = MonitorAlarm(
@@ -333,8 +333,8 @@ class MonitorStream:
     def __init__(self, monitor: Monitor) -> None:
         self.monitor, self.state = monitor, monitor.initial_state()
         self._statistics = (0.0,) * len(monitor.chain.watches)
-        self._rows: deque[Array] = deque(maxlen=MOST_ROWS)
-        self._earlier: deque[tuple[int, int]] = deque(maxlen=MOST_ROWS)
+        self._rows: deque[Array] = deque(maxlen=MAX_ROWS)
+        self._earlier: deque[tuple[int, int]] = deque(maxlen=MAX_ROWS)
 
     def reset(self) -> None:
         """Restart."""

@@ -50,7 +50,7 @@ HEADER = "monitor.json"
 NETWORKS = "networks"
 """Folder of the networks that residuals are made with, a bundle or a twin each."""
 _FOLDER = re.compile(r"[a-z0-9]{1,32}-[a-z0-9]{1,32}")
-MOST_CHANNELS, MOST_SOURCES, MOST_NETWORKS = 2_000, 64, 256
+MOST_CHANNELS, MAX_SOURCES, MAX_NETWORKS = 2_000, 64, 256
 ARRAYS = {
     "session_means": ArrayRule((2, "channels")),
     "scatter": ArrayRule(("summaries",), low=0.0),
@@ -188,14 +188,14 @@ def _check_fit(sources: tuple[ResidualSource, ...], chain: MonitorChain, names: 
 
 
 def _sources(entries: Any, arrays: Table, path: Path) -> tuple[ResidualSource, ...]:
-    if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_SOURCES:
-        raise ValueError(f"it has no list of 1 to {MOST_SOURCES} sources of residuals")
+    if not isinstance(entries, list) or not 1 <= len(entries) <= MAX_SOURCES:
+        raise ValueError(f"it has no list of 1 to {MAX_SOURCES} sources of residuals")
     sources = []
     for index, entry in enumerate(entries):
         spec = RESIDUALS[checked_text(entry["kind"])]
         networks = object_with(entry["networks"], (), "its networks")
-        if len(networks) > MOST_NETWORKS:
-            raise ValueError(f"a source has {len(networks)} networks; at most {MOST_NETWORKS} must hold")
+        if len(networks) > MAX_NETWORKS:
+            raise ValueError(f"a source has {len(networks)} networks; at most {MAX_NETWORKS} must hold")
         bundles = {name: read_network(path, value) for name, value in networks.items()}
         plain = object_with(entry["plain"], (), "a source")
         sources.append(spec.source.of_parts(SourceParts(plain, arrays_under(arrays, f"source.{index}."), bundles)))

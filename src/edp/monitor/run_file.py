@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import chain
 
-from edp.monitor.diagnosis.structure import MOST_PAIRS, Confusion
+from edp.monitor.diagnosis.structure import MAX_PAIRS, Confusion
 from edp.settings.bounds import check_bounds, check_count, check_texts, integer
 from edp.settings.results import ResultFile
 
@@ -50,7 +50,7 @@ class MonitorRunFile(ResultFile):
 
     def __post_init__(self) -> None:
         check_bounds("monitor run", self, recordings=integer(0, 10**9), classes=integer(0, 10**6))
-        check_count("monitor run", "confusions", self.confusions, MOST_PAIRS)
+        check_count("monitor run", "confusions", self.confusions, MAX_PAIRS)
         check_texts("monitor run", (self.promise, self.unseen, *self.remarks, *chain(*self.remarks.values())), MAX_TEXT)
 
     @property

@@ -19,9 +19,9 @@ SCALED_SESSIONS = 12
 """Sessions that scales of residuals are taken from: they set units, conditioning does the rest."""
 MOVING = (Kind.VELOCITY, Kind.ANGULAR_VELOCITY, Kind.PILOT_PRESSURE, Kind.FLOW)
 LEVELS = (Kind.PRESSURE, Kind.TEMPERATURE, Kind.POSITION, Kind.ANGLE, Kind.RATIO, Kind.CURRENT, Kind.VOLTAGE)
-MOST_POINT = 24
+MAX_POINT = 24
 """Channels of an operating point; of more, those that vary most between blocks are taken."""
-LEAST_TICKS = 10
+MIN_TICKS = 10
 """Minimum length of a block in samples. Spreads of fewer samples are meaningless."""
 
 
@@ -66,7 +66,7 @@ def fit_summaries(
 
 def block_ticks(block_s: float, sessions: Sequence[Recording]) -> int:
     """Ticks of a block of these sessions."""
-    block = max(round(block_s * sessions[0].rate_hz), LEAST_TICKS)
+    block = max(round(block_s * sessions[0].rate_hz), MIN_TICKS)
     return min(block, max(1, min(session.samples for session in sessions) // 2))
 
 
@@ -137,7 +137,7 @@ def _operating_channels(
     varies = np.nan_to_num(np.nanstd(np.nanmean(whole, axis=1), axis=0)) > 0.0
     moving = [i for i, c in enumerate(channels) if c.kind in MOVING and varies[i]]
     level = [i for i, c in enumerate(channels) if c.kind in LEVELS and varies[i]]
-    return np.array(moving[:MOST_POINT], np.int64), np.array(level[:MOST_POINT], np.int64)
+    return np.array(moving[:MAX_POINT], np.int64), np.array(level[:MAX_POINT], np.int64)
 
 
 def blocks_of(

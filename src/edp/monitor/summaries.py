@@ -28,12 +28,12 @@ ARRAYS = {
 """Of its file."""
 SUMMARIES = ("mean", "spread", "gain", "lag", "peak")
 """Summaries of each residual and block, in this order, followed by one for each driver."""
-MOST_DRIVERS = 8
+MAX_DRIVERS = 8
 NEAR_ZERO = 0.05
 """Variance in healthy units that is added below `gain` and `lag`: a channel at rest tells neither."""
 BLOCKS_AT_ONCE = 32
 """Side by side: their sums stay in the processor's cache."""
-MOST_BLOCK = 1_000_000
+MAX_BLOCK = 1_000_000
 """Ticks of a block."""
 
 
@@ -206,12 +206,12 @@ class BlockSummaries:
             ValueError: values that cannot be.
         """
         block = plain["block"]
-        if isinstance(block, bool) or not isinstance(block, int) or not 1 <= block <= MOST_BLOCK:
-            raise ValueError(f"a block has {str(block)[:40]} ticks; 1 to {MOST_BLOCK:,} must hold")
+        if isinstance(block, bool) or not isinstance(block, int) or not 1 <= block <= MAX_BLOCK:
+            raise ValueError(f"a block has {str(block)[:40]} ticks; 1 to {MAX_BLOCK:,} must hold")
         values = checked_arrays(arrays, ARRAYS, "the summaries")
         drivers = values["drivers"]
-        if len(drivers) > MOST_DRIVERS or (drivers[..., 0] < 0).any():
-            raise ValueError(f"the summaries have more than {MOST_DRIVERS} drivers, or one without its first input")
+        if len(drivers) > MAX_DRIVERS or (drivers[..., 0] < 0).any():
+            raise ValueError(f"the summaries have more than {MAX_DRIVERS} drivers, or one without its first input")
         return BlockSummaries(block, **values)
 
 

@@ -16,7 +16,7 @@ from edp.monitor.stored_arrays import read_stored, write_stored
 FloatArray = NDArray[np.float32]
 TRACES = "traces"
 SCHEMA = 1
-MOST_RECORDINGS, MOST_COLUMNS = 100_000, 256
+MAX_RECORDINGS, MAX_COLUMNS = 100_000, 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +100,8 @@ def read_traces(folder: Path) -> RunTraces:
         raise StorageError(f"{where}: block_s must be a number of seconds; run the monitor again")
     detectors, groups = (_names(header.get(key), f"{where}: {key}") for key in ("detectors", "groups"))
     entries = header.get("recordings")
-    if not isinstance(entries, list) or len(entries) > MOST_RECORDINGS:
-        raise StorageError(f"{where}: recordings must be a list of at most {MOST_RECORDINGS}; run the monitor again")
+    if not isinstance(entries, list) or len(entries) > MAX_RECORDINGS:
+        raise StorageError(f"{where}: recordings must be a list of at most {MAX_RECORDINGS}; run the monitor again")
     recordings = []
     for n, entry in enumerate(entries):
         at = f"{where}, recording {n}"
@@ -123,8 +123,8 @@ def _rows(values: NDArray[Any] | None, columns: int, where: str) -> FloatArray:
 
 
 def _names(value: Any, where: str) -> tuple[str, ...]:
-    if not isinstance(value, list) or len(value) > MOST_COLUMNS:
-        raise StorageError(f"{where}: a list of at most {MOST_COLUMNS} names must be there; run the monitor again")
+    if not isinstance(value, list) or len(value) > MAX_COLUMNS:
+        raise StorageError(f"{where}: a list of at most {MAX_COLUMNS} names must be there; run the monitor again")
     return tuple(_text(name, where) for name in value)
 
 

@@ -111,9 +111,9 @@ def check_rows(spec: WatchSpec, lengths: Sequence[int], blocks_per_s: float) -> 
     # A quarter of a session at most: of longer averages there would be too few.
     blocks = max(1, min(round(spec.memory_s * blocks_per_s), usual // 4))
     rows = sum(_averages(length, blocks) for length in lengths)
-    if spec.view != "own" and rows < LEAST_ROWS:
+    if spec.view != "own" and rows < MIN_ROWS:
         raise DataError(
-            f"{rows} averages over {blocks} blocks are too few for a covariance; {LEAST_ROWS} at least must hold: "
+            f"{rows} averages over {blocks} blocks are too few for a covariance; {MIN_ROWS} at least must hold: "
             "bring more hours"
         )
     return blocks
@@ -165,7 +165,7 @@ def _own(spec: WatchSpec, sessions: Sequence[Array], settle: int) -> Watch:
     if not peaks:
         raise DataError("no healthy session is longer than the start that is not watched: bring longer ones")
     largest = np.sort(peaks, axis=0)[-min(EAGER, len(peaks))]
-    factors = (1.0 / np.maximum(largest, LEAST_GROSS)).astype(np.float32).astype(np.float64)
+    factors = (1.0 / np.maximum(largest, MIN_GROSS)).astype(np.float32).astype(np.float64)
     return Watch(spec.detector, np.zeros(len(factors)), factors)
 
 
@@ -243,9 +243,9 @@ def scale_watches(specs: Sequence[WatchSpec], watches: Sequence[Watch], sessions
 
 ROWS_AT_ONCE = 64
 """Number of rows of a view at a time, so that their sums stay in the processor's cache."""
-LEAST_ROWS = 16
+MIN_ROWS = 16
 """Minimum number of averages for a covariance. A diagonal is added to represent what they do not determine."""
-LEAST_GROSS = 3.0
+MIN_GROSS = 3.0
 """Healthy deviations: a summary that never strayed further is not gross before that."""
 EAGER = 3
 """Rank of the healthy session's statistic, from the largest, by which watches are scaled: near the limit, where tails

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from edp.errors import DataError
 
 Array = NDArray[np.float64]
-LEAST_SHARE = 1e-9
+MIN_SHARE = 1e-9
 """Fraction of the largest variance below which a direction is rounding of linearly dependent residuals."""
 
 
@@ -48,7 +48,7 @@ class Whitening:
         size = rows.std(axis=0)
         size = np.where(size > 0.0, size, 1.0)
         variances, vectors = np.linalg.eigh(np.cov((rows - mean) / size, rowvar=False).reshape(len(size), len(size)))
-        kept_directions = variances > LEAST_SHARE * max(variances[-1], 0.0)
+        kept_directions = variances > MIN_SHARE * max(variances[-1], 0.0)
         if not kept_directions.any():
             raise DataError("residuals of the healthy sessions do not vary; there is nothing to compare with")
         return Whitening(mean, vectors[:, kept_directions] / np.sqrt(variances[kept_directions]) / size[:, None])

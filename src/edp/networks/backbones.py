@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from edp.data.task import Task
 from edp.errors import ConfigError, closest
 from edp.ir import Builder
-from edp.ir.builder import MOST_INDEX
+from edp.ir.builder import MAX_INDEX
 from edp.networks.blocks.base import BlockSlot, BranchMaker
 from edp.networks.cells import CellSpec, GruCell, LstmCell, Stack
 from edp.networks.cells.base import check_cell
@@ -21,17 +21,17 @@ from edp.networks.convolution import ConvolutionStack, receptive_field
 from edp.networks.initial import InitialSpec, ZeroState
 from edp.networks.lag_bank import LagBank, check_lags, check_smoothed
 from edp.networks.pooling import AttentionPooling
-from edp.networks.radial import MOST_CENTRES, RadialFeatures, check_near
+from edp.networks.radial import MAX_CENTRES, RadialFeatures, check_near
 from edp.networks.streaming import Chain, Cost, State, Streaming
-from edp.networks.trees import MOST_DEPTH, MOST_TREES, Trees
+from edp.networks.trees import MAX_DEPTH, MAX_TREES, Trees
 from edp.registry import Registry
 from edp.settings.bounds import (
+    MAX_KERNEL,
+    MAX_LAYERS,
+    MAX_LEVELS,
+    MAX_NAMES,
+    MAX_UNITS,
     MOST_CHANNELS,
-    MOST_KERNEL,
-    MOST_LAYERS,
-    MOST_LEVELS,
-    MOST_NAMES,
-    MOST_UNITS,
     below,
     check_bounds,
     check_count,
@@ -68,8 +68,8 @@ class BackboneSpec(Protocol):
 
 
 BACKBONES: Registry[type] = Registry("backbone")
-UNITS, LAYERS = integer(1, MOST_UNITS), integer(1, MOST_LAYERS)
-CHANNELS, KERNEL = integer(1, MOST_CHANNELS), integer(1, MOST_KERNEL)
+UNITS, LAYERS = integer(1, MAX_UNITS), integer(1, MAX_LAYERS)
+CHANNELS, KERNEL = integer(1, MOST_CHANNELS), integer(1, MAX_KERNEL)
 DROPOUT = below(0.0, 1.0)
 
 
@@ -167,7 +167,7 @@ class TcnSpec:
     dropout: float = 0.0
 
     def __post_init__(self) -> None:
-        check_count("backbone", "channels", self.channels, MOST_LEVELS, least=1)
+        check_count("backbone", "channels", self.channels, MAX_LEVELS, least=1)
         check_bounds("backbone", self, channels=CHANNELS, kernel=KERNEL, dropout=DROPOUT)
 
     def slots(self) -> tuple[BlockSlot, ...]:
@@ -218,7 +218,7 @@ class HybridSpec:
     initial: InitialSpec = field(default_factory=ZeroState)
 
     def __post_init__(self) -> None:
-        check_count("backbone", "channels", self.channels, MOST_LEVELS, least=1)
+        check_count("backbone", "channels", self.channels, MAX_LEVELS, least=1)
         check_bounds("backbone", self, channels=CHANNELS, kernel=KERNEL, units=UNITS, layers=LAYERS)
         check_bounds("backbone", self, dropout=DROPOUT, zoneout=DROPOUT)
         check_cell("hybrid", self.cell, self.zoneout)
@@ -281,13 +281,13 @@ class CommitteeSpec:
     bounded: bool = False
 
     def __post_init__(self) -> None:
-        check_count("backbone", "lags", self.lags, MOST_LEVELS, least=1)
+        check_count("backbone", "lags", self.lags, MAX_LEVELS, least=1)
         check_lags(self.lags)
         check_smoothed(self.lags, self.smoothed)
         check_count("backbone", "activations", self.activations, len(NON_LINEAR))
-        check_bounds("backbone", self, members=integer(1, MOST_NAMES), units=UNITS, layers=LAYERS, dropout=DROPOUT)
-        check_bounds("backbone", self, trees=integer(0, MOST_TREES), tree_depth=integer(1, MOST_DEPTH))
-        check_bounds("backbone", self, centres=integer(0, MOST_CENTRES))
+        check_bounds("backbone", self, members=integer(1, MAX_NAMES), units=UNITS, layers=LAYERS, dropout=DROPOUT)
+        check_bounds("backbone", self, trees=integer(0, MAX_TREES), tree_depth=integer(1, MAX_DEPTH))
+        check_bounds("backbone", self, centres=integer(0, MAX_CENTRES))
         check_near(self.near, self.lags, self.centres)
         for name in self.activations:
             if name not in NON_LINEAR or self.activations.count(name) > 1:
@@ -299,10 +299,10 @@ class CommitteeSpec:
     def conflicts(self, model: object, task: Task) -> str | None:
         """Trees that read more columns than their tables can name."""
         columns = len(task.features.features) * (1 + len(self.lags) + len(self.smoothed))
-        if self.trees and columns > MOST_INDEX + 1:
+        if self.trees and columns > MAX_INDEX + 1:
             return (
                 f"committee: trees would read {columns:,} columns (features times 1 + lags + smoothed); at most "
-                f"{MOST_INDEX + 1:,} must hold: give fewer channels or lags, or trees = 0"
+                f"{MAX_INDEX + 1:,} must hold: give fewer channels or lags, or trees = 0"
             )
         return None
 

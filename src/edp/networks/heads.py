@@ -15,7 +15,7 @@ from edp.ir import Builder
 from edp.ir.layers import Activate, BinaryOperation, Clip, Dense, Function, Glu, GroupedDense, ScaleShift
 from edp.networks.streaming import Cost, Operation, State, Streaming
 from edp.registry import Registry
-from edp.settings.bounds import MOST_LAYERS, MOST_UNITS, check_bounds, integer
+from edp.settings.bounds import MAX_LAYERS, MAX_UNITS, check_bounds, integer
 
 
 class HeadSpec(Protocol):
@@ -55,7 +55,7 @@ class MlpHead:
     layers: int = 1
 
     def __post_init__(self) -> None:
-        check_bounds("head", self, hidden=integer(1, MOST_UNITS), layers=integer(1, MOST_LAYERS))
+        check_bounds("head", self, hidden=integer(1, MAX_UNITS), layers=integer(1, MAX_LAYERS))
 
     def build(self, width: int, outputs: int, values: int, mix: Streaming | None = None) -> Heads:
         """Heads with ReLU."""
@@ -84,7 +84,7 @@ class GluHead:
     layers: int = 1
 
     def __post_init__(self) -> None:
-        check_bounds("head", self, hidden=integer(1, MOST_UNITS), layers=integer(1, MOST_LAYERS))
+        check_bounds("head", self, hidden=integer(1, MAX_UNITS), layers=integer(1, MAX_LAYERS))
 
     def build(self, width: int, outputs: int, values: int, mix: Streaming | None = None) -> Heads:
         """Heads that begin with a gated linear unit."""

@@ -12,7 +12,7 @@ from edp.ir import Builder
 from edp.ir.memory import PrefixCorrection
 from edp.networks.streaming import Cost, Operation, State, Streaming, map_state, parameters_of, state_numbers
 from edp.registry import Registry
-from edp.settings.bounds import MOST_TICKS, MOST_UNITS, check_bounds, integer
+from edp.settings.bounds import MAX_UNITS, MOST_TICKS, check_bounds, integer
 
 
 class InitialSpec(Protocol):
@@ -66,7 +66,7 @@ class PrefixState:
     hidden: int = 16
 
     def __post_init__(self) -> None:
-        check_bounds("initial prefix", self, ticks=integer(1, MOST_TICKS), hidden=integer(1, MOST_UNITS))
+        check_bounds("initial prefix", self, ticks=integer(1, MOST_TICKS), hidden=integer(1, MAX_UNITS))
 
     def build(self, recurrent: Streaming, width_in: int) -> Streaming:
         """Build the recurrent layers with a network that corrects their state."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from edp.data.features import MOST_LAG
+from edp.data.features import MAX_LAG
 from edp.errors import ConfigError
 from edp.ir import Builder
 from edp.ir.layers import Clip, ScaleShift
@@ -21,11 +21,11 @@ def check_lags(lags: Sequence[int]) -> None:
     """Refuse spans that `LagBank` cannot make.
 
     Raises:
-        ConfigError: no span, one below 1 or above `MOST_LAG`, or spans that do not rise.
+        ConfigError: no span, one below 1 or above `MAX_LAG`, or spans that do not rise.
     """
-    if not lags or list(lags) != sorted(set(lags)) or lags[0] < 1 or lags[-1] > MOST_LAG:
+    if not lags or list(lags) != sorted(set(lags)) or lags[0] < 1 or lags[-1] > MAX_LAG:
         raise ConfigError(
-            f"lags: {shown(lags)}; at least one span in ticks, each from 1 to {MOST_LAG} and longer than the one "
+            f"lags: {shown(lags)}; at least one span in ticks, each from 1 to {MAX_LAG} and longer than the one "
             "before it, must hold"
         )
 

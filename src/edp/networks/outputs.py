@@ -49,7 +49,7 @@ class OutputSpec(Protocol):
 
 
 OUTPUTS: Registry[type] = Registry("output")
-MOST_PAIRS = 99
+MAX_PAIRS = 99
 """Quantiles or intervals: all whole per cent."""
 
 
@@ -189,7 +189,7 @@ class Quantiles:
     calibrated: bool = True
 
     def __post_init__(self) -> None:
-        check_count("quantiles", "levels", self.levels, MOST_PAIRS)
+        check_count("quantiles", "levels", self.levels, MAX_PAIRS)
         check_bounds("quantiles", self, levels=between(0.0, 1.0))
         mirrored = [1.0 - level for level in reversed(self.levels)]
         symmetric = all(math.isclose(a, b, abs_tol=1e-9) for a, b in zip(self.levels, mirrored, strict=True))
@@ -262,7 +262,7 @@ class _Law:
     calibrated: bool = True
 
     def __post_init__(self) -> None:
-        check_count("output", "coverages", self.coverages, MOST_PAIRS, least=1)
+        check_count("output", "coverages", self.coverages, MAX_PAIRS, least=1)
         check_bounds("output", self, coverages=between(0.0, 1.0))
         falling = list(self.coverages) == sorted(set(self.coverages), reverse=True)
         if not self.coverages or not falling or not 0 < min(self.coverages) <= max(self.coverages) < 1:

@@ -21,7 +21,7 @@ from edp.networks.heads import HEADS, HeadSpec, MlpHead
 from edp.networks.losses import Prediction
 from edp.networks.outputs import OUTPUTS, OutputSpec, Point
 from edp.networks.physics import PHYSICS, PhysicsBase, PhysicsSpec
-from edp.networks.size import MOST_PARAMETERS, MOST_STATE, size_at_most
+from edp.networks.size import MAX_STATE, MOST_PARAMETERS, size_at_most
 from edp.networks.streaming import Cost, State, Streaming, parameters_of, state_numbers
 from edp.settings.bounds import MOST_TICKS, check_bounds, check_count, integer
 
@@ -286,16 +286,16 @@ def _check_size(task: Task, spec: ModelSpec, scaler: Scaler) -> None:
     """
     parameters, state = size_at_most(spec, task)
     # On the meta device nothing is allocated, and the check itself builds such a network.
-    if (parameters <= MOST_PARAMETERS and state <= MOST_STATE) or torch.get_default_device().type == "meta":
+    if (parameters <= MOST_PARAMETERS and state <= MAX_STATE) or torch.get_default_device().type == "meta":
         return
     with torch.device("meta"), torch.random.fork_rng(devices=[]):  # shapes without numbers; takes seconds to load
         net = Predictor(task, replace(spec, physics=None), scaler)
         parameters = sum(tensor.numel() for tensor in net.state_dict().values())  # tables of trees included
         state = state_numbers(net.initial_state(1, torch.zeros(())))
-    if parameters > MOST_PARAMETERS or state > MOST_STATE:
+    if parameters > MOST_PARAMETERS or state > MAX_STATE:
         raise ConfigError(
             f"model: the network would have {parameters:,} parameters and carry {state:,} numbers from tick to tick; "
-            f"at most {MOST_PARAMETERS:,} and {MOST_STATE:,} must hold: make backbone.channels, backbone.units, "
+            f"at most {MOST_PARAMETERS:,} and {MAX_STATE:,} must hold: make backbone.channels, backbone.units, "
             "backbone.kernel, the head, the window or the number of horizons smaller"
         )
 

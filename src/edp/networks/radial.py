@@ -13,7 +13,7 @@ from edp.ir.layers import Activate, BinaryOperation, Clip, Dense, Function, Scal
 from edp.networks.streaming import Cost, Operation, State, Streaming
 from edp.settings.bounds import shown
 
-MOST_CENTRES = 4096
+MAX_CENTRES = 4096
 
 
 def check_near(near: Sequence[int], lags: Sequence[int], centres: int) -> None:

@@ -20,7 +20,7 @@ from edp.networks.streaming import State
 
 A = TypeVar("A")
 Run = Callable[[Tensor, State], tuple[Tensor, State]]
-MOST_TICKS_TOGETHER = 1 << 22  # of streams side by side whose answers are in memory: 11 hours at 100 Hz
+MAX_TICKS_TOGETHER = 1 << 22  # of streams side by side whose answers are in memory: 11 hours at 100 Hz
 PIECE = 512  # ticks per call, or windows: long enough for speed, short enough for memory
 
 
@@ -145,7 +145,7 @@ def stream_groups(series: Sequence[Series], batch: int = 16) -> list[list[int]]:
     groups, at = [], 0
     while at < len(order):
         longest = max(1, series[order[min(at + batch, len(order)) - 1]].samples)
-        groups.append(order[at : at + max(1, min(batch, MOST_TICKS_TOGETHER // longest))])
+        groups.append(order[at : at + max(1, min(batch, MAX_TICKS_TOGETHER // longest))])
         at += len(groups[-1])
     return groups
 

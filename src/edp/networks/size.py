@@ -11,7 +11,7 @@ from edp.data.task import Task
 # Forty times the largest network of the thesis (1.2 million); controllers hold a hundred thousand. 0.2 GB as float32.
 MOST_PARAMETERS = 50_000_000
 # Numbers that a stream carries from tick to tick: 0.4 GB as float32, and a training has a stream for each lane.
-MOST_STATE = 100_000_000
+MAX_STATE = 100_000_000
 NO_WIDTHS = (
     *("kernel", "layers", "window", "ticks", "taps", "heads", "reduction", "first_dilations"),
     *("lags", "smoothed", "near"),

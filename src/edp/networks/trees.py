@@ -13,9 +13,9 @@ from edp.ir import layers as ir
 from edp.ir.builder import indices
 from edp.networks.streaming import Cost, State, Streaming
 
-MOST_TREES = 2000
+MAX_TREES = 2000
 """Maximum number of trees per predicted value. Boosting at a rate of 0.05 ends far below."""
-MOST_DEPTH = 8
+MAX_DEPTH = 8
 """256 leaves a tree: 768 numbers, 2.5 KB of flash."""
 BLOCK = 2**20
 """Nodes of all rows that are looked at together: 16 MB of single precision."""

@@ -42,7 +42,7 @@ PART_S = 0.01
 """Time allowance per object of a file. An object of MAT v7.3 takes about 1.3 ms on a busy machine (findings)."""
 WALL = 12
 """Longest time by the clock, in allowed processor times: a process may also wait for ever."""
-MOST_S = 1e6
+MAX_S = 1e6
 """Keeps announced sizes of a hostile header within what a timer takes."""
 _EXHAUSTED = re.compile(
     r"(?:out of|not enough|insufficient) memory|memory allocation|bad_alloc|malloc|alloc\w* failed|"
@@ -78,7 +78,7 @@ class Allowance:
 
     def seconds(self, values: int = 0) -> float:
         """Processor time of a request that wants some values."""
-        return min(START_S + self.size / BYTES_PER_S + self.work_s + values / VALUES_PER_S, MOST_S)
+        return min(START_S + self.size / BYTES_PER_S + self.work_s + values / VALUES_PER_S, MAX_S)
 
     @contextlib.contextmanager
     def running(self, seconds: float) -> Iterator[list[float]]:
@@ -104,7 +104,7 @@ class Allowance:
                 left = signal.getitimer(timer)[0]
                 # A timer that is not running stays so: nothing is being read.
                 if left:
-                    signal.setitimer(timer, min(left + times * more, WALL * MOST_S))
+                    signal.setitimer(timer, min(left + times * more, WALL * MAX_S))
 
     def _limit_memory(self) -> None:
         """Set the soft limits. Hard limits stay at the machine's capacity; later headers may raise the soft ones."""

@@ -10,33 +10,33 @@ from typing import Any
 from edp.errors import ConfigError
 
 # Sizes of a network: eight times the widest of the thesis (256 units, 4 levels) and more; it must run on a controller.
-MOST_UNITS = 4096
+MAX_UNITS = 4096
 MOST_CHANNELS = 4096
-MOST_LAYERS = 16
+MAX_LAYERS = 16
 # The dilation doubles from level to level: 16 levels of kernel 2 see 65,536 ticks, as long as the longest window.
-MOST_LEVELS = 16
-MOST_KERNEL = 1024
+MAX_LEVELS = 16
+MAX_KERNEL = 1024
 # Ten minutes at 100 Hz; what a stream remembers beyond that is a slow drift, which recurrent states carry.
 MOST_TICKS = 65_536
 # A batch holds at most a month at 100 Hz; the memory that it needs is computed before it is taken.
-MOST_BATCH = 1_000_000
+MAX_BATCH = 1_000_000
 # Of targets, horizons, channels, features, terms or names in a list: machines log hundreds, and each is an output.
-MOST_NAMES = 10_000
-MOST_HORIZONS = 1_000
+MAX_NAMES = 10_000
+MAX_HORIZONS = 1_000
 # Rows or ticks: 115 days at 100 Hz, more than any recording has.
-MOST_ROWS = 1_000_000_000
-MOST_EPOCHS = 1_000_000
+MAX_ROWS = 1_000_000_000
+MAX_EPOCHS = 1_000_000
 # Of processor time: six milliseconds, in which nothing is trained, and less is a slip of the pen.
 MIN_MINUTES = 1e-4
-MOST_UPDATES = 1_000_000_000
-MOST_THREADS = 4_096
+MAX_UPDATES = 1_000_000_000
+MAX_THREADS = 4_096
 # Of NumPy's RandomState, which Optuna and scikit-learn draw from: 32 bits.
-MOST_SEED = 2**32 - 1
+MAX_SEED = 2**32 - 1
 # Standardised errors, gradients and weights of loss terms are of the order of one; float32 squares overflow at 1.8e19.
-MOST_WEIGHT = 1e6
-LEAST_POSITIVE = 1.2e-38
+MAX_WEIGHT = 1e6
+MIN_POSITIVE = 1.2e-38
 """Least number that counts as above zero: the smallest normal number of float32, whose inverse is finite."""
-MOST_SHOWN = 60
+MAX_SHOWN = 60
 """Characters of a value that a message repeats."""
 
 
@@ -48,7 +48,7 @@ class Bound:
         low: least value.
         high: largest value, finite.
         integer: only integers.
-        above: `low` itself is out; above zero, numbers below `LEAST_POSITIVE` are, too.
+        above: `low` itself is out; above zero, numbers below `MIN_POSITIVE` are, too.
         below: `high` itself is out.
     """
 
@@ -65,7 +65,7 @@ class Bound:
             return False
         number: Any = value  # integers beyond what a float holds compare as they are
         over = number > self.low if self.above else number >= self.low
-        if self.above and self.low == 0.0 and number < LEAST_POSITIVE:
+        if self.above and self.low == 0.0 and number < MIN_POSITIVE:
             return False
         under = number < self.high if self.below else number <= self.high
         return bool(over and under)
@@ -79,8 +79,8 @@ class Bound:
     def note(self, value: Any) -> str:
         """Return the explanation for a positive number that counts as zero; otherwise an empty text."""
         entries = value if isinstance(value, tuple | list) else (value,)
-        tiny = any(isinstance(entry, Real) and 0.0 < entry < LEAST_POSITIVE for entry in entries)  # type: ignore[operator]
-        return f" (numbers below {LEAST_POSITIVE:g} count as zero)" if self.above and self.low == 0.0 and tiny else ""
+        tiny = any(isinstance(entry, Real) and 0.0 < entry < MIN_POSITIVE for entry in entries)  # type: ignore[operator]
+        return f" (numbers below {MIN_POSITIVE:g} count as zero)" if self.above and self.low == 0.0 and tiny else ""
 
 
 def integer(low: int, high: int) -> Bound:
@@ -108,13 +108,13 @@ def between(low: float, high: float) -> Bound:
     return Bound(low, high, above=True, below=True)
 
 
-SEED = integer(0, MOST_SEED)
+SEED = integer(0, MAX_SEED)
 SHARE = span(0.0, 1.0)
 RATE = above(0.0, 1e38)
 """Of learning: what float32 holds. A rate that is too large for a network is reported as a training that diverged."""
 DECAY = span(0.0, 100.0)
 """Of weights, per unit of the learning rate."""
-WEIGHT = above(0.0, MOST_WEIGHT)
+WEIGHT = above(0.0, MAX_WEIGHT)
 """Of a term of a loss."""
 
 
@@ -163,16 +163,14 @@ def check_texts(what: str, texts: Iterable[str], longest: int) -> None:
 def shown(value: Any) -> str:
     """Return a value as text for error messages: long values are cut, huge integers become their number of digits."""
     # str() of an integer of thousands of digits takes quadratic time, and Python refuses it.
-    if isinstance(value, int) and not isinstance(value, bool) and value.bit_length() > 4 * MOST_SHOWN:
+    if isinstance(value, int) and not isinstance(value, bool) and value.bit_length() > 4 * MAX_SHOWN:
         return f"a number of about {round(value.bit_length() * 0.30103):,} digits"
     if isinstance(value, tuple | list):
-        return f"[{_cut(', '.join(shown(entry) for entry in value[:MOST_SHOWN]))}]"
+        return f"[{_cut(', '.join(shown(entry) for entry in value[:MAX_SHOWN]))}]"
     if isinstance(value, dict):
-        return _cut(
-            "{" + ", ".join(f"{key!r}: {shown(entry)}" for key, entry in list(value.items())[:MOST_SHOWN]) + "}"
-        )
+        return _cut("{" + ", ".join(f"{key!r}: {shown(entry)}" for key, entry in list(value.items())[:MAX_SHOWN]) + "}")
     return _cut(repr(value))
 
 
 def _cut(text: str) -> str:
-    return text if len(text) <= 2 * MOST_SHOWN else f"{text[: 2 * MOST_SHOWN]} ... ({len(text):,} characters)"
+    return text if len(text) <= 2 * MAX_SHOWN else f"{text[: 2 * MAX_SHOWN]} ... ({len(text):,} characters)"

@@ -44,7 +44,7 @@ _RULES = {
     "dict_type": "a table must hold",
 }
 """By kind of pydantic's error, what must hold; kinds that are not listed are told in its words."""
-MOST_LISTED, MOST_KEY = 50, 100
+MAX_LISTED, MAX_KEY = 50, 100
 """Problems that a message lists, and characters of a key that it repeats."""
 
 
@@ -192,8 +192,8 @@ class SettingsTree:
         problems: list[str] = []
         spec = self._build(cls, table, path, problems)
         if problems:
-            more = [f"and {len(problems) - MOST_LISTED:,} more"] if len(problems) > MOST_LISTED else []
-            listed = "\n  - ".join(problems[:MOST_LISTED] + more)
+            more = [f"and {len(problems) - MAX_LISTED:,} more"] if len(problems) > MAX_LISTED else []
+            listed = "\n  - ".join(problems[:MAX_LISTED] + more)
             count = f"{len(problems)} problem" + ("s" if len(problems) > 1 else "")
             raise ConfigError(f"{self.what} {where}: {count}\n  - {listed}")
         return typing.cast(T, spec)
@@ -426,7 +426,7 @@ def _truth_in(value: Any) -> bool:
 
 def _key(name: str) -> str:
     """Return a key or name, shortened for messages."""
-    return name if len(name) <= MOST_KEY else f"{name[:MOST_KEY]}..."
+    return name if len(name) <= MAX_KEY else f"{name[:MAX_KEY]}..."
 
 
 def _join(path: str, key: str) -> str:

@@ -37,13 +37,13 @@ DEFAULT_MIX: Mapping[str, float] = {
 }
 """Share of the recordings by excitation."""
 
-MOST_RECORDINGS, MOST_MINUTES, MOST_MACHINES, MOST_SEED = 100_000, 1e6, 1000, 2**63
+MAX_RECORDINGS, MAX_MINUTES, MAX_MACHINES, MAX_SEED = 100_000, 1e6, 1000, 2**63
 """Bounds of one data set; the plan of the most recordings takes some seconds."""
 BOUNDS = {
-    "recordings": integer(1, MOST_RECORDINGS),
-    "minutes": span(MIN_MINUTES, MOST_MINUTES),
-    "seed": integer(0, MOST_SEED - 1),
-    "family": integer(0, MOST_MACHINES),
+    "recordings": integer(1, MAX_RECORDINGS),
+    "minutes": span(MIN_MINUTES, MAX_MINUTES),
+    "seed": integer(0, MAX_SEED - 1),
+    "family": integer(0, MAX_MACHINES),
     "scatter": above(0.0, WIDEST),
     "rate_hz": span(1.0, 1000.0),
     "step_s": above(0.0, LARGEST_STEP_S),

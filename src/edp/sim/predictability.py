@@ -23,7 +23,7 @@ from edp.jobs import IN_PROCESS, Workers
 from edp.jobs.packing import pack, unpack
 from edp.jobs.workers import WorkUnit
 from edp.progress import SILENT, Progress
-from edp.settings.bounds import MOST_HORIZONS, MOST_NAMES, SEED, check_bounds, check_count, integer, shown
+from edp.settings.bounds import MAX_HORIZONS, MAX_NAMES, SEED, check_bounds, check_count, integer, shown
 from edp.signals import TABLE_A1
 from edp.sim.limit_file import LimitErrors, LimitFile, Rows
 from edp.sim.machine import layout as at
@@ -41,7 +41,7 @@ PAST = 40
 RESAMPLES = 2000
 """Draws of the bootstrap of recordings."""
 CONFIDENCE = 0.95
-MOST_BRANCHES, MOST_MOMENTS = 4096, 100_000
+MAX_BRANCHES, MAX_MOMENTS = 4096, 100_000
 """Bounds; the usual 32 branches of 240 moments take minutes."""
 MOST_AHEAD = 2000
 """Samples, 20 s at 100 Hz."""
@@ -70,14 +70,14 @@ class LimitSpec:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_count("limit", "horizons", self.horizons, MOST_HORIZONS, least=1)
+        check_count("limit", "horizons", self.horizons, MAX_HORIZONS, least=1)
         check_bounds(
             "limit",
             self,
             horizons=integer(1, MOST_AHEAD),
-            moments=integer(2, MOST_MOMENTS),
-            branches=integer(4, MOST_BRANCHES),
-            recordings=integer(1, MOST_NAMES),
+            moments=integer(2, MAX_MOMENTS),
+            branches=integer(4, MAX_BRANCHES),
+            recordings=integer(1, MAX_NAMES),
             seed=SEED,
         )
         if any(a >= b for a, b in pairwise(self.horizons)):

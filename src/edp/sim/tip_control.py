@@ -22,7 +22,7 @@ GAINS = 6
 # memory[...]: time on the leg in s, largest stroke error in m, then integrals and last levers of the three axes
 TIME, BEHIND, SUM, LEVER = 0, 1, 2, 5
 MEMORY = 8
-MOST_SUM = 0.1
+MAX_SUM = 0.1
 """Most speed (m/s) that the integral may add: a blocked leg must not wind it up."""
 
 
@@ -98,7 +98,7 @@ def control(
         # No integration at a saturated lever, which could not follow.
         if abs(lever) < 1.0:
             total = memory[SUM + i] + gains[INTEGRAL] * gains[STEP] * error
-            memory[SUM + i] = min(max(total, -MOST_SUM), MOST_SUM)
+            memory[SUM + i] = min(max(total, -MAX_SUM), MAX_SUM)
         before, samples = memory[LEVER + i], targets.shape[0]
         for k in range(samples):
             targets[k, i] = before + (lever - before) * (k + 1) / samples

@@ -11,7 +11,7 @@ import numpy as np
 from edp.errors import ConfigError, closest
 from edp.stats.checks import Array, Mask
 
-MOST_RUNS = 256
+MAX_RUNS = 256
 """Trainings of one screening; the search for columns grows with the third power of the factors."""
 INTERACTION = 0.03
 """Assumed fraction of a run's variance per interaction, to weigh errors against aliases."""
@@ -88,13 +88,13 @@ def _check_runs(names: tuple[str, ...], runs: int | None) -> int:
     if len(names) < 2 or len(set(names)) != len(names):
         raise ConfigError(f"factors {list(names)} came; give at least two, each once")
     least = least_runs(len(names))
-    if least > MOST_RUNS:
-        raise ConfigError(f"{len(names)} factors need {least} runs; screen at most {MOST_RUNS // 2} at a time")
+    if least > MAX_RUNS:
+        raise ConfigError(f"{len(names)} factors need {least} runs; screen at most {MAX_RUNS // 2} at a time")
     if runs is None:
         return least
-    if runs < least or runs > MOST_RUNS or runs & (runs - 1):
+    if runs < least or runs > MAX_RUNS or runs & (runs - 1):
         raise ConfigError(
-            f"{runs} runs came for {len(names)} factors; resolution IV needs a power of two from {least} to {MOST_RUNS}"
+            f"{runs} runs came for {len(names)} factors; resolution IV needs a power of two from {least} to {MAX_RUNS}"
         )
     return runs
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-MOST_EXACT = 1 << 20
+MAX_EXACT = 1 << 20
 """Values that are kept as they are, 8 MB."""
 FINE = 10
 """Bits of the mantissa that tell bins apart: 1,024 bins an octave, so that a quantile is wrong by 0.05 % at most."""
@@ -17,7 +17,7 @@ _BINS = 1 << (31 - _SHIFT)
 
 
 class QuantileSketch:
-    """Quantile sketch of non-negative values: exact up to `MOST_EXACT` values, beyond that to 0.05 %.
+    """Quantile sketch of non-negative values: exact up to `MAX_EXACT` values, beyond that to 0.05 %.
 
     Bins are those of single precision with a shortened mantissa: two megabytes, however many values come.
     """
@@ -37,7 +37,7 @@ class QuantileSketch:
         new = np.asarray(values, dtype=np.float64).ravel()
         self.count += new.size
         self._kept.append(new)
-        if self.count > MOST_EXACT or self._bins is not None:
+        if self.count > MAX_EXACT or self._bins is not None:
             self._fill_bins()
 
     def _fill_bins(self) -> NDArray[np.int64]:

@@ -15,9 +15,9 @@ from edp.stats.mixed import mixed_model
 from edp.stats.multiple import benjamini_hochberg
 from edp.stats.resampled import printed_p
 
-LEAST_DZ = 0.5
+MIN_DZ = 0.5
 """The thesis's gate of relevance (3.3.4): a medium effect in Cohen's words."""
-LEAST_STABILITY = 0.75
+MIN_STABILITY = 0.75
 """The thesis's third gate: three quarters of the pairs of runs won."""
 
 
@@ -78,7 +78,7 @@ def thesis_confirm(
     difference = module - baseline
     d_z = cohens_dz(difference.mean(axis=-1))
     stability = rank_stability(difference.reshape(*difference.shape[:2], -1))
-    gates = (adjusted < alpha, d_z <= -LEAST_DZ, effect.mean < 0.0, stability >= LEAST_STABILITY)
+    gates = (adjusted < alpha, d_z <= -MIN_DZ, effect.mean < 0.0, stability >= MIN_STABILITY)
     passed: Mask = np.asarray(np.logical_and.reduce(gates), dtype=bool)
     printed = printed_p(d_z, array.shape[2])
     confirmed = np.asarray(passed.any(axis=0))

@@ -10,7 +10,7 @@ from scipy.special import ndtr, ndtri
 
 from edp.errors import ConfigError
 
-MOST_SPLITS = 25
+MAX_SPLITS = 25
 """Upper bound of eq. 3.42: the sessions in the thesis's development set."""
 
 
@@ -95,10 +95,10 @@ def thesis_plan(
     simulated = next(
         (
             n
-            for n in range(2, MOST_SPLITS + 1)
+            for n in range(2, MAX_SPLITS + 1)
             if thesis_power(n, delta, sigma_seed, seeds, alpha=alpha, seed=seed) >= power
         ),
         None,
     )
-    split_count = MOST_SPLITS if simulated is None else max(simulated, math.ceil(analytical))
-    return ThesisPlan(min(split_count, MOST_SPLITS), simulated, analytical)
+    split_count = MAX_SPLITS if simulated is None else max(simulated, math.ceil(analytical))
+    return ThesisPlan(min(split_count, MAX_SPLITS), simulated, analytical)

@@ -22,7 +22,7 @@ from edp.storage.runs import ENDED, FINISHED, IDENTITY, STATUS
 from edp.storage.seals import unsealed
 from edp.wording import typed
 
-MOST_FOLDERS = 20_000
+MAX_FOLDERS = 20_000
 """Folders that are looked into: more is a whole disk."""
 DEEPEST = 6
 """Levels below the folder."""
@@ -69,7 +69,7 @@ def list_runs(folder: str | Path) -> tuple[list[ListedRun], bool]:
         raise StorageError(f"no folder at '{top}'; give one that holds runs")
     runs, whole = [], True
     for number, path in enumerate(_folders(top)):
-        if number >= MOST_FOLDERS:
+        if number >= MAX_FOLDERS:
             whole = False
             break
         try:

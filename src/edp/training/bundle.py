@@ -53,7 +53,7 @@ ARRAYS = ("weights", "integers", "adaptation")
 """Beginnings of the names of a bundle's files of arrays."""
 SCALES = ("front.width", "code.width")
 """Weights of a predictor that scale its inputs and targets."""
-RATE, MOST_BITS, MOST_TEXT = above(0.0, 1e6), 64, 4096
+RATE, MAX_BITS, MOST_TEXT = above(0.0, 1e6), 64, 4096
 """Bounds of the ticks in a second, of the fraction of a number, and of a name or description."""
 
 
@@ -382,9 +382,9 @@ def _formats(plain: Any) -> dict[str, int]:
     formats = object_with(plain, (), "its formats")
     # A bool is an int in Python; JSON's true is no format.
     wrong = [name for name, frac in formats.items() if isinstance(frac, bool) or not isinstance(frac, int)]
-    wrong += [name for name, frac in formats.items() if name not in wrong and abs(frac) > MOST_BITS]
+    wrong += [name for name, frac in formats.items() if name not in wrong and abs(frac) > MAX_BITS]
     if wrong:
-        raise ValueError(f"the format of '{wrong[0][:40]}' is no integer of at most {MOST_BITS} bits")
+        raise ValueError(f"the format of '{wrong[0][:40]}' is no integer of at most {MAX_BITS} bits")
     return formats
 
 

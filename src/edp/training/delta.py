@@ -41,7 +41,7 @@ EACH_BYTES = 200
 """Of the name, shape and place of an array in the file, about."""
 Eighths = NDArray[np.int8]
 Cut = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
-MOST_BITS, LEAST_BITS = 8, 4
+MAX_BITS, MIN_BITS = 8, 4
 """Of a number of a whole matrix; with fewer than the least, its largest singular values alone say more."""
 
 
@@ -51,10 +51,10 @@ class Scaled:
 
     numbers: Eighths
     scales: NDArray[np.float32]
-    bits: int = MOST_BITS
+    bits: int = MAX_BITS
 
     @staticmethod
-    def of(matrix: NDArray[np.float64], bits: int = MOST_BITS) -> Scaled:
+    def of(matrix: NDArray[np.float64], bits: int = MAX_BITS) -> Scaled:
         """Return the nearest scaled matrix."""
         steps = 2 ** (bits - 1) - 1
         scales = (np.abs(matrix).max(axis=1) / steps).astype(np.float32)
@@ -65,7 +65,7 @@ class Scaled:
     def packed(self) -> NDArray[np.uint8]:
         """Return the integers without their unused bits."""
         raised = (self.numbers.astype(np.int16) + 2 ** (self.bits - 1)).astype(np.uint8)
-        planes = np.unpackbits(raised.reshape(-1, 1), axis=1)[:, MOST_BITS - self.bits :]
+        planes = np.unpackbits(raised.reshape(-1, 1), axis=1)[:, MAX_BITS - self.bits :]
         return np.packbits(planes)
 
     @staticmethod
@@ -73,7 +73,7 @@ class Scaled:
         """Create a scaled matrix from the bytes of `packed`."""
         count = len(scales) * columns
         planes = np.unpackbits(data, count=count * bits).reshape(count, bits)
-        raised = np.packbits(np.pad(planes, ((0, 0), (MOST_BITS - bits, 0))), axis=1)[:, 0].astype(np.int16)
+        raised = np.packbits(np.pad(planes, ((0, 0), (MAX_BITS - bits, 0))), axis=1)[:, 0].astype(np.int16)
         return Scaled((raised - 2 ** (bits - 1)).astype(np.int8).reshape(len(scales), columns), scales, bits)
 
     @property
@@ -152,7 +152,7 @@ def delta_of(
             matrices[name] = change.reshape(len(change), -1)
     if left < 0:
         raise BundleError(f"{most_bytes:,} bytes do not hold the changed vectors of this network; allow more")
-    for bits in range(MOST_BITS, LEAST_BITS - 1, -1):
+    for bits in range(MAX_BITS, MIN_BITS - 1, -1):
         needed = sum(-(-matrix.size * bits // 8) + 4 * len(matrix) + 2 * EACH_BYTES for matrix in matrices.values())
         if needed <= left:
             coarse = {name: Scaled.of(matrix, bits) for name, matrix in matrices.items()}
@@ -263,7 +263,7 @@ def _matrices(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, object], 
         if not isinstance(shape, list) or len(shape) != 2 or not all(type(one) is int for one in shape):
             raise BundleError(f"{where} is damaged: '{name}' lacks its shape")
         columns, bits = shape
-        if not (0 < columns <= MOST_BYTES and LEAST_BITS <= bits <= MOST_BITS):
+        if not (0 < columns <= MOST_BYTES and MIN_BITS <= bits <= MAX_BITS):
             raise BundleError(f"{where} is damaged: '{name}' has {columns} columns of {bits} bits")
         scales = name.replace(":", "s:", 1)
         rows = len(arrays.get(scales, ()))

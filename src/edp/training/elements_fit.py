@@ -26,7 +26,7 @@ STEP = 1e-20
 """Imaginary step: so small that its square is nothing beside one."""
 MOST_TICKS = 4096
 """Of a run where no length is set: each tick of a pass is interpreted, some tenth of a millisecond."""
-MOST_VALUES = 20_000_000
+MAX_VALUES = 20_000_000
 """Complex answers of all lanes that are kept in a pass, 0.3 GB; with more runs, evenly chosen ones are fitted."""
 FTOL = 1e-5
 """Relative decrease of the cost in the last step."""
@@ -65,7 +65,7 @@ class LumpedProblem:
                 f"{typed(longest / twin.channels.rate_hz)} s; shorten twin.length_s, to no less than two ticks"
             )
         lanes = len(twin.table) + self.hidden
-        affordable = max(1, MOST_VALUES // (lanes * ticks * len(twin.channels.answers)))
+        affordable = max(1, MAX_VALUES // (lanes * ticks * len(twin.channels.answers)))
         if len(windows) > affordable:
             windows = [windows[i] for i in np.linspace(0, len(windows) - 1, affordable).round().astype(int)]
         runs = MeasuredWindows.read(windows, ticks)

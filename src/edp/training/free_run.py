@@ -26,10 +26,10 @@ from edp.networks.twin.recurrent_cell import CellWeights
 from edp.networks.twin.residual import ResidualTwin
 from edp.networks.twin.windows import MeasuredWindows, random_windows
 from edp.settings.bounds import (
-    MOST_BATCH,
-    MOST_NAMES,
+    MAX_BATCH,
+    MAX_NAMES,
+    MAX_UPDATES,
     MOST_TICKS,
-    MOST_UPDATES,
     SEED,
     SHARE,
     WEIGHT,
@@ -46,7 +46,7 @@ from edp.training.optimizers import OptimizerSpec, Soap
 from edp.wording import setting_text, typed
 
 Array = NDArray[np.float32]
-MOST_LENGTH_S = 600.0
+MAX_LENGTH_S = 600.0
 """Of a free run that is trained on; gradients over longer ones say nothing more."""
 
 
@@ -104,13 +104,13 @@ class FreeRunSpec:
     patience: int = 8
 
     def __post_init__(self) -> None:
-        bounds = {"seed": SEED, "lanes": integer(1, MOST_BATCH), "updates": integer(1, MOST_UPDATES)}
-        bounds |= {"lengths_s": above(0.0, MOST_LENGTH_S), "validation_s": above(0.0, MOST_LENGTH_S)}
+        bounds = {"seed": SEED, "lanes": integer(1, MAX_BATCH), "updates": integer(1, MAX_UPDATES)}
+        bounds |= {"lengths_s": above(0.0, MAX_LENGTH_S), "validation_s": above(0.0, MAX_LENGTH_S)}
         bounds |= {"measured_share": SHARE, "mixed_share": SHARE, "warmup": SHARE, "clip": WEIGHT, "delta": WEIGHT}
         bounds |= {"stroke_weight": WEIGHT, "pressure_weight": WEIGHT}
-        bounds |= {"validate_every": integer(1, MOST_UPDATES), "patience": integer(0, MOST_UPDATES)}
+        bounds |= {"validate_every": integer(1, MAX_UPDATES), "patience": integer(0, MAX_UPDATES)}
         check_bounds("free runs", self, **bounds)
-        check_count("free runs", "lengths_s", self.lengths_s, MOST_NAMES, least=1)
+        check_count("free runs", "lengths_s", self.lengths_s, MAX_NAMES, least=1)
         if len(self.lengths_s) != len(self.updates):
             raise ConfigError(
                 f"free runs: {len(self.lengths_s)} lengths_s and {len(self.updates)} updates; one number of updates "

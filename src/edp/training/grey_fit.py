@@ -32,7 +32,7 @@ FINEST = 0.02
 """Error in deviations that a fit is taken to leave: it weighs the data against what is plausible."""
 APART = 0.3
 """Spread of the further starts in prior standard deviations: far enough for another valley, near enough to simulate."""
-LEAST_GAIN = 0.01
+MIN_GAIN = 0.01
 """Share of the validation error by which finer curves must be better."""
 TRIES = 4
 """Steps, each damped more, after which a round gives up and draws other windows."""
@@ -176,7 +176,7 @@ def fit_grey_box(
         problem = GreyProblem(finer, train, carried=share * by_finer.T @ begin.information @ by_finer)
         fit = _Stages(problem, validation, seed + stretches, history).fit()
         history.updates += spec.final_rounds
-        better = fit.error < (1.0 - LEAST_GAIN) * best.error
+        better = fit.error < (1.0 - MIN_GAIN) * best.error
         best = fit if better else best
         if stretches == STRETCHES[0]:
             continue

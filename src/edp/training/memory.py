@@ -11,7 +11,7 @@ from edp.networks.predictor import Predictor
 from edp.networks.streaming import state_numbers
 from edp.storage.memory import check_setting
 from edp.training.spec import TrainingSpec
-from edp.training.validation import MOST_VALIDATED
+from edp.training.validation import MAX_VALIDATED
 
 FLOAT, DOUBLE = 4, 8
 COPIES = 6
@@ -68,7 +68,7 @@ def _batch(net: Predictor, spec: TrainingSpec) -> float:
 
 def _validation(net: Predictor, data: Prepared) -> float:
     """Return the memory of the network outputs for the validation samples, in double precision."""
-    ticks = min(sum(part.samples for part in data.validation), MOST_VALIDATED)
+    ticks = min(sum(part.samples for part in data.validation), MAX_VALIDATED)
     return 3 * DOUBLE * ticks * len(net.task.horizons) * len(net.task.targets) * (1 + net.spec.output.values)
 
 

@@ -12,7 +12,7 @@ from torch import nn
 
 from edp.errors import ConfigError
 from edp.registry import Registry
-from edp.settings.bounds import DECAY, MOST_NAMES, MOST_UPDATES, RATE, below, check_bounds, check_count, integer, shown
+from edp.settings.bounds import DECAY, MAX_NAMES, MAX_UPDATES, RATE, below, check_bounds, check_count, integer, shown
 from edp.training.eager import EagerAdamW, EagerSgd
 
 
@@ -111,7 +111,7 @@ class Discriminative:
 
     def __post_init__(self) -> None:
         check_bounds("discriminative", self, learning_rate=RATE, weight_decay=DECAY, beta1=BETA, beta2=BETA)
-        check_count("discriminative", "rates", self.rates, MOST_NAMES)
+        check_count("discriminative", "rates", self.rates, MAX_NAMES)
         if not all(RATE.holds(rate) for _, rate in self.rates):
             raise ConfigError(f"discriminative: rates = {shown(self.rates)}; {RATE.rule('rate')} must hold")
 
@@ -168,7 +168,7 @@ class Soap:
             weight_decay=DECAY,
             beta1=BETA,
             beta2=BETA,
-            refresh=integer(1, MOST_UPDATES),
+            refresh=integer(1, MAX_UPDATES),
         )
 
     def build(self, named: Iterable[tuple[str, nn.Parameter]]) -> torch.optim.Optimizer:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from edp.registry import Registry
-from edp.settings.bounds import MOST_EPOCHS, SHARE, below, check_bounds, integer
+from edp.settings.bounds import MAX_EPOCHS, SHARE, below, check_bounds, integer
 
 
 @dataclass
@@ -134,7 +134,7 @@ class Plateau:
 
     def __post_init__(self) -> None:
         check_bounds(
-            "schedule", self, shrink=SHARE, patience=integer(0, MOST_EPOCHS), threshold=below(0.0, 1.0), floor=SHARE
+            "schedule", self, shrink=SHARE, patience=integer(0, MAX_EPOCHS), threshold=below(0.0, 1.0), floor=SHARE
         )
 
     def factor(self, progress: float, state: ScheduleState) -> float:

@@ -17,10 +17,10 @@ from edp.networks.losses.base import Penalty
 from edp.networks.outputs import OUTPUTS
 from edp.networks.predictor import ModelSpec
 from edp.settings.bounds import (
-    MOST_EPOCHS,
-    MOST_THREADS,
-    MOST_UPDATES,
-    MOST_WEIGHT,
+    MAX_EPOCHS,
+    MAX_THREADS,
+    MAX_UPDATES,
+    MAX_WEIGHT,
     SEED,
     above,
     check_bounds,
@@ -34,9 +34,9 @@ from edp.training.optimizers import AdamW, OptimizerSpec
 from edp.training.schedules import Cosine, ScheduleSpec
 
 REFITS = ("none", "best", "whole")
-MOST_POWER = 4.0
+MAX_POWER = 4.0
 """Of the weights of outputs: spreads of targets a thousand times apart then give weights 1e12 times apart."""
-MOST_AUGMENTATIONS = 16
+MAX_AUGMENTATIONS = 16
 GRADIENT_CHUNK, GRADIENT_LANES, GRADIENT_UPDATES = 64, 16, 200
 """Ticks and lanes of an update of a committee, and updates an epoch. Nothing recurs in it, so short chunks do, and
 little data have chunks enough."""
@@ -102,16 +102,16 @@ class TrainingSpec:
         check_bounds(
             "training",
             self,
-            weight_power=span(-MOST_POWER, MOST_POWER),
+            weight_power=span(-MAX_POWER, MAX_POWER),
             horizon_decay=above(0.0, 1.0),
-            epochs=integer(1, MOST_EPOCHS),
-            updates=integer(0, MOST_UPDATES),
-            patience=integer(0, MOST_EPOCHS),
-            clip_norm=above(0.0, MOST_WEIGHT),
+            epochs=integer(1, MAX_EPOCHS),
+            updates=integer(0, MAX_UPDATES),
+            patience=integer(0, MAX_EPOCHS),
+            clip_norm=above(0.0, MAX_WEIGHT),
             seed=SEED,
-            threads=integer(0, MOST_THREADS),
+            threads=integer(0, MAX_THREADS),
         )
-        check_count("training", "augmentations", self.augmentations, MOST_AUGMENTATIONS)
+        check_count("training", "augmentations", self.augmentations, MAX_AUGMENTATIONS)
         if self.refit not in REFITS:
             raise ConfigError(f"training: refit = '{self.refit}'; {_either(REFITS)} must hold")
         if self.device not in ("auto", "cpu", "cuda"):

@@ -18,7 +18,7 @@ from edp.networks.running import answer_pieces, stream_answers
 from edp.signals import KINDS
 from edp.training.spec import TrainingSpec
 
-MOST_VALIDATED = 1 << 20
+MAX_VALIDATED = 1 << 20
 """Ticks that judge an epoch and calibrate intervals, about; three hours at 100 Hz."""
 STARTS_A_STRETCH = 100
 """Times the start-up of a network that a stretch is long: of its ticks one per cent are not judged."""
@@ -45,12 +45,12 @@ def validation_scores(
 
 
 def select_evaluated(net: Predictor, series: Sequence[Series], spec: TrainingSpec) -> list[Series]:
-    """Return the data that evaluate epochs: the series, or evenly spaced segments beyond `MOST_VALIDATED` samples.
+    """Return the data that evaluate epochs: the series, or evenly spaced segments beyond `MAX_VALIDATED` samples.
 
     Else an epoch of a fixed number of updates would take hours to judge where the store is large.
     """
     start_up = max(spec.chunks.burn_in, net.spec.window) + net.task.max_horizon
-    return spread_series(series, STARTS_A_STRETCH * start_up, MOST_VALIDATED)
+    return spread_series(series, STARTS_A_STRETCH * start_up, MAX_VALIDATED)
 
 
 def calibrate(net: Predictor, series: Sequence[Series], spec: TrainingSpec) -> None:

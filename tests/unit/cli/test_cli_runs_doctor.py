@@ -89,7 +89,7 @@ def test_hostile_runs_are_damaged_and_bounded(edp, folder, monkeypatch):
     assert max(len(row["data"]) for row in rows.values()) == 200
     assert not any(name.startswith("loop") for name in rows)
     assert "\x1b" not in edp("runs", folder).out
-    monkeypatch.setattr(run_listing, "MOST_FOLDERS", 2)
+    monkeypatch.setattr(run_listing, "MAX_FOLDERS", 2)
     assert not edp("runs", folder, "--json").json["complete"]
 
 

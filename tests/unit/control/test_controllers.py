@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from edp.control.base import MOST_EVENTS, ControlFault, Controller
+from edp.control.base import MAX_EVENTS, ControlFault, Controller
 from edp.control.controllers import CONTROLLERS
 from edp.control.geometry import TipGeometry
 from edp.control.limits import LoopLimits
@@ -122,12 +122,12 @@ def test_an_observation_of_another_width_is_answered_by_the_safe_command(plant, 
 
 
 def test_the_log_of_events_is_bounded(plant, reference):
-    answers = [ControlFault("odd") if tick % 2 else np.zeros(3) for tick in range(2 * MOST_EVENTS + 100)]
+    answers = [ControlFault("odd") if tick % 2 else np.zeros(3) for tick in range(2 * MAX_EVENTS + 100)]
     controller = Scripted(plant, LoopLimits(), answers)
     controller.reset(observed(plant), reference)
     for tick in range(len(answers)):
         controller.step(observed(plant), tick)
-    assert len(controller.events) == MOST_EVENTS
+    assert len(controller.events) == MAX_EVENTS
 
 
 def test_a_start_that_cannot_be_is_refused(plant, reference):

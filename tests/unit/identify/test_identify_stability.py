@@ -7,7 +7,7 @@ import pytest
 
 from edp.testing.twins import sample_series
 from edp.training.identification.rows import TOLD, IdentifiedNumber
-from edp.training.identification.stability import LEAST_BLOCKS, MOST_BLOCKS, divided, spread
+from edp.training.identification.stability import MAX_BLOCKS, MIN_BLOCKS, divided, spread
 
 RNG = np.random.default_rng(0)
 
@@ -50,10 +50,10 @@ def test_logs_are_divided_by_recordings_else_by_time():
     _, series = sample_series(3)
     (long,) = series[:1]
     by_recording = divided([replace(long, name=str(k)) for k in range(40)], 100)
-    assert len(by_recording) == MOST_BLOCKS
+    assert len(by_recording) == MAX_BLOCKS
     assert sum(len(block) for block in by_recording) == 40
     by_time = divided(series, 100)
-    assert len(by_time) == LEAST_BLOCKS
+    assert len(by_time) == MIN_BLOCKS
     assert sum(part.samples for block in by_time for part in block) == sum(part.samples for part in series)
     assert all(part.samples >= 100 for block in by_time for part in block)
     assert divided([], 100) == divided([long], long.samples + 1) == []

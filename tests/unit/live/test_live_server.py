@@ -17,7 +17,7 @@ from websockets.sync.client import ClientConnection, connect
 from edp.errors import ConfigError
 from edp.live import LiveLayout, LiveSession, LiveTrace, Pace
 from edp.live.protocol import HEAD, PAST, ROWS
-from edp.live.server import MOST_VIEWERS, LiveServer
+from edp.live.server import MAX_VIEWERS, LiveServer
 from edp.live.viewer import Viewer
 from edp.signals import Channel, Kind
 
@@ -193,7 +193,7 @@ def test_a_source_that_runs_by_itself_is_not_steered(served):
 
 
 def test_a_stalled_viewer_loses_frames_and_nobody_else_does(served, monkeypatch):
-    monkeypatch.setattr("edp.live.viewer.MOST_WAITING", 4)
+    monkeypatch.setattr("edp.live.viewer.MAX_WAITING", 4)
     width, ticks = 4000, 300  # large rows fill the buffers of the system soon
     served.server.session = served.session = session = LiveSession(LiveLayout("t", "s", 100.0, width, []))
     narrow = socket.socket()
@@ -224,9 +224,9 @@ def test_a_stalled_viewer_loses_frames_and_nobody_else_does(served, monkeypatch)
 
 def test_a_viewer_that_leaves_is_forgotten_and_too_many_are_refused(served):
     with contextlib.ExitStack() as stack:
-        for _ in range(MOST_VIEWERS):
+        for _ in range(MAX_VIEWERS):
             stack.enter_context(served.viewer())
-        until(lambda: len(served.server.viewers) == MOST_VIEWERS)
+        until(lambda: len(served.server.viewers) == MAX_VIEWERS)
         with pytest.raises(InvalidStatus, match="503"):
             served.viewer()
     until(lambda: not served.server.viewers)

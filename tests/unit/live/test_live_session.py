@@ -12,7 +12,7 @@ from edp.live import LiveLayout, LiveSession, LiveTrace, Pace, write_session_pag
 from edp.live.layout import MOST_LABEL, label, sentence
 from edp.live.protocol import HEAD, PAST, request_of, rows_message, text_message
 from edp.live.saved import session_page
-from edp.live.session import MOST_EVENTS, MOST_TEXT
+from edp.live.session import MAX_EVENTS, MOST_TEXT
 from edp.signals import Channel, Kind
 
 
@@ -43,14 +43,14 @@ def test_a_ring_keeps_the_newest_rows_and_says_which():
 
 def test_events_are_bounded_and_numbered_on():
     session = filled(3)
-    for n in range(MOST_EVENTS + 10):
+    for n in range(MAX_EVENTS + 10):
         session.event("note", f"{n} " + "x" * 1000, "g" * 1000)
     events = session.events()
-    assert len(events) == MOST_EVENTS
-    assert events[-1].number == MOST_EVENTS + 9
+    assert len(events) == MAX_EVENTS
+    assert events[-1].number == MAX_EVENTS + 9
     assert events[0].tick == 3
     assert max(len(event.text) for event in events) == MOST_TEXT
-    assert [event.number for event in session.events(MOST_EVENTS + 8)] == [MOST_EVENTS + 8, MOST_EVENTS + 9]
+    assert [event.number for event in session.events(MAX_EVENTS + 8)] == [MAX_EVENTS + 8, MAX_EVENTS + 9]
 
 
 def test_rows_are_written_and_read_at_the_same_time():

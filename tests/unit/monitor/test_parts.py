@@ -11,7 +11,7 @@ from edp.monitor.residuals import FitMaterial
 from edp.monitor.residuals.balances import BalancesSpec
 from edp.monitor.residuals.base import residuals_of
 from edp.monitor.residuals.look_ahead import LookAheadSpec
-from edp.monitor.watches import LEAST_GROSS, BankSpec, WatchSpec, fit_watch, scale_watches
+from edp.monitor.watches import MIN_GROSS, BankSpec, WatchSpec, fit_watch, scale_watches
 from edp.recording import Recording
 from edp.signals import VOCABULARY
 from edp.testing.monitor import rig_sessions
@@ -69,7 +69,7 @@ def test_a_view_of_what_is_gross_measures_each_summary_by_itself():
     spec = WatchSpec(detector=SeparateCusumsSpec(), view="own")
     watch = fit_watch(spec, sessions, 1.0, 0)
     largest = np.sort([np.abs(session).max(axis=0) for session in sessions], axis=0)[-3]
-    np.testing.assert_allclose(1.0 / watch.matrix, np.maximum(largest, LEAST_GROSS), rtol=1e-6)
+    np.testing.assert_allclose(1.0 / watch.matrix, np.maximum(largest, MIN_GROSS), rtol=1e-6)
     gross = np.array([[40.0, 0.0], [np.nan, 40.0]])
     seen = BankSpec((watch,)).white(np.clip(gross, -6.0, 6.0), gross)
     np.testing.assert_allclose(seen, np.nan_to_num(gross) * watch.matrix, rtol=1e-6)

@@ -301,7 +301,7 @@ def test_twenty_thousand_columns_and_long_names(tmp_path):
     row = ",".join(str(i % 97) for i in range(20_000))
     path.write_text(f"time,{names}\n" + "".join(f"{i},{row[i:]}{row[:i]}\n" for i in range(12)))
     proposal = propose(path)
-    assert len(proposal.proposal.columns) == columns_module.MOST_COLUMNS
+    assert len(proposal.proposal.columns) == columns_module.MAX_COLUMNS
     assert any("come after the first columns" in note for note in proposal.notes)
     path.write_text(f"time,{'a' * 100_000}\n0,1\n1,2\n2,3\n")
     with pytest.raises(DataError, match=r"at most 256 are read; rename it"):

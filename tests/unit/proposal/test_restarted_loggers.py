@@ -82,7 +82,7 @@ def test_what_stands_behind_the_table_is_left_out_and_told(tmp_path, behind, end
     "bad",
     [
         ["12.0,0.5"],  # numbers in too few cells are damage, as elsewhere
-        [*["word"] * (csv_leftovers.MOST_LAST_LINES + 1)],  # a text behind a table is no short end of it
+        [*["word"] * (csv_leftovers.MAX_LAST_LINES + 1)],  # a text behind a table is no short end of it
         [NAMES.replace("s_arm", "s_bucket"), *rows(20, 900_000)],  # another table
     ],
 )

@@ -48,7 +48,7 @@ def test_a_step_keeps_the_balance_of_energy(drooping):
         before, load = plant[at.ENGINE_SPEED], engine.load_power(row, plant)
         engine.turn(row, plant, 0.01)
         gained = 0.5 * plant[at.ENGINE_ENERGY] * (plant[at.ENGINE_SPEED] ** 2 - before**2)
-        assert plant[at.ENGINE_SPEED] > engine.LEAST_SPEED
+        assert plant[at.ENGINE_SPEED] > engine.MIN_SPEED
         assert gained == pytest.approx(0.01 * (engine_power(plant) - load), rel=1e-9, abs=1e-6)
         assert plant[at.MAX_FLOW] == plant[at.RATED_FLOW] * plant[at.ENGINE_SPEED]
 
@@ -70,7 +70,7 @@ def test_a_stalled_engine_is_held_at_its_least_speed(drooping):
     for _ in range(2000):
         engine.turn(row_of(2e8, 1.0), plant, 0.01)
         assert np.isfinite(plant[at.ENGINE_SPEED])
-    assert plant[at.ENGINE_SPEED] == engine.LEAST_SPEED
+    assert plant[at.ENGINE_SPEED] == engine.MIN_SPEED
 
 
 def test_without_droop_nothing_turns():

@@ -12,7 +12,7 @@ from edp.signals import FAULT_CHANNELS
 from edp.sim import DataSetSpec, Scenario, Simulation, load_machine, read_scenario_file, simulate
 from edp.sim.environment import EnvironmentSpec, ExcavatorEnv
 from edp.sim.faults import FAULTS, FaultSpec, MachineFault, faults_of, ladder, parse_fault
-from edp.sim.faults.base import MOST_FAULTS
+from edp.sim.faults.base import MAX_FAULTS
 from edp.sim.faults.course import numbers_of, shares_at
 from edp.sim.machine import layout as at
 from edp.sim.machine.parameters import pack
@@ -36,7 +36,7 @@ def faulty_numbers(text, machine="M22"):
 def test_the_registry_has_the_kinds_of_machines_and_of_sensors():
     of_machine = [name for name, kind in FAULTS.items() if isinstance(kind, MachineFault)]
     assert (len(of_machine), len(FAULTS)) == (18, 38)
-    assert len(FAULT_CHANNELS) == MOST_FAULTS
+    assert len(FAULT_CHANNELS) == MAX_FAULTS
     every = list(ladder())
     assert {fault.kind for fault in every} == set(FAULTS)
     assert len(every) == sum(max(1, len(kind.ladder)) for kind in FAULTS.values())

@@ -99,7 +99,7 @@ def test_long_logs_are_fitted_in_as_many_runs_as_the_memory_holds(tanks, monkeyp
     twin, _, series = tanks
     monkeypatch.setattr("edp.training.elements_fit.MOST_TICKS", 20)
     assert LumpedProblem(twin, [series]).truth.shape[:2] == (8, 20)
-    monkeypatch.setattr("edp.training.elements_fit.MOST_VALUES", 3 * 12 * 20 * 2)
+    monkeypatch.setattr("edp.training.elements_fit.MAX_VALUES", 3 * 12 * 20 * 2)
     assert LumpedProblem(twin, [series]).truth.shape[:2] == (3, 20)
 
 

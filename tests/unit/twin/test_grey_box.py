@@ -186,7 +186,7 @@ def test_free_runs_choose_how_many_stretches_an_opening_curve_has(bench):
 @pytest.mark.long
 def test_a_curve_that_gains_too_little_stays_coarse(bench, monkeypatch):
     machine, runs = bench
-    monkeypatch.setattr(grey_fit, "LEAST_GAIN", 1.0)
+    monkeypatch.setattr(grey_fit, "MIN_GAIN", 1.0)
     arrays = {"numbers": machine.numbers.astype(np.float32), "full": machine.full}
     fit = replace(BENCH.fit, lengths_s=(0.1,), rounds=(1,), starts=1)
     begun = replace(BENCH, stretches=0, fit=fit).build(machine.channels, machine.scales, arrays)

@@ -20,7 +20,7 @@ from edp.errors import ConfigError
 from edp.settings.bounds import above, check_bounds, integer, span
 
 Array = NDArray[np.float64]
-MOST_SUM = 0.1
+MAX_SUM = 0.1
 """Most speed (m/s) that an integral may add: a blocked cylinder must not wind it up."""
 
 
@@ -118,7 +118,7 @@ class InversionController(Controller):
         asked = np.where(np.abs(speed) > self.spec.rest_m_s, self._solve_levers(speed, self._row), 0.0)
         free = (asked > self.limits.lever_low) & (asked < self.limits.lever_high)
         total = self._sum + self.spec.integral * error / self.plant.rate_hz
-        self._sum = np.where(free, np.clip(total, -MOST_SUM, MOST_SUM), self._sum)
+        self._sum = np.where(free, np.clip(total, -MAX_SUM, MAX_SUM), self._sum)
         self._solution = asked
         return asked
 

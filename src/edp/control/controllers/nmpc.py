@@ -34,7 +34,7 @@ from edp.settings.bounds import above, check_bounds, check_count, integer, span
 from edp.wording import typed
 
 Array = NDArray[np.float64]
-MOST_BLOCKS, MOST_BLOCK_TICKS = 30, 1_000
+MAX_BLOCKS, MAX_BLOCK_TICKS = 30, 1_000
 STEP_M_S = 0.01
 """By which a speed is changed to see its effect: far above single precision, far below what bends the valve curves."""
 NEAR_LIMIT = 0.1
@@ -43,7 +43,7 @@ NO_LIMIT = -1e30
 """What DAQP takes for no limit."""
 SOFT = 8
 """DAQP's mark of a constraint that may be violated at a price."""
-LEAST_ANSWER, GOOD_ANSWER = 0.1, 0.5
+MIN_ANSWER, GOOD_ANSWER = 0.1, 0.5
 """Shares of a speed that must be there where a plan ends, and that better are: short of them it sees no effect."""
 ATTITUDE_M, LOADED_ATTITUDE_M = 1.0, 2.0
 """Of most twins, and of those that are told of forces: on lines that were not judged 2 held the attitude in loam better
@@ -92,11 +92,11 @@ class PredictiveControl:
     fallback: bool = True
 
     def __post_init__(self) -> None:
-        check_count("controller 'nmpc'", "blocks", self.blocks, MOST_BLOCKS, least=1)
+        check_count("controller 'nmpc'", "blocks", self.blocks, MAX_BLOCKS, least=1)
         check_bounds(
             "controller 'nmpc'",
             self,
-            blocks=integer(1, MOST_BLOCK_TICKS),
+            blocks=integer(1, MAX_BLOCK_TICKS),
             along=above(0.0, 1e3),
             change=above(0.0, 1e6),
             feedforward=span(0.0, 1e6),
@@ -170,14 +170,14 @@ class NmpcController(Controller):
         """Raise an error for a plan shorter than the machine's response time, simulated by the twin from steady state.
 
         Raises:
-            ConfigError: at its end less than `LEAST_ANSWER` of a speed is there, so that it would run away.
+            ConfigError: at its end less than `MIN_ANSWER` of a speed is there, so that it would run away.
         """
         self.model.begin(measured)
         shares = response(self.model, measured, self._valves, self._slew)
         if shares is None:
             return
         weakest, ticks = shares.min(axis=1), self._moves.ticks
-        if weakest[min(ticks, len(weakest)) - 1] >= LEAST_ANSWER:
+        if weakest[min(ticks, len(weakest)) - 1] >= MIN_ANSWER:
             return
         # From then on it stays.
         enough = len(weakest) + 1 - int(np.argmax(weakest[::-1] < GOOD_ANSWER))

@@ -18,7 +18,7 @@ from edp.control.valve_map import ValveMap
 from edp.settings.bounds import check_bounds, span
 
 Array = NDArray[np.float64]
-MOST_SUM = 0.1
+MAX_SUM = 0.1
 """Most speed (m/s) that an integral may add: a blocked cylinder must not wind it up."""
 
 
@@ -95,7 +95,7 @@ class PiController(Controller):
         # No integration at a saturated lever, which could not follow.
         free = (asked > self.limits.lever_low) & (asked < self.limits.lever_high)
         total = self._sum + self.spec.integral * error / self.plant.rate_hz
-        self._sum = np.where(free, np.clip(total, -MOST_SUM, MOST_SUM), self._sum)
+        self._sum = np.where(free, np.clip(total, -MAX_SUM, MAX_SUM), self._sum)
         return asked
 
     def fallback(self, measured: Array, tick: int, reason: str) -> Array:

@@ -10,15 +10,15 @@ from pathlib import Path
 from edp.errors import ConfigError, DataError
 from edp.storage.archives import ArchiveLimits, ZipReader, printable
 
-MOST_FILE = 1 << 28
+MAX_FILE = 1 << 28
 """Bytes of the file: tools pack solvers and tables of some 100 MB."""
-MOST_UNPACKED = 1 << 29
+MAX_UNPACKED = 1 << 29
 """Bytes of all entries: a bomb announces thousands of times its size."""
-MOST_XML = 1 << 24
+MAX_XML = 1 << 24
 """Bytes of ``modelDescription.xml``: some 100,000 variables."""
 MOST_ENTRIES = 10_000
 DESCRIPTION = "modelDescription.xml"
-_LIMITS = ArchiveLimits(MOST_FILE, MOST_UNPACKED, MOST_ENTRIES)
+_LIMITS = ArchiveLimits(MAX_FILE, MAX_UNPACKED, MOST_ENTRIES)
 
 
 class FmuArchive:
@@ -55,8 +55,8 @@ class FmuArchive:
         size = self._sizes.get(DESCRIPTION)
         if size is None:
             raise DataError(f"FMU '{self.path}' has no {DESCRIPTION}; give a file that an FMI tool exported")
-        if size > MOST_XML:
-            raise DataError(f"FMU '{self.path}': {DESCRIPTION} has {size:,} bytes; at most {MOST_XML:,} are read")
+        if size > MAX_XML:
+            raise DataError(f"FMU '{self.path}': {DESCRIPTION} has {size:,} bytes; at most {MAX_XML:,} are read")
         with self._open() as archive:
             return archive.read(DESCRIPTION)
 

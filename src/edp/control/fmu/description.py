@@ -17,8 +17,8 @@ from edp.control.fmu.archive import DESCRIPTION
 from edp.errors import DataError
 from edp.storage.archives import printable
 
-MOST_VARIABLES = 100_000
-MOST_ELEMENTS = 1_000_000
+MAX_VARIABLES = 100_000
+MAX_ELEMENTS = 1_000_000
 """Each takes some 200 bytes of memory, and four bytes of the file suffice for one."""
 DEEPEST = 50
 """Of elements; those of the standard reach 6, annotations of tools somewhat more."""
@@ -120,9 +120,9 @@ def _tree(content: bytes, where: str) -> ET.Element:
 
     def begin(tag: str, attributes: dict[str, str]) -> None:
         depth[0], count[0] = depth[0] + 1, count[0] + 1
-        if depth[0] > DEEPEST or count[0] > MOST_ELEMENTS:
+        if depth[0] > DEEPEST or count[0] > MAX_ELEMENTS:
             raise DataError(
-                f"{where}: elements of {DESCRIPTION} are more than {DEEPEST} deep or {MOST_ELEMENTS:,}; do not use "
+                f"{where}: elements of {DESCRIPTION} are more than {DEEPEST} deep or {MAX_ELEMENTS:,}; do not use "
                 "this file"
             )
         builder.start(tag, attributes)
@@ -162,8 +162,8 @@ def _step(text: str, where: str) -> float:
 def _variables(root: ET.Element, version: int, where: str) -> dict[str, FmuVariable]:
     listed = root.find("ModelVariables")
     entries = [] if listed is None else list(listed)
-    if len(entries) > MOST_VARIABLES:
-        raise DataError(f"{where} has {len(entries):,} variables; at most {MOST_VARIABLES:,} are read")
+    if len(entries) > MAX_VARIABLES:
+        raise DataError(f"{where} has {len(entries):,} variables; at most {MAX_VARIABLES:,} are read")
     units, types = _units(root), _types(root, version)
     variables: dict[str, FmuVariable] = {}
     for entry in entries:

@@ -13,7 +13,7 @@ from edp.control.plant import STROKES, VELOCITIES
 from edp.control.tasks import TASKS, TaskSpec
 from edp.errors import ConfigError, closest
 from edp.networks.twin import Twin
-from edp.settings.bounds import MOST_SEED, above, check_bounds, integer, span
+from edp.settings.bounds import MAX_SEED, above, check_bounds, integer, span
 from edp.signals import TABLE_A1, Kind
 from edp.sim.environment import EnvironmentSpec
 from edp.wording import setting_text, typed
@@ -72,7 +72,7 @@ class LearningSpec:
     authority: float = 0.2
     reward: RewardWeights = field(default_factory=RewardWeights)
     lost_m: float = 0.5
-    seeds: tuple[int, int] = (FIRST_SEED, MOST_SEED)
+    seeds: tuple[int, int] = (FIRST_SEED, MAX_SEED)
     simulator: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -88,7 +88,7 @@ class LearningSpec:
             past_s=span(0.0, 10.0),
             authority=above(0.0, 2.0),
             lost_m=above(0.0, 100.0),
-            seeds=integer(0, MOST_SEED),
+            seeds=integer(0, MAX_SEED),
         )
         if len(self.seeds) != 2 or self.seeds[0] > self.seeds[1]:
             raise ConfigError(f"task environment: seeds = {list(self.seeds)}; the lowest and the highest must hold")

@@ -15,7 +15,7 @@ SPEED_M_S = 0.1
 """That is asked for: clear of the dead bands, far below what the pumps can give."""
 SETTLED_S, MEAN_S = 1.0, 0.2
 """After which a speed counts as reached, and the time before over which it is averaged."""
-LEAST_OF_ASKED = 0.2
+MIN_OF_ASKED = 0.2
 """Of what was asked for: a twin that reaches less has no answer whose time could be told."""
 
 
@@ -44,6 +44,6 @@ def response(model: TwinModel, measured: Array, valves: SpeedToLever, slew: Arra
     )
     speeds = ways * np.diff(moved, axis=0, prepend=strokes[None]) * plant.rate_hz
     reached = speeds[-max(1, round(MEAN_S * plant.rate_hz)) :].mean(axis=0)
-    if not np.isfinite(speeds).all() or reached.min() < LEAST_OF_ASKED * SPEED_M_S:
+    if not np.isfinite(speeds).all() or reached.min() < MIN_OF_ASKED * SPEED_M_S:
         return None
     return np.asarray(speeds / reached)

@@ -52,7 +52,7 @@ _NEAR_PAST = range(21)
 _LONG_PAST = range(61)
 _SPARSE_PAST = (0, 1, 2, 4, 7, 12, 20)
 """Delays of all others: the model has dozens of channels, and its solution grows with the third power of the taps."""
-_MOST_TRUSTED = 40
+_MAX_TRUSTED = 40
 """Strongest trusted channels in a model, for the same reason."""
 _PARTNERS = 2
 
@@ -87,7 +87,7 @@ def find_leaks(
     lead, _ = peaks(correlations, -reach, reach)
 
     def judge(channel: int) -> Flag | None:
-        base = sorted((k for k in trusted if k != channel), key=lambda k: -strength[channel, k])[:_MOST_TRUSTED]
+        base = sorted((k for k in trusted if k != channel), key=lambda k: -strength[channel, k])[:_MAX_TRUSTED]
         sources = list(dict.fromkeys([*base[:_PARTNERS], *(k for k in targets if k != channel)]))
         # a channel far ahead of its source is looked at as if it came at a moderate distance
         ahead = {k: max(far, min(reach - max(near), -int(lead[channel, k]) + 2)) for k in sources}

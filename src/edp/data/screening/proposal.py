@@ -21,7 +21,7 @@ from edp.data.screening.result import (
     Proposal,
     Value,
 )
-from edp.data.screening.stability import ABOVE_CHANCE, LEAST_INFORMATION, Relations
+from edp.data.screening.stability import ABOVE_CHANCE, MIN_INFORMATION, Relations
 from edp.data.screening.table import CandidateTable
 
 NEGLIGIBLE = 0.002
@@ -111,7 +111,7 @@ def _noise(evidence: ScreeningEvidence, live_index: int, name: str) -> Flag:
         text = f"{100 * between:.0f} % of its variance lies between recordings; within them {correlation_text}"
         return Flag(name, FlagKind.ARTEFACT, value=between, evidence=text)
     information = float(np.nan_to_num(relations.information[live_index]).max())
-    if value > ABOVE_CHANCE * chance or information > LEAST_INFORMATION:
+    if value > ABOVE_CHANCE * chance or information > MIN_INFORMATION:
         spread = float(evidence.pieces[:, live_index].std(ddof=1))
         text = (
             f"relates to targets in some pieces, not in all alike (correlation {value:.2f} with deviation {spread:.2f} "

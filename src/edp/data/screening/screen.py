@@ -48,7 +48,7 @@ SHARES = {
     "linear value": 0.05,
 }
 """Stages in order, and about which share of the time each takes."""
-MOST_RANKED = 1 << 20
+MAX_RANKED = 1 << 20
 """Rows that Spearman's correlation is of, evenly spread."""
 _SHIFTS = 6
 """Other pieces with which each piece is paired for chance."""
@@ -136,7 +136,7 @@ def _matrices(table: CandidateTable, spec: ScreeningSpec, clock: _Clock) -> Matr
         pearson = correlation([some_columns(stretch, live.tolist()) for stretch in stretches])
         tell("correlation", 0.2)
         # Beyond, the error of a rank correlation is a thousandth.
-        ranks = rank_columns(table.sample(MOST_RANKED)[:, live])
+        ranks = rank_columns(table.sample(MAX_RANKED)[:, live])
         tell("correlation", 0.8)
         spearman = correlation([ranks])
         # As large as the table; the next stages need the room.

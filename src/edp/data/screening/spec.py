@@ -5,17 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from edp.errors import ConfigError
-from edp.settings.bounds import MOST_NAMES, SEED, above, between, check_bounds, check_count, integer
+from edp.settings.bounds import MAX_NAMES, SEED, above, between, check_bounds, check_count, integer
 
 # Rows that estimates rest on: errors of information and rank estimates fall with their root, and time grows at least
 # in proportion (of nearest neighbours, ranks and trees); a million is far beyond what any of them gains from.
-MOST_SAMPLES = 1_000_000
-MOST_TREES = 10_000
-MOST_REPEATS = 1_000
-MOST_PIECES = 10_000
-MOST_NEIGHBOURS = 100
+MAX_SAMPLES = 1_000_000
+MAX_TREES = 10_000
+MAX_REPEATS = 1_000
+MAX_PIECES = 10_000
+MAX_NEIGHBOURS = 100
 # A minute and a half at 100 Hz, to both sides, for each pair of channels and target.
-MOST_LAG = 10_000
+MAX_LAG = 10_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,11 +44,11 @@ class ForestSpec:
         check_bounds(
             "screening.forest",
             self,
-            trees=integer(1, MOST_TREES),
-            samples=integer(1, MOST_SAMPLES),
-            tests=integer(1, MOST_SAMPLES),
-            repeats=integer(1, MOST_REPEATS),
-            leaf=integer(1, MOST_SAMPLES),
+            trees=integer(1, MAX_TREES),
+            samples=integer(1, MAX_SAMPLES),
+            tests=integer(1, MAX_SAMPLES),
+            repeats=integer(1, MAX_REPEATS),
+            leaf=integer(1, MAX_SAMPLES),
             share=above(0.0, 1.0),
             held_out=above(0.0, 0.8),
         )
@@ -95,20 +95,20 @@ class ScreeningSpec:
 
     def __post_init__(self) -> None:
         shares = dict.fromkeys(("collinear", "copy", "level"), between(0.0, 1.0))
-        rows = dict.fromkeys(("information_samples", "rank_samples", "piece_samples"), integer(100, MOST_SAMPLES))
+        rows = dict.fromkeys(("information_samples", "rank_samples", "piece_samples"), integer(100, MAX_SAMPLES))
         check_bounds(
             "screening",
             self,
-            horizon=integer(0, MOST_LAG),
-            max_lag=integer(20, MOST_LAG),
-            pieces=integer(4, MOST_PIECES),
-            neighbours=integer(1, MOST_NEIGHBOURS),
+            horizon=integer(0, MAX_LAG),
+            max_lag=integer(20, MAX_LAG),
+            pieces=integer(4, MAX_PIECES),
+            neighbours=integer(1, MAX_NEIGHBOURS),
             seed=SEED,
             **rows,
             **shares,
         )
         for name in ("targets", "candidates", "trusted"):
-            check_count("screening", name, getattr(self, name), MOST_NAMES)
+            check_count("screening", name, getattr(self, name), MAX_NAMES)
         if self.horizon > self.max_lag:
             raise ConfigError(
                 f"screening.horizon = {self.horizon} is beyond max_lag = {self.max_lag}; raise max_lag to see it"

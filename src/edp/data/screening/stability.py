@@ -160,9 +160,9 @@ class Relations:
 
 ABOVE_CHANCE = 1.5
 """A correlation counts from this multiple of the largest one between unrelated pieces."""
-LEAST_INFORMATION = 0.02
+MIN_INFORMATION = 0.02
 """Mutual information below this many nat is not worth a channel, however certain."""
-LEAST_CORRELATION = 0.03
+MIN_CORRELATION = 0.03
 """The same for the correlation at the best lag."""
 CLEARLY = 3.0
 """Times the largest correlation between unrelated pieces at which a relation is clear."""
@@ -200,8 +200,8 @@ def relations_of(lagged: Lagged, places: NDArray[np.int64], metrics: Metrics, le
         # all draws of chance, less will do.
         sure = (np.abs(linear) > ABOVE_CHANCE * chance) & (linear_t > bound)
         clear = (np.abs(linear) > CLEARLY * chance) & (linear_t > float(stdtrit(count - 1, 0.995)))
-        by_lag = (np.abs(linear) > LEAST_CORRELATION) & (sure | clear)
-        by_information = (information > LEAST_INFORMATION) & (information_t > bound_information)
+        by_lag = (np.abs(linear) > MIN_CORRELATION) & (sure | clear)
+        by_information = (information > MIN_INFORMATION) & (information_t > bound_information)
     return Relations(linear, chance.copy(), linear_t, information, information_t, by_lag | by_information)
 
 

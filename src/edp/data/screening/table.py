@@ -13,13 +13,13 @@ from edp.data.gathered import on_demand, some_columns
 from edp.data.screening.result import Array
 from edp.data.screening.spec import ScreeningSpec
 from edp.errors import DataError, closest
-from edp.recording import MOST_ROWS, FloatArray, Recording, spread_stretches
+from edp.recording import MAX_ROWS, FloatArray, Recording, spread_stretches
 from edp.signals import TABLE_A1, Kind
 from edp.wording import typed
 
-LEAST_LAGS, LAGS_A_STRETCH = 5, 40
+MIN_LAGS, LAGS_A_STRETCH = 5, 40
 """Largest lags that a recording is long at least, and that a stretch of a large data set is."""
-MOST_PIECES = 24
+MAX_PIECES = 24
 """Beyond, several recordings form a piece."""
 _GROUPS = {
     "CylVels": "cylinder velocity",
@@ -219,7 +219,7 @@ def _usual_targets(recording: Recording) -> tuple[str, ...]:
 def _long_enough(recordings: Sequence[Recording], max_lag: int) -> tuple[Sequence[Recording], tuple[str, ...]]:
     """Return the recordings of at least five times the largest lag, and the names of the others."""
     # A correlation at the largest lag then rests on four fifths of the rows at least.
-    least = LEAST_LAGS * max_lag
+    least = MIN_LAGS * max_lag
     long = [recording for recording in recordings if recording.samples >= least]
     short = tuple(recording.name for recording in recordings if recording.samples < least)
     if sum(recording.samples for recording in long) < 4 * least:
@@ -251,7 +251,7 @@ def _pieces(names: Sequence[str], columns: Sequence[FloatArray], spec: Screening
     if len(columns) >= spec.pieces:
         # lagged covariances of all pairs are held for every piece: a gigabyte at most
         each = 4 * (2 * spec.max_lag + 1) * columns[0].shape[1] ** 2
-        per = -(-len(columns) // max(spec.pieces, min(MOST_PIECES, int(1e9 / each))))
+        per = -(-len(columns) // max(spec.pieces, min(MAX_PIECES, int(1e9 / each))))
         for start in range(0, len(columns), per):
             label = names[start] if per == 1 else f"{names[start]} to {names[min(start + per, len(names)) - 1]}"
             pieces.append(Piece(label, tuple(columns[start : start + per])))
@@ -267,15 +267,15 @@ def _pieces(names: Sequence[str], columns: Sequence[FloatArray], spec: Screening
 
 
 def _thin_segments(pieces: tuple[Piece, ...], max_lag: int) -> tuple[Piece, ...]:
-    """Return segments with about `MOST_ROWS` rows in total, as evenly spaced parts of each recording in memory."""
+    """Return segments with about `MAX_ROWS` rows in total, as evenly spaced parts of each recording in memory."""
     lengths = [len(stretch) for piece in pieces for stretch in piece.stretches]
-    if sum(lengths) <= MOST_ROWS:
+    if sum(lengths) <= MAX_ROWS:
         return pieces
     owners = [p for p, piece in enumerate(pieces) for _ in piece.stretches]
     whole = [stretch for piece in pieces for stretch in piece.stretches]
     stretches_of_piece: list[list[FloatArray]] = [[] for _ in pieces]
     for i, start, stop in spread_stretches(lengths, LAGS_A_STRETCH * max_lag):
         # Rest at the end of a recording may be too short for the lags.
-        if stop - start >= LEAST_LAGS * max_lag:
+        if stop - start >= MIN_LAGS * max_lag:
             stretches_of_piece[owners[i]].append(np.ascontiguousarray(whole[i][start:stop]))
     return tuple(Piece(piece.name, tuple(own)) for piece, own in zip(pieces, stretches_of_piece, strict=True) if own)

@@ -17,7 +17,7 @@ from edp.ir.w8a16.layers import QGather
 
 WORK = {Number.FLOAT: "work", Number.INT16: "work16", Number.INT32: "work32"}
 """Work memories."""
-MOST_COPIES = 8
+MAX_COPIES = 8
 """Runs of neighbouring columns up to which copies are written; beyond, a table of columns."""
 
 
@@ -95,7 +95,7 @@ def needs_columns(calls: Calls, layer: Layer) -> bool:
     if not isinstance(layer, layers.Gather | QGather):
         return False
     # Columns of several inputs have no common address, so a table cannot reach them.
-    return len(layer.inputs) == 1 and len(runs(calls, layer)) > MOST_COPIES
+    return len(layer.inputs) == 1 and len(runs(calls, layer)) > MAX_COPIES
 
 
 def _gather(calls: Calls, layer: layers.Gather) -> list[str]:

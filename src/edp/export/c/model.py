@@ -15,7 +15,7 @@ from edp.export.c.text import channel_enumeration, enumeration, filled, indented
 from edp.export.escape import C_SIGNIFICANT, Code, c_comment, fill_file, package_text
 from edp.export.hashes import little_endian, model_hash, scale_hash
 from edp.export.si_names import si_names
-from edp.export.sizes import MOST_COLUMNS, check_numbers, check_sizes
+from edp.export.sizes import MAX_COLUMNS, check_numbers, check_sizes
 from edp.ir import Graph, Layer
 from edp.ir.base import Number
 from edp.ir.hydraulics import HydraulicTick
@@ -27,7 +27,7 @@ from edp.training.bundle import Bundle
 RUNTIME = ("edp_runtime.h", "edp_runtime.c", "edp_memory.c")
 HYDRAULICS = ("edp_hydraulics.h", "edp_linkage.h", "edp_hydraulics.c", "edp_linkage.c")
 DOUBLE_BYTES = 8
-MOST_STACK = 2**18
+MAX_STACK = 2**18
 """Bytes: a quarter of the smallest stack that threads of desktop systems have (1 MiB, Windows)."""
 CLIPPED = Code("    uint32_t clipped;  /* numbers beyond the range of their format, chosen on training data */\n")
 PLANT = (
@@ -334,18 +334,18 @@ def _check(model: Model) -> None:
     check_sizes(layers)
     for layer in graph.layers:
         stack = DOUBLE_BYTES * layer.room if isinstance(layer, HydraulicTick) else 0
-        if stack > MOST_STACK:
+        if stack > MAX_STACK:
             raise ExportError(
-                f"a tick of layer '{layer.name}' works in {stack:,} bytes of stack; at most {MOST_STACK:,} must hold: "
+                f"a tick of layer '{layer.name}' works in {stack:,} bytes of stack; at most {MAX_STACK:,} must hold: "
                 "train with fewer cylinders, or with a smaller twin.inertia_degree or twin.potential_degree"
             )
     calls = Calls(graph, model.plan)
     chosen = {x.name: max(x.columns) + 1 for x in graph.layers if needs_columns(calls, x)}  # type: ignore[attr-defined]
-    check_sizes({f"numbers that '{name}' chooses from": size for name, size in chosen.items()}, MOST_COLUMNS)
+    check_sizes({f"numbers that '{name}' chooses from": size for name, size in chosen.items()}, MAX_COLUMNS)
     if model.adapts and law is not None:
         sizes = {"bytes of the adaptation's memory": 4 * law.state_numbers, "its horizons": max(law.horizons)}
         check_sizes(sizes)
-        check_sizes({"inputs from which its targets are read": int(max(law.columns)) + 1}, MOST_COLUMNS)
+        check_sizes({"inputs from which its targets are read": int(max(law.columns)) + 1}, MAX_COLUMNS)
 
 
 def has_ring(layer: Layer) -> bool:

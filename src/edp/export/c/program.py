@@ -22,7 +22,7 @@ FLOAT = re.compile(r"-?[0-9.][0-9.e+-]*f")
 # A linear fit; docs/findings.md has its error, 1.3 % at most over 187 networks.
 OWN, EACH_CALL, ON_STACK, WIDE = 593.0, 14.6, 5.4, 9.7
 """Bytes of Thumb-2 code (GCC 12, -O2): of every model, a call, an argument on the stack, a number above 255."""
-MOST_COPIED = 64
+MAX_COPIED = 64
 """Bytes of a struct that the compiler copies itself; larger ones are copied by ``memcpy``."""
 
 

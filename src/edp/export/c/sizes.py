@@ -12,7 +12,7 @@ from edp.export.c import adaptation as adapting
 from edp.export.c.constants import CORTEX_M, DataModel, constants_of, total_bytes
 from edp.export.c.model import clear_work, computed, remembered
 from edp.export.c.plan import plan
-from edp.export.c.program import FIXED, MOST_COPIED, called, own_bytes, runtime_bytes
+from edp.export.c.program import FIXED, MAX_COPIED, called, own_bytes, runtime_bytes
 from edp.ir import Graph
 from edp.ir.rls import Adaptation
 
@@ -62,13 +62,13 @@ def program_bytes(graph: Graph, adaptation: Adaptation | None = None) -> int:
     compute, finish = computed(graph, places)
     statements = [*compute, *finish, *remembered(graph)[1]]
     functions = {*FIXED, *called(statements), *called(clear_work(places))}
-    # The output is copied as a struct; beyond `MOST_COPIED` the compiler calls `memcpy`.
+    # The output is copied as a struct; beyond `MAX_COPIED` the compiler calls `memcpy`.
     copied = 4 * sum(map(graph.width_of, graph.results.values()))
     own = own_bytes(statements)
     if adaptation is not None:
         own += adapting.own_bytes(adaptation)
         functions |= set(adapting.FUNCTIONS)
         copied = max(copied, 4 * (1 + adaptation.unit.size * adaptation.features))
-    if copied > MOST_COPIED:
+    if copied > MAX_COPIED:
         functions.add("memcpy")
     return own + runtime_bytes(functions)

@@ -14,7 +14,7 @@ from edp.export.c.text import array, double_number, number, table, unsigned_lite
 from edp.export.escape import Code
 from edp.export.hashes import little_endian
 
-MOST_PLACES = 2**16 - 1
+MAX_PLACES = 2**16 - 1
 """Tables of places are 16 bits wide."""
 DOUBLE_TABLE = "typedef struct {\n    const double *values;\n    uint32_t count;\n} double_table;"
 
@@ -82,10 +82,8 @@ class ConstantTables:
             ExportError: a place beyond 16 bits.
         """
         listed = list(values) or [0]
-        if max(listed) > MOST_PLACES:
-            raise ExportError(
-                f"table '{name}' of the {self.owner} counts to {max(listed):,}; {MOST_PLACES:,} must hold"
-            )
+        if max(listed) > MAX_PLACES:
+            raise ExportError(f"table '{name}' of the {self.owner} counts to {max(listed):,}; {MAX_PLACES:,} must hold")
         self.lines.append(array("uint16_t", name, unsigned_literals(listed)))
         self._enter(name, np.asarray(listed, dtype=np.uint16))
 

@@ -40,7 +40,7 @@ LONGEST_NAME = 20
 """Of a monitor: names of its networks and functions are made from it."""
 NO_INPUT = 0xFFFF
 """Stands for a driver without a second input: `EDP_NO_INPUT`."""
-MOST_MEMORY = 2**31 - 1
+MAX_MEMORY = 2**31 - 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,7 +284,7 @@ def monitor_files(parts: MonitorParts, name: str) -> MonitorFiles:
     if len(name) > LONGEST_NAME:
         raise ExportError(f"name '{name}' of a monitor has {len(name)} characters; at most {LONGEST_NAME} must hold")
     memory, block = sum(view.memory for view in parts.watches), parts.chain.summaries.block
-    check_sizes({"bytes of the detectors' memory": 8 * memory, "ticks of a block": block}, MOST_MEMORY)
+    check_sizes({"bytes of the detectors' memory": 8 * memory, "ticks of a block": block}, MAX_MEMORY)
     sources = (source_code(part, index, name, parts.columns) for index, part in enumerate(parts.sources))
     return MonitorFiles(name, parts, tuple(sources))
 

@@ -13,7 +13,7 @@ from edp.export.onnx.nodes import Nodes
 from edp.ir import Layer, layers
 from edp.ir.layers import BinaryOperation, Function, runs
 
-MOST_PIECES = 12
+MAX_PIECES = 12
 """Runs of neighbouring columns up to which numbers are moved by splitting and joining; beyond, by a 0/1 matrix."""
 
 Plain = Callable[[Nodes, Any, int, Sequence[str], Sequence[int]], str]
@@ -80,7 +80,7 @@ def _flat(nodes: Nodes, x: str, ticks: int, rows: int, width: int) -> str:
 
 def _gather(nodes: Nodes, layer: layers.Gather, ticks: int, values: Sequence[str], widths: Sequence[int]) -> str:
     column_runs = runs(layer.columns, widths)
-    if len(column_runs) > MOST_PIECES:
+    if len(column_runs) > MAX_PIECES:
         matrix = np.zeros((len(layer.columns), sum(widths)), np.float32)
         # A 0/1 matrix moves numbers exactly: every sum has a single term.
         matrix[np.arange(len(layer.columns)), list(layer.columns)] = 1.0

@@ -21,7 +21,7 @@ from edp.storage.reading import Table
 # 47 characters, a part behind them and a number stay within MATLAB's 63.
 LONGEST_LAYER = 47
 """Characters of a layer's part of it; names of constants and slots come behind."""
-MOST_PIECES = 8
+MAX_PIECES = 8
 """Runs of neighbouring columns up to which they are written as ranges; beyond, as a constant."""
 FUNCTIONS = {
     Function.RELU: "max({x}, 0)",
@@ -77,7 +77,7 @@ class Native:
             tensors["feature"] = tensors["feature"] + 1.0
         elif isinstance(layer, memory.Rotation):
             tensors["factor"] = layer.factor.T
-        elif isinstance(layer, layers.Gather) and len(self.runs(layer)) > MOST_PIECES:
+        elif isinstance(layer, layers.Gather) and len(self.runs(layer)) > MAX_PIECES:
             # MATLAB counts from 1.
             tensors["columns"] = np.array([[column + 1] for column in layer.columns], dtype=float)
         return tensors
@@ -184,7 +184,7 @@ def _plain(value: float) -> str:
 
 def _gather(native: Native, layer: layers.Gather, x: Sequence[str]) -> list[str]:
     column_runs = native.runs(layer)
-    if len(column_runs) > MOST_PIECES:
+    if len(column_runs) > MAX_PIECES:
         joined = x[0] if len(x) == 1 else f"[{'; '.join(x)}]"
         lines = [f"given = {joined};"]
         return [*lines, f"{native.value(layer.name)} = given({native.constant(layer, 'columns')});"]

@@ -15,7 +15,7 @@ from edp.wording import typed
 Array = NDArray[np.floating]
 COARSER = 1.02
 """More than a sum needs to fit: weights of least error are a little larger in sum than the nearest ones."""
-MOST_COARSE = 4.0
+MAX_COARSE = 4.0
 """Times its own scale that a row may take, two bits of its weights; beyond, the network is refused."""
 
 
@@ -57,7 +57,7 @@ def _scale(weight: Array, bias: Array, input_frac: int) -> Array:
     count = float(np.prod([weight.shape[axis] for axis in terms]))
     room = max(1.0, fixed.ACCUMULATOR - fixed.LARGEST * (0.5 * count + 1.0))
     coarser = COARSER * (np.abs(weight).sum(axis=terms, dtype=np.float64) * fixed.LARGEST + offset) / room
-    saved = (worst > fixed.ACCUMULATOR) & (coarser <= MOST_COARSE * scale)
+    saved = (worst > fixed.ACCUMULATOR) & (coarser <= MAX_COARSE * scale)
     return np.asarray(np.where(saved, np.maximum(scale, coarser), scale))
 
 

@@ -149,7 +149,7 @@ class RawLog:
 
 LONGEST_NAME = 256
 """Characters of a column's name; a full path of a Simulink signal has some hundred."""
-MOST_COLUMNS = 65_536
+MAX_COLUMNS = 65_536
 """Columns of a log; a large Simulink model logs some thousand."""
 
 
@@ -169,8 +169,8 @@ def check_names(path: Path, names: Iterable[str]) -> None:
             )
         if not name.isprintable() and any(ord(letter) < 32 or 127 <= ord(letter) < 160 for letter in name):
             raise DataError(f"'{path}': the name of column {name[:80]!r} holds control characters; rename it")
-    if count > MOST_COLUMNS:
-        raise DataError(f"'{path}' has {count} columns, at most {MOST_COLUMNS} are read; split it")
+    if count > MAX_COLUMNS:
+        raise DataError(f"'{path}' has {count} columns, at most {MAX_COLUMNS} are read; split it")
 
 
 TRUTH_PLACES = ("with", "apart", "without")

@@ -17,7 +17,7 @@ import pyarrow.csv as arrow_csv
 from edp.errors import DataError
 from edp.logs.formats.base import (
     FORMATS,
-    MOST_COLUMNS,
+    MAX_COLUMNS,
     Column,
     RawLog,
     RawSignal,
@@ -40,7 +40,7 @@ from edp.signals import TIME_UNITS, UNITS, SignalMap
 
 _HEAD_BYTES = (1 << 18, 1 << 22, 1 << 26)
 """Sizes of the examined head of a file. Longer comments or headers need the larger ones."""
-_MOST_CELLS_LOOKED = 200_000
+_MAX_CELLS_LOOKED = 200_000
 """Cells in which the layout is looked for; wide tables need fewer rows."""
 _DELIMITERS = (",", ";", "\t", "|")
 """Delimiters in the order in which a tie is decided."""
@@ -130,7 +130,7 @@ def _layout(path: Path, signal_map: SignalMap) -> TextLayout:
     rows, ends = _rows(path, lines, delimiter)
     if not rows:
         raise DataError(f"'{path}' holds no rows; expected a header row and numbers")
-    check_names(path, () if len(rows[0]) <= MOST_COLUMNS else map(str, range(len(rows[0]))))
+    check_names(path, () if len(rows[0]) <= MAX_COLUMNS else map(str, range(len(rows[0]))))
     table_place = find_table(rows, _number_of_any_kind(delimiter), _is_unit_row) or TablePlace(0, 0)
     named = table_place.header < table_place.first
     padding = table_place.padding
@@ -271,7 +271,7 @@ def _rows(path: Path, lines: list[str], delimiter: str) -> tuple[list[list[str]]
                 rows.append(row)
                 ends.append(reader.line_num)
                 cells += len(row)
-            if len(rows) >= _ROWS_LOOKED or (cells > _MOST_CELLS_LOOKED and len(rows) > 2):
+            if len(rows) >= _ROWS_LOOKED or (cells > _MAX_CELLS_LOOKED and len(rows) > 2):
                 break
     except text_csv.Error as error:
         raise DataError(

@@ -24,7 +24,7 @@ from edp.logs.formats.csv_table import CsvTable, TextLayout, has_decimal_commas
 from edp.logs.units import normalise_unit
 
 _NAMES, _UNITS, _PATHS, _VALUES = "trace_names", "trace_units", "path", "trace_values"
-_MOST_HEAD_ROWS = 200
+_MAX_HEAD_ROWS = 200
 _LONGEST_HEAD = 1 << 26
 """Characters of the rows above the numbers at most."""
 _SAMPLE_ROWS = 20
@@ -69,7 +69,7 @@ def controldesk_head(path: Path, lines: Sequence[str], encoding: str) -> Control
     Raises:
         DataError: the head has no rows of numbers behind it, or no time.
     """
-    named = next((line for line in lines[:_MOST_HEAD_ROWS] if line.startswith(_NAMES)), "")
+    named = next((line for line in lines[:_MAX_HEAD_ROWS] if line.startswith(_NAMES)), "")
     delimiter = named[len(_NAMES) : len(_NAMES) + 1]
     if delimiter not in (",", ";", "\t", "|"):
         return None
@@ -112,7 +112,7 @@ def _rows_of_head(path: Path, encoding: str, delimiter: str) -> tuple[dict[str, 
                     used = reader.line_num
                     rows.setdefault(row[0] if row else "", row)
                 ends = len(sample) >= _SAMPLE_ROWS
-                if ends or characters > _LONGEST_HEAD or (not sample and used > _MOST_HEAD_ROWS):
+                if ends or characters > _LONGEST_HEAD or (not sample and used > _MAX_HEAD_ROWS):
                     break
         except text_csv.Error as error:
             raise DataError(

@@ -12,9 +12,9 @@ _PIECE_BYTES = 1 << 20
 """Size of the text examined or passed on at a time."""
 _TAIL_BYTES = 1 << 16
 """End of a file in which its last lines are looked for."""
-MOST_LAST_LINES = 10
+MAX_LAST_LINES = 10
 """Lines that may stand behind the table."""
-_LEAST_ROWS = 2
+_MIN_ROWS = 2
 """Rows that a table has at least where lines stand behind it."""
 _ONE_BYTE_LINE_ENDS = ("utf-8", "utf-8-sig", "latin-1", "cp1252", "ascii")
 """Encodings in which a line ends with the byte that ends it in ASCII."""
@@ -95,8 +95,8 @@ def _end_of_table(path: Path, size: int, mark: bytes, skip: int, width: int) -> 
         # Power went while this line was written.
         cut = last
     # Words right below the first line are no end of a table but a text that is none.
-    first = skip + _LEAST_ROWS if start == 0 else 0
-    for index in range(max(len(lines) - MOST_LAST_LINES, first), cut):
+    first = skip + _MIN_ROWS if start == 0 else 0
+    for index in range(max(len(lines) - MAX_LAST_LINES, first), cut):
         cells = [cell for cell in lines[index].split(mark) if cell.strip()]
         words = cells and not any(_NUMBER.fullmatch(cell) for cell in cells)
         if words and len(lines[index].split(mark)) < width:

@@ -11,9 +11,9 @@ _SAME_WIDTH = 0.8
 """Minimum fraction of later rows with an equal number of cells. Otherwise the file is damaged, or is not a table."""
 _NUMBERS = 0.8
 """Minimum fraction of numbers among the filled cells of a numeric column."""
-_MOST_HEADER_ROWS = 4
+_MAX_HEADER_ROWS = 4
 """Names, units and descriptions: what stands between the names and the numbers at most."""
-_MOST_REMARKS = 2
+_MAX_REMARKS = 2
 """Columns of remarks that are named behind those of numbers."""
 _WORDS = 3
 """Words of a cell from which a row describes channels instead of naming them."""
@@ -68,7 +68,7 @@ def find_table(
     header = _header_of(rows, top, first, is_unit_row)
     usual = header == 0 and (first == 1 or (first == 2 and is_unit_row(list(rows[1]))))
     padding = width - len(rows[header])
-    return None if (usual and not padding) or first - header > _MOST_HEADER_ROWS else TablePlace(header, first, padding)
+    return None if (usual and not padding) or first - header > _MAX_HEADER_ROWS else TablePlace(header, first, padding)
 
 
 def _runs_on(row: Sequence[str], width: int, is_number: Callable[[str], bool]) -> bool:
@@ -88,7 +88,7 @@ def _is_numeric(cells: list[str], is_number: Callable[[str], bool]) -> bool:
 
 def _is_data(row: Sequence[str], width: int, columns: list[int], is_number: Callable[[str], bool]) -> bool:
     """Return whether most cells in the numeric columns of a row are numbers. Text may replace missing values."""
-    if not width <= len(row) <= width + _MOST_REMARKS or any(map(is_number, row[width:])):
+    if not width <= len(row) <= width + _MAX_REMARKS or any(map(is_number, row[width:])):
         return False
     filled = [row[i] for i in columns if row[i].strip()]
     return 2 * len(filled) >= len(columns) and 2 * sum(map(is_number, filled)) > len(filled)
@@ -97,7 +97,7 @@ def _is_data(row: Sequence[str], width: int, columns: list[int], is_number: Call
 def _may_name(row: Sequence[str], width: int, whole: Sequence[Sequence[str]], is_number: Callable[[str], bool]) -> bool:
     """Return whether a row may contain names, units or descriptions: half of its cells filled, without numbers."""
     ends_open = len(row) == width - 1 and not any(other[-1].strip() for other in whole)
-    if width < len(row) <= width + _MOST_REMARKS:
+    if width < len(row) <= width + _MAX_REMARKS:
         row = row[:width]
     filled = [cell for cell in row if cell.strip()]
     # 1 is the unit of a ratio, too.

@@ -23,7 +23,7 @@ from edp.storage.memory import free_bytes
 
 _STEP_KEY = "SampleTime[ms]"
 _NAME_KEY, _UNIT_KEY = "Name", "Unit"
-_MOST_HEAD_LINES = 60
+_MAX_HEAD_LINES = 60
 _END = "EOF"
 _WIDEST = 6
 """Bytes of memory a byte of text: numbers of eight bytes, and those of the parser beside them."""
@@ -58,7 +58,7 @@ def scope_head(path: Path, lines: Sequence[str]) -> ScopeHead | None:
     Raises:
         DataError: its delimiter stands within cells, too.
     """
-    steps = next((i for i, line in enumerate(lines[:_MOST_HEAD_LINES]) if line.lstrip('"').startswith(_STEP_KEY)), None)
+    steps = next((i for i, line in enumerate(lines[:_MAX_HEAD_LINES]) if line.lstrip('"').startswith(_STEP_KEY)), None)
     if steps is None or not lines[0].lstrip('"').startswith(_NAME_KEY):
         return None
     behind = lines[steps].lstrip('"')[len(_STEP_KEY) :].lstrip('"')

@@ -32,7 +32,7 @@ from edp.logs.units import normalise_unit
 from edp.recording import Recording
 from edp.signals import SignalMap
 
-_MOST_NAMED = 100
+_MAX_NAMED = 100
 """Experiments of a file that are looked through for one that is named nearly so."""
 _VERSIONS = {"v5": "v7", "v7.3": "v7.3"}
 """Our names and the library's: its v7 is v5 with packed variables."""
@@ -65,7 +65,7 @@ class MatFormat:
         )
         if signal_map.variable is not None:
             if signal_map.variable not in mat_variables.names:
-                there = (*mat_variables.names, *mat_variables.experiment_names[:_MOST_NAMED])
+                there = (*mat_variables.names, *mat_variables.experiment_names[:_MAX_NAMED])
                 raise DataError(
                     f"'{path}' has no variable '{signal_map.variable}'{closest(signal_map.variable, there)}; "
                     "set 'variable' in the signal map to an existing one"

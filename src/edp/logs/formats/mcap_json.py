@@ -35,7 +35,7 @@ ROS = ("ros1", "ros2")
 JSON = "json"
 LONGEST_MESSAGE = 1 << 18
 """Bytes of a message; a row of a thousand channels takes some 40,000."""
-MOST_PATHS, MOST_TOPICS = 4096, 1024
+MAX_PATHS, MAX_TOPICS = 4096, 1024
 """Numbers of a topic's messages, and topics of a file."""
 LONGEST_TOPIC = 1024
 CHECKED = 1 << 24
@@ -64,8 +64,8 @@ class _Topic:
         for name, value in values.items():
             column = self.columns.get(name)
             if column is None:
-                if len(self.columns) >= MOST_PATHS:
-                    raise DataError(f"{where}: topic '{self.name}' holds more than {MOST_PATHS} numbers")
+                if len(self.columns) >= MAX_PATHS:
+                    raise DataError(f"{where}: topic '{self.name}' holds more than {MAX_PATHS} numbers")
                 column = self.columns[name] = array("d", [math.nan]) * rows
             column.append(value)
         self.at_ns.append(at_ns)
@@ -143,8 +143,8 @@ def _topics(path: Path) -> Sequence[_Topic]:
     for kind, body in _records(path, memoryview(path.read_bytes())):
         if kind == _CHANNEL:
             number, topic = _channel(body)
-            if len(by_number) >= MOST_TOPICS:
-                raise ValueError(f"it has more than {MOST_TOPICS} channels")
+            if len(by_number) >= MAX_TOPICS:
+                raise ValueError(f"it has more than {MAX_TOPICS} channels")
             by_number.setdefault(number, topic)
         elif kind == _MESSAGE:
             values += _message(path, body, by_number)
@@ -189,8 +189,8 @@ def _flatten(name: str, value: Any, values: dict[str, float], where: str) -> Non
         for at, inner in enumerate(value[:LONGEST_LIST]):
             _flatten(f"{name}_{at + 1}", inner, values, where)
     elif value is None or isinstance(value, int | float):
-        if len(values) >= MOST_PATHS:
-            raise DataError(f"{where} holds more than {MOST_PATHS} numbers")
+        if len(values) >= MAX_PATHS:
+            raise DataError(f"{where} holds more than {MAX_PATHS} numbers")
         values[name or "data"] = math.nan if value is None else float(value)
 
 

@@ -26,12 +26,12 @@ _COPIES = 3
 """A packed block is in memory as it was unpacked, transposed and as columns."""
 _DEEPEST_CONVERSION = 8
 """Conversions within one another that are walked; `mdf_conversion.DEEPEST` bounds those that are applied."""
-_MOST_ENTRIES = 2_000_000
+_MAX_ENTRIES = 2_000_000
 """Entries of all conversions that the library would load, each table within a table counted as often as it does."""
-_MOST_TEXT = 1 << 26
+_MAX_TEXT = 1 << 26
 """Bytes of text that blocks may share in any file."""
 _TEXT_RATIO = 8
-"""Bytes of text that blocks may share, beyond `_MOST_TEXT`, for each byte of the file."""
+"""Bytes of text that blocks may share, beyond `_MAX_TEXT`, for each byte of the file."""
 _PACKINGS = ("zlib", "zlib", "lz4", "lz4", "zstd", "zstd")
 """Compression by type of a packed block; every second one is transposed."""
 _DATA = {b"##DT", b"##DV", b"##DZ", b"##DL", b"##HL", b"##LD", b"##SD", b"##RD", b"##DI", b"##RV", b"##RI"}
@@ -179,7 +179,7 @@ class _Walk:
             if block.id == b"##CN" and len(block.links) >= 8 and block.links[4]:
                 count, more = self.conversion(block.links[4], seen, 0)
                 entries, text = entries + count, text + more
-        if entries > _MOST_ENTRIES or text > _MOST_TEXT + _TEXT_RATIO * len(self.view):
+        if entries > _MAX_ENTRIES or text > _MAX_TEXT + _TEXT_RATIO * len(self.view):
             raise _damage_error(
                 self.path,
                 f"states {entries} entries of conversions and {text} bytes of text, by blocks used many times",

@@ -12,7 +12,7 @@ from edp.errors import DataError
 
 LONGEST_TEXT = 2_000
 """Characters of a name or comment; more is cut."""
-MOST_EVENTS = 100_000
+MAX_EVENTS = 100_000
 """Maximum number of events in a file: a segment takes two blocks of about 150 bytes and its texts."""
 _NS = 10**9
 _MARKER, _RECORDED_AFTERWARDS = 6, 1
@@ -52,12 +52,12 @@ def event_blocks(events: Sequence[LogEvent]) -> list[Any]:
     """Return the asammdf blocks of the begin and end of each event, in file order.
 
     Raises:
-        DataError: more than `MOST_EVENTS`.
+        DataError: more than `MAX_EVENTS`.
     """
     from asammdf.blocks.v4_blocks import EventBlock
 
-    if len(events) > MOST_EVENTS:
-        raise DataError(f"{len(events):,} events; at most {MOST_EVENTS:,} are written to a file")
+    if len(events) > MAX_EVENTS:
+        raise DataError(f"{len(events):,} events; at most {MAX_EVENTS:,} are written to a file")
     blocks: list[Any] = []
     for event in events:
         for kind, time_s in ((_BEGIN, event.start_s), (_END, event.end_s)):

@@ -23,7 +23,7 @@ LONGEST = 4096
 """Characters of a formula; those of calibration tools have some dozens."""
 DEEPEST = 32
 """Parentheses, functions and signs within one another: what bounds the stack of the parser."""
-MOST_TOKENS = 512
+MAX_TOKENS = 512
 """Numbers, names and signs of a formula: each is at most one pass over the values."""
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)|(?P<name>[A-Za-z_][A-Za-z_0-9]*)"
@@ -124,8 +124,8 @@ def _tokens(text: str) -> list[tuple[str, str]]:
         if match is None or match.lastgroup is None:
             raise FormulaError(f"character {at + 1} begins neither a number, a name nor one of + - * / ^ ( )")
         tokens.append((match.lastgroup, match[match.lastgroup].lower()))
-        if len(tokens) > MOST_TOKENS:
-            raise FormulaError(f"it has more than {MOST_TOKENS} numbers, names and signs")
+        if len(tokens) > MAX_TOKENS:
+            raise FormulaError(f"it has more than {MAX_TOKENS} numbers, names and signs")
         at = match.end()
     if not tokens:
         raise FormulaError("it is empty")

@@ -39,7 +39,7 @@ _DTYPES = {
 _BASE, _NAME, _ARRAY, _SEQUENCE = 1, 2, 3, 4
 _DEEPEST = 32
 """Types within one another; those of ROS have some six."""
-_MOST_STEPS = 100_000
+_MAX_STEPS = 100_000
 """Fields of one message, each element of a list counted; only lists of lists and of messages can have so many."""
 
 
@@ -135,8 +135,8 @@ class _Walk:
     def value(self, kind: Any, path: str, names: list[str], depth: int) -> list[str]:
         """One field; returns the texts of a list of texts."""
         self.steps += 1
-        if self.steps > _MOST_STEPS:
-            raise LongMessageError(f"a message of more than {_MOST_STEPS:,} fields")
+        if self.steps > _MAX_STEPS:
+            raise LongMessageError(f"a message of more than {_MAX_STEPS:,} fields")
         what, detail = int(kind[0]), kind[1]
         if what == _BASE:
             self.base(detail[0], path)
@@ -153,7 +153,7 @@ class _Walk:
     def several(self, kind: Any, count: int, path: str, names: list[str], depth: int) -> list[str]:
         """Visit a list. Numbers are named by the accompanying list of names, otherwise counted from 1."""
         plain = int(kind[0]) == _BASE
-        if not plain and count > _MOST_STEPS:
+        if not plain and count > _MAX_STEPS:
             raise DataError(f"a list of {count} messages in a message")
         if plain and kind[1][0] in ("string", "wstring"):
             if count > len(self.raw):

@@ -33,7 +33,7 @@ _SPANS = (1, 4, 16)
 """Rows over which a change is compared with a velocity: noise hides it over one, motion over many."""
 
 
-_LEAST_STEPS, _MOST_LOST = 50, 5
+_MIN_STEPS, _MAX_LOST = 50, 5
 """Steps from which a clock that loses rows is told, and the longest of its steps over the usual one."""
 
 
@@ -149,14 +149,14 @@ def behaviour_of(column: LogColumn) -> Behaviour:
 
 def _loses_rows(moving: Column) -> bool:
     """Whether most steps have one size and nearly all others are a few times it."""
-    if len(moving) < _LEAST_STEPS:
+    if len(moving) < _MIN_STEPS:
         return False
     step = float(np.median(moving))
     if step <= 0:
         return False
     times = moving / step
     whole = np.rint(times)
-    fitting = (np.abs(times - whole) <= 0.1) & (whole >= 1) & (whole <= _MOST_LOST)
+    fitting = (np.abs(times - whole) <= 0.1) & (whole >= 1) & (whole <= _MAX_LOST)
     return bool(np.mean(fitting) > 0.98 and np.mean(fitting & (whole == 1)) > 0.6)
 
 

@@ -23,9 +23,9 @@ some minutes at 100 Hz."""
 _FASTEST_HZ = 200.0
 """Rates above are brought down to one of `_PLAIN_HZ`: a machine moves slower, and a tick more costs on a controller."""
 _PLAIN_HZ = (100.0, 200.0, 500.0, 1000.0, 2000.0)
-_MOST_RESTARTS = 5
+_MAX_RESTARTS = 5
 """Falls of uneven stamps, each the restart of a logger."""
-_LEAST_ROWS = 1500
+_MIN_ROWS = 1500
 """Rows that a log should keep: from some 700 nothing can be set apart for tests and validation."""
 
 
@@ -96,7 +96,7 @@ def _time_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> LogColum
 
 def _begins_anew(column: LogColumn, behaviour: Behaviour) -> bool:
     """Return whether stamps recognised by name rise except for a few restarts. Even stamps are counted without them."""
-    few = 0 < behaviour.falls <= _MOST_RESTARTS
+    few = 0 < behaviour.falls <= _MAX_RESTARTS
     return few and not behaviour.even and (behaviour.steady or behaviour.lossy) and is_time_name(column.name)
 
 
@@ -175,7 +175,7 @@ def _brought_down(clock: ClockGuess, rows: int) -> ClockGuess:
     if clock.rate_hz is None or clock.rate_hz <= _FASTEST_HZ:
         return clock
     # A short log shows what is fast: the lowest plain rate that leaves it enough rows, else its own.
-    plain = (hz for hz in _PLAIN_HZ if hz < clock.rate_hz and rows * hz >= _LEAST_ROWS * clock.rate_hz)
+    plain = (hz for hz in _PLAIN_HZ if hz < clock.rate_hz and rows * hz >= _MIN_ROWS * clock.rate_hz)
     wanted_hz = next(plain, None)
     if wanted_hz is None:
         return clock

@@ -26,7 +26,7 @@ TEXT_BYTES = 16_000_000
 beginning."""
 _HEAD_BYTES = 1 << 20
 """Size of the examined part of a text when comparing columns with other files."""
-MOST_COLUMNS = 400
+MAX_COLUMNS = 400
 """Columns that are looked at; the others are left out and counted."""
 _ROWS = 30_000
 """Rows of the first piece, which tells time and relations; five minutes at 100 Hz."""
@@ -36,7 +36,7 @@ _VALUES = 12_000_000
 """Numbers kept of all columns together, 96 MB."""
 _PROBE_ROWS = 1000
 """Rows by which a column of text is told from one of numbers."""
-_MOST_TEXTS = 20
+_MAX_TEXTS = 20
 """Columns of text that are tried as time."""
 _COVERED = 0.9
 """Minimum fraction of the longest span that signals with their own times cover. A single message is not a signal."""
@@ -171,8 +171,8 @@ def _look(path: Path, part: Path, note: str, experiment: str | None) -> LogLook:
     length = _usual_length(raw)
     signals = [signal for signal in raw.signals.values() if signal.samples == length]
     left_out = {f"have another length than {length:,} rows": len(raw.signals) - len(signals)}
-    left_out["come after the first columns"] = max(len(signals) - MOST_COLUMNS, 0)
-    signals = signals[:MOST_COLUMNS]
+    left_out["come after the first columns"] = max(len(signals) - MAX_COLUMNS, 0)
+    signals = signals[:MAX_COLUMNS]
     numbers = [signal for signal in signals if _is_numeric(signal)]
     texts = tuple(signal.name for signal in signals if signal not in numbers)
     if not numbers:
@@ -246,7 +246,7 @@ def _look_at_signals(path: Path, part: Path, note: str, signal_map: SignalMap) -
     fastest = min(covering, key=lambda s: _span_s(s) / s.samples)
     step, stamps = _step_s(fastest), np.asarray(fastest.time_s, dtype=np.float64)
     alike = [s for s in covering if s.samples * _SLOWEST >= fastest.samples]
-    numbers = alike[:MOST_COLUMNS]
+    numbers = alike[:MAX_COLUMNS]
     if len({s.samples for s in numbers}) < 2 or len(numbers) * len(stamps) > _HELD_VALUES:
         return None
     first = min(_ROWS, max(_VALUES // len(numbers) // 2, 100))
@@ -379,7 +379,7 @@ def _time_of(
     """Return the reader's time column, the step in seconds, and the columns with their own stamps."""
     by_word = [name for name in texts if _is_time_word(name)]
     others = [name for name in texts if name not in by_word]
-    for name in (None, *islice([*by_word, *others], _MOST_TEXTS)):
+    for name in (None, *islice([*by_word, *others], _MAX_TEXTS)):
         try:
             timed = open_log(part, replace(whole, time=name))
             signal = next((s for s in timed.signals.values() if s.time_s is not None), None)

@@ -12,7 +12,7 @@ from edp.logs.proposal.groups import LogGroup, fits, some_of
 TRAINING_WORDS = ("est", "train", "id", "training", "identification")
 TEST_WORDS = ("val", "test", "validation")
 """Names of variables by which an author parted experiments."""
-MOST_EXPERIMENTS = 2000
+MAX_EXPERIMENTS = 2000
 """Experiments of a group of files: each is a recording in a data-set file."""
 
 
@@ -55,9 +55,9 @@ def part_experiments(group: LogGroup) -> Experiments | None:
     entries = [(look.path, name) for look in group.looks for name in look.experiments]
     if not entries:
         return None
-    if len(entries) > MOST_EXPERIMENTS:
+    if len(entries) > MAX_EXPERIMENTS:
         raise DataError(
-            f"'{group.looks[0].path}' and its like hold {len(entries):,} experiments; at most {MOST_EXPERIMENTS:,} "
+            f"'{group.looks[0].path}' and its like hold {len(entries):,} experiments; at most {MAX_EXPERIMENTS:,} "
             "become recordings: give fewer files"
         )
     looks = [replace(look_at_log(path, name), path=_pseudo_path(path, name)) for path, name in some_of(entries)]

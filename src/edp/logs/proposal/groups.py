@@ -14,7 +14,7 @@ from edp.logs.proposal.columns import LogLook, look_at_log, names_in_log
 from edp.progress import SILENT, Progress
 
 _One = TypeVar("_One")
-MOST_LOGS = 12
+MAX_LOGS = 12
 """Logs that are looked at of a group of files: the first ones, the last ones and some between."""
 _ALIKE = 0.7
 """Minimum fraction of common columns of two logs in one group."""
@@ -103,8 +103,8 @@ def group_logs(paths: Sequence[Path], progress: Progress = SILENT) -> tuple[list
 
 
 def some_of(logs: Sequence[_One]) -> list[_One]:
-    """Return at most `MOST_LOGS` evenly spaced logs."""
-    places = np.unique(np.linspace(0, len(logs) - 1, min(len(logs), MOST_LOGS)).round().astype(int))
+    """Return at most `MAX_LOGS` evenly spaced logs."""
+    places = np.unique(np.linspace(0, len(logs) - 1, min(len(logs), MAX_LOGS)).round().astype(int))
     return [logs[index] for index in places]
 
 

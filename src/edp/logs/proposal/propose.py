@@ -37,11 +37,11 @@ _MEASURED = tuple(kind for kind in Kind if kind not in (*_COMMANDS, Kind.GENERIC
 _FOLLOWED = (Kind.PRESSURE, Kind.TEMPERATURE, Kind.FLOW)
 """Kinds that are references by their names only."""
 _NUMBERS = re.compile(r"\d+")
-_LEAST_SWITCHES = 3
+_MIN_SWITCHES = 3
 """Changes at the rate of a label that a log is long enough for, before a command without them is one."""
 _PLAIN_NAME = re.compile(r"\w[\w .\-/()%]{0,63}")
-_MOST_CHANNELS = 200
-_MOST_FALLS = 5
+_MAX_CHANNELS = 200
+_MAX_FALLS = 5
 """Restarts of a logger within a log, at which stamps of its messages fall."""
 _SWITCHED_HZ = {"command": 0.01, "": 0.05, "label": 1.0}
 """Changes a second below which a column of a few whole values is a label, by what its name says: a working machine
@@ -235,7 +235,7 @@ def _aside(name: str, behaviour: Behaviour, kind: KindGuess, rate_hz: float | No
         value = _EMPTY if not behaviour.filled else f"always {typed(behaviour.high)}"
         return ColumnGuess(name, "", "constant", _NO_KIND, 0.95, value, "" if is_known(name) else "not taken")
     # A logger that was restarted has stamps that fall now and then.
-    rising = behaviour.rises or behaviour.falls <= _MOST_FALLS
+    rising = behaviour.rises or behaviour.falls <= _MAX_FALLS
     if is_stamp_name(name) or (ends_as_stamp(name) and rising):
         return ColumnGuess(name, "", "time", _NO_KIND, 0.9, "the stamp of a message", "not taken")
     if is_sample_time_name(name) and behaviour.low >= 0:
@@ -250,7 +250,7 @@ def _aside(name: str, behaviour: Behaviour, kind: KindGuess, rate_hz: float | No
         return ColumnGuess(name, name, "label", kind, max(kind.confidence, BOUND), "a flag by its name", "a feature?")
     seldom = behaviour.changes * (rate_hz or 1.0) < _SWITCHED_HZ.get(word, 0.0)
     # In a log of a minute a valve that is tested opens once.
-    brief = word == "command" and rows < _LEAST_SWITCHES * (rate_hz or 1.0) / _SWITCHED_HZ[word]
+    brief = word == "command" and rows < _MIN_SWITCHES * (rate_hz or 1.0) / _SWITCHED_HZ[word]
     if behaviour.switches and seldom and not brief:
         sure = min(0.85 if word == "label" else 0.7, max(kind.confidence, BOUND))
         check = kind.check if kind.kind is not Kind.GENERIC and kind.check else "a feature?"
@@ -324,8 +324,8 @@ def _name_channels(guesses: Sequence[ColumnGuess]) -> list[ColumnGuess]:
     for i, guess in enumerate(guesses):
         channel = guess.channel
         count += bool(channel)
-        if channel and (count > _MOST_CHANNELS or not channel.isprintable()):
-            guess = replace(guess, channel="", check=f"left out: beyond {_MOST_CHANNELS} channels, or an odd name")
+        if channel and (count > _MAX_CHANNELS or not channel.isprintable()):
+            guess = replace(guess, channel="", check=f"left out: beyond {_MAX_CHANNELS} channels, or an odd name")
         elif channel:
             plain = channel if _PLAIN_NAME.fullmatch(channel) else channel.strip("/ .:")[:64].replace(":", ".")
             channel = plain if _PLAIN_NAME.fullmatch(plain) and plain not in used else f"channel_{i + 1}"
@@ -373,4 +373,4 @@ def plain_map(look: LogLook) -> SignalMap:
         ChannelMap(g.column, g.column, "1", Kind.GENERIC) for g in unmapped if g.column not in used | set(VOCABULARY)
     ]
     # A fast log is inspected as it is.
-    return replace(proposal.signal_map, channels=(*mapped, *more)[:_MOST_CHANNELS], rate_hz=None)
+    return replace(proposal.signal_map, channels=(*mapped, *more)[:_MAX_CHANNELS], rate_hz=None)

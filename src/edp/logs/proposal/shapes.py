@@ -15,7 +15,7 @@ from edp.logs.proposal.columns import LogLook, names_in_log
 from edp.storage.paths import files_below, is_file_at, is_folder_at
 from edp.wording import percent, setting_text, typed
 
-_LEAST_COLUMNS = 20
+_MIN_COLUMNS = 20
 """Columns without names from which a row may hold samples of one signal."""
 _ALIKE, _MOST = 0.97, 0.9
 """Correlation of neighbours that continue each other, and share of the neighbours that do."""
@@ -23,8 +23,8 @@ _ALIKE, _MOST = 0.97, 0.9
 _SLOWER, _LOST, _FEW = 4.0, 0.25, 0.1
 """A rate is this many times the motion that it shows well; share of faster motion from which a person is told, and
 that a better rate leaves. Eight samples a period would be plenty, two are lost between samples."""
-_LEAST_ROWS = 500
-_MOST_TEXTS = 8
+_MIN_ROWS = 500
+_MAX_TEXTS = 8
 """Text files beside logs of other endings that are tried."""
 _RATES_HZ = (200.0, 500.0, 1000.0, 2000.0, 5000.0)
 
@@ -35,7 +35,7 @@ def shape_notes(look: LogLook) -> list[str]:
     Args:
         look: examined part of the log.
     """
-    if look.headerless and len(look.columns) >= _LEAST_COLUMNS and _neighbours_continue(look):
+    if look.headerless and len(look.columns) >= _MIN_COLUMNS and _neighbours_continue(look):
         return [
             f"{len(look.columns)} columns without names, each nearly the one before: a row seems to hold samples of "
             "one signal, as a cycle of a test rig does; write one signal a column, its samples below each other"
@@ -82,7 +82,7 @@ def pace_notes(look: LogLook, clock: ClockGuess, targets: Collection[str]) -> li
 def _faster(values: Column, rate_hz: float, limit_hz: float) -> float:
     """Share of the variance of a column, without its trend, above a frequency."""
     values = values[np.isfinite(values)]
-    if len(values) < _LEAST_ROWS:
+    if len(values) < _MIN_ROWS:
         return 0.0
     rows = np.arange(len(values))
     moved = values - np.polyval(np.polyfit(rows, values, 1), rows)
@@ -100,7 +100,7 @@ def note_ignored_files(source: Path, paths: Collection[Path]) -> list[str]:
     """
     if not is_folder_at(source) or any(path.suffix.lower() == ".txt" for path in paths):
         return []
-    tables = [path for path in sorted(islice(files_below(source, "*.txt"), _MOST_TEXTS)) if _is_table(path)]
+    tables = [path for path in sorted(islice(files_below(source, "*.txt"), _MAX_TEXTS)) if _is_table(path)]
     named = ", ".join(path.name[:40] for path in tables[:3])
     return [f"text files beside these logs are not looked at: {named}; give such logs on their own"] if tables else []
 

@@ -19,7 +19,7 @@ _ONE_RATE = 1.0005
 """Ratio of rates up to which logs count as one; reading allows a thousandth."""
 _LONG_S, _LONG_STEPS = 1.0, 20.0
 """A gap longer than both is a break in the session: held values would be motion that never was."""
-_MOST_KEPT = 0.8
+_MAX_KEPT = 0.8
 """Minimum fraction of the rows on one side of a break, above which the rest is cut off."""
 
 
@@ -132,4 +132,4 @@ def _choose_gap_repair(clock: Clock) -> str:
         return "hold"
     # Cutting keeps the longest stretch between any gaps, long or short.
     edges = np.concatenate(([0], clock.gaps + 1, [len(clock.stamps)]))
-    return "cut" if np.diff(edges).max() >= _MOST_KEPT * len(clock.stamps) else "hold"
+    return "cut" if np.diff(edges).max() >= _MAX_KEPT * len(clock.stamps) else "hold"

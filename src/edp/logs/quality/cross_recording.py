@@ -17,7 +17,7 @@ from edp.settings.results import json_value
 from edp.signals import UNITS, Kind
 from edp.wording import typed
 
-_LEAST_RATIO = 9.0
+_MIN_RATIO = 9.0
 """Units nearer than this cannot be told from a recording that is merely livelier."""
 _NEAR_DECADES = 0.35
 """Tolerance of size and noise relative to the ratio of two units, in decades: a factor of 2.2."""
@@ -121,7 +121,7 @@ def _two_units(reports: Sequence[QualityReport]) -> list[Finding]:
 def _unit_ratio(kind: Kind, ratios: tuple[float, float]) -> str:
     """Return the two units that explain both ratios; empty if none do."""
     decades = [math.log10(ratio) for ratio in ratios]
-    if min(map(abs, decades)) < math.log10(_LEAST_RATIO) - _NEAR_DECADES:  # Most channels: no two units explain it.
+    if min(map(abs, decades)) < math.log10(_MIN_RATIO) - _NEAR_DECADES:  # Most channels: no two units explain it.
         return ""
     for text, between in _unit_pairs(kind):
         if all(abs(one - between) < _NEAR_DECADES for one in decades):
@@ -137,5 +137,5 @@ def _unit_pairs(kind: Kind) -> tuple[tuple[str, float], ...]:
         (f"{name} read as {other}?", math.log10(base / factor))
         for name, factor in unit_factors
         for other, base in unit_factors
-        if max(base / factor, factor / base) >= _LEAST_RATIO
+        if max(base / factor, factor / base) >= _MIN_RATIO
     )

@@ -34,7 +34,7 @@ _LEFT_OUT = {
 }
 """Descriptions of lines in a text file that are not rows, by type."""
 _LENIENT = Repair(nan="keep", gaps="keep", duplicates="last", falling="sort")
-_MOST_NAMES = 2000
+_MAX_NAMES = 2000
 """Columns that are compared with the vocabulary: each costs half a millisecond."""
 _MISSPELT = 0.85
 """Likeness (`difflib`) of a name to one of the vocabulary from which it is a slip: a letter in eight."""
@@ -132,7 +132,7 @@ def _open_with_map(path: Path, signal_map: SignalMap) -> tuple[RawLog, SignalMap
         plain = plain_map(look_at_log(path))
     else:
         # Misspelt names of the vocabulary are answered with the right ones.
-        misspelt = any(_is_misspelt(name) for name in islice(raw.signals, _MOST_NAMES))
+        misspelt = any(_is_misspelt(name) for name in islice(raw.signals, _MAX_NAMES))
         plain = signal_map if misspelt else plain_map(look_at_log(path))
     raw = open_log(path, plain)
     return raw, plain, *resolve(raw, plain)
@@ -193,7 +193,7 @@ def _readable(sources: list[ChannelSource]) -> tuple[list[ChannelSource], list[F
 def _find_near_misses(raw: RawLog) -> list[Finding]:
     """Columns that are not taken although their names nearly are in the vocabulary."""
     findings = []
-    for name in islice(raw.signals, _MOST_NAMES):
+    for name in islice(raw.signals, _MAX_NAMES):
         if len(name) <= _LONGEST_MISS and name not in VOCABULARY and raw.signals[name].kind is None:
             hint = closest(name, VOCABULARY)
             if hint.startswith("; did you mean"):

@@ -14,7 +14,7 @@ from edp.logs.repair import runs
 
 Values = NDArray[np.float32]
 
-MOST_UNIQUE = 500_000
+MAX_UNIQUE = 500_000
 """Samples looked at for a lattice; a longer channel is thinned evenly."""
 _ON_LATTICE = 0.05
 """Largest distance from a multiple of the step, in steps."""
@@ -42,7 +42,7 @@ class Measures:
 
     Attributes:
         quantum: step of the lattice on which all values lie, None where there is none coarser than float32.
-        levels: distinct values, of at most `MOST_UNIQUE` samples.
+        levels: distinct values, of at most `MAX_UNIQUE` samples.
         noise: deviation of the white part at rest, 0 for a state of up to three levels.
         every: samples between new values; 1 where each sample is new.
         busy: sensor noise moves the last digit all the time, so that equal samples in a row mean something.
@@ -105,7 +105,7 @@ def quantum(values: Values) -> tuple[float | None, int]:
     be whole multiples within 5 % of the step. Steps of up to four units in the last place of float32 are no lattice.
     """
     # Thinned evenly instead of cut: a channel may rest for all of its beginning.
-    seen = np.unique(values[:: -(-len(values) // MOST_UNIQUE)])
+    seen = np.unique(values[:: -(-len(values) // MAX_UNIQUE)])
     if len(seen) < 2:
         return None, len(seen)
     apart = np.diff(seen.astype(np.float64))

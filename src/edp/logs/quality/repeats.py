@@ -33,15 +33,15 @@ _CHANNELS = 3
 _OWN, _OWN_UNNAMED = 2, 16
 _SAME = 0.98
 """Correlation of a window in both recordings."""
-_LEAST_WINDOWS = 2
-_LEAST_VOTES = 3
+_MIN_WINDOWS = 2
+_MIN_VOTES = 3
 """Fingerprints that must agree on a lag before it is checked."""
 _HOPELESS = 0.8
 """Correlation below which no fraction of a block makes two windows the same."""
-_LEAST_SHARE = 0.5
+_MIN_SHARE = 0.5
 """Minimum fraction of the channels moving in a window that must agree. Steps of two sessions look alike in one channel
 or another (correlations of 0.99 on a bench with two machines), but not in most of them."""
-_LEAST_UNBROKEN = 2 / 3
+_MIN_UNBROKEN = 2 / 3
 """Minimum fraction of the windows in motion between the first and the last agreeing one that must agree. Within one
 session all agree except for noise; of two similar sessions about half did."""
 _SHIFTS = (0.0, -0.25, 0.25, -0.5, 0.5)
@@ -187,7 +187,7 @@ def _elect_lags(votes: Labels, numbers: NDArray[np.int64]) -> dict[tuple[int, in
     both[:-1] += np.where(follows, counts[1:], 0)
     both[1:] += np.where(follows, counts[:-1], 0)
     best: dict[tuple[int, int], tuple[int, int, int]] = {}
-    for k in np.flatnonzero(both >= _LEAST_VOTES).tolist():
+    for k in np.flatnonzero(both >= _MIN_VOTES).tolist():
         i, j, lag = (int(value) for value in votes[k])
         vote = (int(both[k]), int(counts[k]), lag)
         if vote[:2] > best.get((i, j), (0, 0, 0))[:2]:
@@ -285,15 +285,15 @@ def _compare_pair(
     moves = np.isfinite(alike)
     agree = np.where(moves, alike, 0.0) > _SAME
     moving = moves.sum(axis=1)
-    same = agree.sum(axis=1) > _LEAST_SHARE * moving
-    if same.sum() < _LEAST_WINDOWS:
+    same = agree.sum(axis=1) > _MIN_SHARE * moving
+    if same.sum() < _MIN_WINDOWS:
         return None
     hit = np.flatnonzero(same)
-    if len(hit) < _LEAST_UNBROKEN * (moving[hit[0] : hit[-1] + 1] > 0).sum():
+    if len(hit) < _MIN_UNBROKEN * (moving[hit[0] : hit[-1] + 1] > 0).sum():
         return None
     compared = moves[hit].any(axis=0)
     agreeing_pairs = agree[hit].sum(axis=0) >= 0.5 * np.maximum(moves[hit].sum(axis=0), 1)
-    if agreeing_pairs.sum() <= _LEAST_SHARE * compared.sum():
+    if agreeing_pairs.sum() <= _MIN_SHARE * compared.sum():
         return None
     begins = start + int(hit[0]) * WINDOW
     ends = start + (int(hit[-1]) + 1) * WINDOW

@@ -76,7 +76,7 @@ BATCH_LOG_BYTES = 128 * 2**20
 """Of the logs of a batch, about: what a process that is killed loses."""
 BATCHES = 64
 """About, of small data sets: some for each worker, so that none waits for the last one for long."""
-MOST_FILES = 400
+MAX_FILES = 400
 """Files of rows of one build, about: each is open while the store is, and systems allow some thousand."""
 
 
@@ -248,7 +248,7 @@ def _batches(logs: dict[str, StoredLog], folder: Path) -> list[LogBatch]:
     """Divide logs into batches of similar size, which do not depend on the number of workers."""
     sizes = {key: log.size for key, log in logs.items()}
     total = sum(sizes.values())
-    bound = max(min(BATCH_LOG_BYTES, total // BATCHES), total // MOST_FILES)
+    bound = max(min(BATCH_LOG_BYTES, total // BATCHES), total // MAX_FILES)
     groups: list[list[tuple[str, StoredLog]]] = []
     left = 0
     for key, log in logs.items():

@@ -13,7 +13,7 @@ AtFault = Literal["sensor", "machine", "none"]
 NONE_OF_THESE = "none"
 """Kind of the cause that is no fault of the dictionary."""
 LONGEST_TEXT = 300
-MOST_SIZES = 32
+MAX_SIZES = 32
 
 
 @dataclass(frozen=True)
@@ -99,8 +99,8 @@ def class_of(values: Any, where: str) -> FaultClass:
             raise DataError(f"{where}: {key} must be a text of at most {LONGEST_TEXT} characters")
     sizes, neutral = values["sizes"], values["neutral"]
     numbers = [*sizes, neutral] if isinstance(sizes, Sequence) and not isinstance(sizes, str) else [None]
-    if len(numbers) > MOST_SIZES or not all(_is_finite(number) for number in numbers):
-        raise DataError(f"{where}: sizes and neutral must be at most {MOST_SIZES} finite numbers")
+    if len(numbers) > MAX_SIZES or not all(_is_finite(number) for number in numbers):
+        raise DataError(f"{where}: sizes and neutral must be at most {MAX_SIZES} finite numbers")
     if values["at_fault"] not in ("sensor", "machine") or not isinstance(values["grave"], bool):
         raise DataError(f"{where}: at_fault must be 'sensor' or 'machine', grave true or false")
     return FaultClass(**{**values, "sizes": tuple(map(float, sizes)), "neutral": float(neutral)})

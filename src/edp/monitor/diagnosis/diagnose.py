@@ -18,7 +18,7 @@ from edp.monitor.diagnosis.signatures import Dictionary
 Array = NDArray[np.float64]
 AFTER_S = 60.0
 """Time after an alarm whose rows name its cause where a log has them: a change at once is alarmed within a block."""
-MOST_ROWS = 180
+MAX_ROWS = 180
 """Blocks that name a cause: of a longer stretch the last ones, and no onset."""
 
 
@@ -31,7 +31,7 @@ def diagnosed(alarm: MonitorAlarm, dictionary: Dictionary, rows: Array, start: d
         rows: conditioned rows since the onset, shape (blocks, summaries).
         start: time of day at the start of the recording.
     """
-    matched = match(dictionary, rows[-MOST_ROWS:], fresh=len(rows) <= MOST_ROWS)
+    matched = match(dictionary, rows[-MAX_ROWS:], fresh=len(rows) <= MAX_ROWS)
     causes = causes_of(dictionary, matched)
     sentence = alarm_sentence(causes, alarm.since_s, start)
     return replace(alarm, causes=causes, sentence=sentence, severity=severity(causes))

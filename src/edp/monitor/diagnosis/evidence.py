@@ -15,9 +15,9 @@ SHORT, LONG = 8, 40
 """Blocks of the windows over which the scatter of means is measured."""
 SHRUNK = 0.2
 """Weight of the identity in the correlations, because there are fewer healthy sessions than summaries."""
-LEAST_VARIANCE = 1e-6
+MIN_VARIANCE = 1e-6
 """Variance of a feature, in units of healthy blocks, below which the feature is constant."""
-LEAST_SESSIONS = 4
+MIN_SESSIONS = 4
 ONSET = 6
 """Blocks from the onset on that are looked at apart: a step of a sensor shows in them only."""
 
@@ -60,10 +60,10 @@ def check_stretches(lengths: Sequence[int]) -> None:
         DataError: too few stretches of `LONG` blocks.
     """
     count = sum(length // LONG for length in lengths)
-    if count < LEAST_SESSIONS:
+    if count < MIN_SESSIONS:
         raise DataError(
             f"{count_of(count, 'stretch')} of {LONG} healthy blocks {'is' if count == 1 else 'are'} too few for a "
-            f"diagnosis; bring {LEAST_SESSIONS} at least, or leave the dictionary out (--machine none)"
+            f"diagnosis; bring {MIN_SESSIONS} at least, or leave the dictionary out (--machine none)"
         )
 
 
@@ -95,7 +95,7 @@ class Scatter:
         mean = windows[SHORT].mean(axis=0)
         short = np.cov(windows[SHORT], rowvar=False)
         # What never varies on healthy sessions has no scale of its own, and is left out: its row stays zero.
-        varies = np.diag(short) > LEAST_VARIANCE
+        varies = np.diag(short) > MIN_VARIANCE
         size = np.sqrt(np.where(varies, np.diag(short), 1.0))
         correlation = (1.0 - SHRUNK) * short / np.outer(size, size) * np.outer(varies, varies) + SHRUNK * np.eye(
             len(size)
@@ -105,7 +105,7 @@ class Scatter:
         # Two lengths tell both parts: variance = lasting + passing / length.
         over_short = ((windows[SHORT] - mean) @ matrix).var(axis=0)
         over_long = ((windows[LONG] - mean) @ matrix).var(axis=0)
-        over_short = np.where(over_short > LEAST_VARIANCE, over_short, 1.0)
+        over_short = np.where(over_short > MIN_VARIANCE, over_short, 1.0)
         passing = np.maximum((over_short - over_long) / (1.0 / SHORT - 1.0 / LONG), 0.05 * SHORT * over_short)
         lasting = np.maximum(over_short - passing / SHORT, 0.05 * over_short)
         return Scatter(mean, lasting, passing, matrix)

@@ -21,11 +21,11 @@ CHANGING = (0.1, 0.3, 1.0)
 TEMPERATURES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 WINDOW = 40
 """Healthy blocks under a signature of a left-out session: what an alarm has after some half a minute."""
-LEAST_CHANGE = 3.0
+MIN_CHANGE = 3.0
 """Size of a signature, in healthy standard deviations of such a mean, below which it would not have been found."""
 UNUSUAL = 0.98
 """Fraction of left-out sessions that some fault must explain."""
-MOST_JUDGED = 240
+MAX_JUDGED = 240
 """Left-out sessions that numbers are chosen on."""
 
 
@@ -148,13 +148,13 @@ def _select_left_out(
             means = [mean_features(session[ends[part] : ends[part + 1]]) for part in (0, 1)]
             at, after = ((scatter.directions(means[part] + fault.change[part]), noise[part]) for part in (0, 1))
             sessions.append(_Judged(tried, fault, (at, after)))
-    keep = chance.permutation(len(sessions))[:MOST_JUDGED]
+    keep = chance.permutation(len(sessions))[:MAX_JUDGED]
     return [sessions[row] for row in sorted(keep.tolist())]
 
 
 def _would_be_found(change: Array, noise: Sequence[Array]) -> bool:
     """Whether a direction is far enough off at the onset or after it."""
-    return any(float(np.max(change[part] ** 2 / noise[part])) > LEAST_CHANGE**2 for part in (0, 1))
+    return any(float(np.max(change[part] ** 2 / noise[part])) > MIN_CHANGE**2 for part in (0, 1))
 
 
 def _choose_dictionary(judged_sessions: Sequence[_Judged], whole: Dictionary) -> Dictionary:

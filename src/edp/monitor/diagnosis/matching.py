@@ -25,13 +25,13 @@ BEYOND = 1.3
 FURTHER = (2.0, 4.0, 8.0)
 """Sizes beyond the ladder that are tried, over its largest: signatures go on as they changed towards it, and what is at
 its clip stays there."""
-MOST_STRANGE = 0.5
+MAX_STRANGE = 0.5
 """Probability of none of the ladders' faults, above which sizes beyond them are tried."""
-MOST_SHARE = 100.0
+MAX_SHARE = 100.0
 """Maximum size of faults measured in percent."""
-LEAST_SIZE = 0.5
+MIN_SIZE = 0.5
 """Smallest size that is tried, over the smallest of the ladder."""
-MOST_CAUSES = 8
+MAX_CAUSES = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ def match_directions(dictionary: Dictionary, seen: Sequence[Seen | None]) -> Mat
     """Match from the directions at the onset and later; None for a part without rows."""
     matched = _match_rows(dictionary, seen, further=False)
     # Carried on, signatures are coarse: they are asked only where no size of the ladders explains the evidence.
-    return matched if matched.none <= MOST_STRANGE else _match_rows(dictionary, seen, further=True)
+    return matched if matched.none <= MAX_STRANGE else _match_rows(dictionary, seen, further=True)
 
 
 def _match_rows(dictionary: Dictionary, seen: Sequence[Seen | None], further: bool) -> Match:
@@ -160,8 +160,8 @@ def _list_sizes(dictionary: Dictionary, number: int, fault: FaultClass, beyond: 
     away = np.abs(dictionary.sizes[rows] - fault.neutral)
     sign = -1.0 if fault.sizes[0] < fault.neutral else 1.0
     ends = abs(fault.sizes[0] - fault.neutral), abs(fault.sizes[-1] - fault.neutral)
-    within = np.geomspace(LEAST_SIZE * ends[0], BEYOND * ends[1], GRID)
-    most = (MOST_SHARE / ends[1] if fault.unit == "%" else np.inf) if beyond else 0.0
+    within = np.geomspace(MIN_SIZE * ends[0], BEYOND * ends[1], GRID)
+    most = (MAX_SHARE / ends[1] if fault.unit == "%" else np.inf) if beyond else 0.0
     further = np.array([times for times in FURTHER if times <= most])
     tried = np.concatenate([within, further * ends[1]])
     # From nothing at the neutral size; a little beyond the largest size that was simulated it stays as it was there.
@@ -175,7 +175,7 @@ def _list_sizes(dictionary: Dictionary, number: int, fault: FaultClass, beyond: 
     return fault.neutral + sign * tried, between
 
 
-def causes_of(dictionary: Dictionary, matched: Match, most: int = MOST_CAUSES) -> tuple[Cause, ...]:
+def causes_of(dictionary: Dictionary, matched: Match, most: int = MAX_CAUSES) -> tuple[Cause, ...]:
     """Return the most probable causes, the first from the most probable component.
 
     A part may have many kinds of faults that look alike: what a mechanic looks at first is the part whose faults

@@ -21,7 +21,7 @@ from edp.storage.paths import is_there
 
 Array = NDArray[np.float64]
 FILE, SCHEMA = "dictionary", 1
-MOST_CLASSES, MOST_SUMMARIES, MOST_SIGNATURES = 5_000, 5_000, 50_000
+MAX_CLASSES, MAX_SUMMARIES, MAX_SIGNATURES = 5_000, 5_000, 50_000
 ARRAYS = {
     "signatures": ArrayRule((2, "signatures", "features")),
     "owner": ArrayRule(("signatures",)),
@@ -145,10 +145,10 @@ def load_dictionary(folder: Path, summaries: Sequence[str]) -> Dictionary | None
     if header.get("summaries") != list(summaries):
         raise StorageError(f"{where} is of another monitor: its summaries differ; fit the monitor again")
     entries, count = header.get("classes"), header.get("signatures")
-    if not isinstance(entries, list) or not 0 < len(entries) <= MOST_CLASSES or len(summaries) > MOST_SUMMARIES:
-        raise StorageError(f"{where}: classes must be a list of 1 to {MOST_CLASSES}; fit the monitor again")
-    if type(count) is not int or not 0 < count <= MOST_SIGNATURES:
-        raise StorageError(f"{where}: signatures must be a number from 1 to {MOST_SIGNATURES}; fit the monitor again")
+    if not isinstance(entries, list) or not 0 < len(entries) <= MAX_CLASSES or len(summaries) > MAX_SUMMARIES:
+        raise StorageError(f"{where}: classes must be a list of 1 to {MAX_CLASSES}; fit the monitor again")
+    if type(count) is not int or not 0 < count <= MAX_SIGNATURES:
+        raise StorageError(f"{where}: signatures must be a number from 1 to {MAX_SIGNATURES}; fit the monitor again")
     try:
         classes = tuple(class_of(entry, where) for entry in entries)
         pairs = tuple(read_part(Confusion, entry, where) for entry in header.get("confusions", []))

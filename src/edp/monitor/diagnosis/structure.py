@@ -14,9 +14,9 @@ Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 APART = 0.25
 """Largest share of wrong answers of a test between two faults that can be told apart; a coin has 0.5."""
-MOST_PAIRS = 400
+MAX_PAIRS = 400
 LONGEST_NAME = 300
-LEAST_SESSIONS = 3
+MIN_SESSIONS = 3
 """Minimum number of sessions of each of two faults for a statement on their confusion."""
 
 
@@ -61,14 +61,14 @@ def confusions(
     pairs = []
     for a in range(len(names)):
         for b in range(a + 1, len(names)):
-            if min(len(rows[a]), len(rows[b])) < LEAST_SESSIONS:
+            if min(len(rows[a]), len(rows[b])) < MIN_SESSIONS:
                 continue
             error = 0.5 * (_measure_confusion(logits[rows[a]], a, b) + _measure_confusion(logits[rows[b]], b, a))
             if error > APART:
                 pairs.append((error, a, b))
     pairs.sort(key=lambda pair: (-pair[0], pair[1], pair[2]))
     result = []
-    for error, a, b in pairs[:MOST_PAIRS]:
+    for error, a, b in pairs[:MAX_PAIRS]:
         sensor, sensor_error = _best_sensor(rows[a], rows[b], sensors)
         helps = sensor_error is not None and sensor_error <= min(APART, 0.5 * error)
         result.append(Confusion(names[a], names[b], error, *((sensor, sensor_error) if helps else ("", None))))

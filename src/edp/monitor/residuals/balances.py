@@ -47,7 +47,7 @@ SLOW = (Kind.TEMPERATURE,)
 """Kinds that cannot jump: their rate counts as zero."""
 MATCH_S = 0.5
 """Time over which changes are compared to find which rate belongs to which level."""
-MOST_ROWS = 200_000
+MAX_ROWS = 200_000
 """Maximum number of rows for that comparison: half an hour at 100 Hz."""
 
 
@@ -221,7 +221,7 @@ def _match(level: str, rate: str, sessions: Sequence[Recording], ticks: int, rat
     xy = xx = yy = 0.0
     rows = 0
     for session in sessions:
-        if rows > MOST_ROWS or session.samples <= ticks:
+        if rows > MAX_ROWS or session.samples <= ticks:
             continue
         x = session.column(level).astype(np.float64)
         y = np.cumsum(session.column(rate).astype(np.float64)) / rate_hz

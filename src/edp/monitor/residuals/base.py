@@ -20,7 +20,7 @@ from edp.training.bundle import Bundle
 from edp.training.twin_bundle import TwinBundle
 
 Rows = NDArray[np.float32]
-MOST_RESIDUALS = 512
+MAX_RESIDUALS = 512
 """Maximum number of residuals of a source. A machine with more channels is monitored in parts."""
 MIDDLE = ArrayRule(("inputs",), np.float32)
 """Substitutes for absent channels, an array of each source."""
@@ -258,8 +258,8 @@ def texts_of(values: Any, what: str) -> tuple[str, ...]:
     Raises:
         ValueError: something else, or too many.
     """
-    if not isinstance(values, list | tuple) or len(values) > MOST_RESIDUALS * 8:
-        raise ValueError(f"{what} is no list of at most {MOST_RESIDUALS * 8} texts")
+    if not isinstance(values, list | tuple) or len(values) > MAX_RESIDUALS * 8:
+        raise ValueError(f"{what} is no list of at most {MAX_RESIDUALS * 8} texts")
     if not all(isinstance(value, str) and len(value) <= 1024 for value in values):
         raise ValueError(f"{what} holds something else than texts of at most 1024 characters")
     return tuple(values)
@@ -314,8 +314,8 @@ def residual_labels(plain: Mapping[str, object]) -> tuple[tuple[str, ...], tuple
         ValueError: too many residuals, or something else than texts.
     """
     inputs, units = texts_of(plain["inputs"], "its inputs"), texts_of(plain["units"], "its units")
-    if len(units) > MOST_RESIDUALS:
-        raise ValueError(f"it has {len(units)} residuals; at most {MOST_RESIDUALS} must hold")
+    if len(units) > MAX_RESIDUALS:
+        raise ValueError(f"it has {len(units)} residuals; at most {MAX_RESIDUALS} must hold")
     return inputs, units
 
 

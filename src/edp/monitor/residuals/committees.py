@@ -19,7 +19,7 @@ from edp.networks.backbones import CommitteeSpec
 from edp.networks.heads import LinearHead
 from edp.networks.losses.mse import MeanSquared
 from edp.networks.predictor import ModelSpec
-from edp.settings.bounds import MOST_ROWS, MOST_UNITS, above, check_bounds, check_count, integer
+from edp.settings.bounds import MAX_ROWS, MAX_UNITS, above, check_bounds, check_count, integer
 from edp.settings.provenance import Provenance
 from edp.training.bagging.spec import BaggingSpec
 from edp.training.bundle import Bundle, make_bundle
@@ -28,7 +28,7 @@ from edp.training.fit import TrainingSpec, fit
 FOLDS = 2
 """Each member leaves out half of the rows, and stops where its error there is least."""
 BATCH = 512
-STEPS_PER_MINUTE, LEAST_STEPS, MOST_STEPS = 12_000, 200, 6_000
+STEPS_PER_MINUTE, MIN_STEPS, MAX_STEPS = 12_000, 200, 6_000
 """Training steps per minute on one core, and their range. The time of a fit is a target, not a bound."""
 VALIDATED_TICKS = 120_000
 """Number of samples for selecting among weights: twenty minutes at 100 Hz suffice."""
@@ -60,8 +60,8 @@ class CommitteeOptions:
             self,
             lags_s=above(0.0, 60.0),
             members=integer(2, 1000),
-            units=integer(1, MOST_UNITS),
-            rows=integer(100, MOST_ROWS),
+            units=integer(1, MAX_UNITS),
+            rows=integer(100, MAX_ROWS),
         )
         check_count("residuals", "lags_s", self.lags_s, 16, least=1)
         if self.members % FOLDS:
@@ -75,7 +75,7 @@ class CommitteeOptions:
             lags=tuple(lags), members=self.members, units=self.units, layers=2, activations=("tanh",)
         )
         model = ModelSpec(backbone=backbone, head=LinearHead(), window=max(2, lags[-1]))
-        steps = max(LEAST_STEPS, min(MOST_STEPS, round(minutes * STEPS_PER_MINUTE)))
+        steps = max(MIN_STEPS, min(MAX_STEPS, round(minutes * STEPS_PER_MINUTE)))
         bagging = BaggingSpec(folds=FOLDS, steps=steps, batch=BATCH, rows=self.rows, checks=5)
         training = TrainingSpec(loss=MeanSquared(), bagging=bagging, seed=material.seed, device="cpu")
         fitted = fit(data, model, training)

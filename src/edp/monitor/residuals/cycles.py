@@ -37,7 +37,7 @@ ARRAYS = {
 }
 """Of its file."""
 PREFIX = "cycle:"
-LEAST_CYCLES = 3
+MIN_CYCLES = 3
 """Fewer tell no scatter."""
 MOST_TICKS = 1_000_000
 """Maximum length of a cycle."""
@@ -149,11 +149,11 @@ class CyclesSpec(ResidualSpec):
                 f"of 1 to {MOST_TICKS} must hold, since each cycle begins at a tick"
             )
         whole = [log.samples // ticks if self.period_s else 1 for log in logs]
-        if sum(whole) < LEAST_CYCLES:
+        if sum(whole) < MIN_CYCLES:
             raise DataError(
                 f"cycles: {sum(whole)} cycles of {figure(ticks / material.rate_hz)} s are in the healthy logs that "
                 "train; "
-                f"{LEAST_CYCLES} at least must hold: bring more logs, or give the length of a cycle as period_s"
+                f"{MIN_CYCLES} at least must hold: bring more logs, or give the length of a cycle as period_s"
             )
         parts = [
             log.select(inputs)[: count * ticks].reshape(count, ticks, len(inputs))

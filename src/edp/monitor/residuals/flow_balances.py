@@ -41,14 +41,14 @@ from edp.monitor.residuals.flow_curves import (
 )
 from edp.monitor.residuals.flow_fit import fit_chambers, fit_oil_range
 from edp.recording import Recording
-from edp.settings.bounds import MOST_ROWS, check_bounds, integer, span
+from edp.settings.bounds import MAX_ROWS, check_bounds, integer, span
 from edp.signals import KINDS, Kind
 from edp.storage.arrays import ArrayRule, arrays_under, checked_arrays
 from edp.storage.reading import Table
 from edp.wording import figure, percent
 
 PREFIX = "flow:"
-MOST_CHAMBERS, MOST_DEAD = 64, 1_000
+MAX_CHAMBERS, MAX_DEAD = 64, 1_000
 """Maximum numbers in a file: chambers, and samples of dead time."""
 NUMBERS = {
     "values": ArrayRule(("paths", len(KNOTS)), np.float32),
@@ -61,7 +61,7 @@ SPOOLS = {
     "extend": ArrayRule(("spools",), np.int64, low=0, high="inputs"),
     "retract": ArrayRule(("spools",), np.int64, low=-1, high="inputs"),
     "gain": ArrayRule(("spools",), np.float32),
-    "dead": ArrayRule(("spools",), low=0.0, high=MOST_DEAD),
+    "dead": ArrayRule(("spools",), low=0.0, high=MAX_DEAD),
     "stages": ArrayRule(("spools", 2, 4), np.float32),
     "play": ArrayRule(("spools",), np.float32, low=0.0),
 }
@@ -236,8 +236,8 @@ class FlowBalances(ResidualSource):
         sizes, own = {"inputs": len(inputs)}, arrays_under(parts.arrays, "spools.")
         spools = SpoolModel(**checked_arrays(own, SPOOLS, "its spools", sizes))
         entries = parts.plain["chambers"]
-        if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_CHAMBERS:
-            raise ValueError(f"it has no list of 1 to {MOST_CHAMBERS} chambers")
+        if not isinstance(entries, list) or not 1 <= len(entries) <= MAX_CHAMBERS:
+            raise ValueError(f"it has no list of 1 to {MAX_CHAMBERS} chambers")
         chambers = [
             _chamber_of(_place_of(entry, len(inputs), len(spools.gain)), parts.arrays, index)
             for index, entry in enumerate(entries)
@@ -303,7 +303,7 @@ class FlowBalancesSpec(ResidualSpec):
 
     def __post_init__(self) -> None:
         check_bounds(
-            "flow_balances", self, rows=integer(1000, MOST_ROWS), trials=integer(1, 10_000), least=span(0.0, 1.0)
+            "flow_balances", self, rows=integer(1000, MAX_ROWS), trials=integer(1, 10_000), least=span(0.0, 1.0)
         )
 
     def fit(self, material: FitMaterial) -> ResidualSource | None:

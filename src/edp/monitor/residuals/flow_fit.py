@@ -48,7 +48,7 @@ COVERED = (0.01, 0.99)
 """Quantiles of a session's temperature: a thermometer has single values that are wrong."""
 BEYOND_K = 5.0
 """Kelvin beyond the learned temperatures within which balances still hold."""
-LEAST_TANK = 0.005
+MIN_TANK = 0.005
 """Fraction of all pressures below which the pressure of the return line is estimated, to which an emptied chamber
 falls."""
 
@@ -114,7 +114,7 @@ def _places(
         low = float(min(rows[:, stroke].min() for rows in sessions))
         high = float(max(rows[:, stroke].max() for rows in sessions))
     pressures = np.concatenate([rows[::7, [head, rod]].ravel() for rows in sessions])
-    tank = max(float(np.quantile(pressures, LEAST_TANK)), 0.0) * 1e-6
+    tank = max(float(np.quantile(pressures, MIN_TANK)), 0.0) * 1e-6
     spools = (0, 1) if axis.conflux else (0,)
     length = max(CUSHION * (high - low), 1e-6)
     return [

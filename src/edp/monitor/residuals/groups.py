@@ -11,7 +11,7 @@ SENSED = ("PumpPressure_1", "PumpPressure_2", "CylStroke_1", "CylStroke_2", "Cyl
 """Channels of `EXTRA_CHANNELS` for which a machine may have sensors. Only a simulation knows the others."""
 MOTION = (Kind.VELOCITY, Kind.ACCELERATION, Kind.POSITION)
 TURNING = (Kind.ANGULAR_VELOCITY, Kind.ANGLE)
-MOST_SINGLE = 24
+MAX_SINGLE = 24
 """Channels up to which each is a group of its own; beyond them kinds are."""
 
 
@@ -41,7 +41,7 @@ def groups_of(channels: Sequence[Channel]) -> tuple[Group, ...]:
     names = {channel.name for channel in channels}
     if len(names & {*TABLE_A1}) >= 9:
         return _excavator_groups(names)
-    if len(channels) <= MOST_SINGLE:
+    if len(channels) <= MAX_SINGLE:
         return tuple(Group(channel.name, (channel.name,)) for channel in channels)
     kinds = list(dict.fromkeys(channel.kind for channel in channels))
     return tuple(Group(str(kind), tuple(c.name for c in channels if c.kind is kind)) for kind in kinds)

@@ -176,12 +176,12 @@ class LookAheadSpec(CommitteeOptions, ResidualSpec):
             return None
         horizons = tuple(sorted({max(1, round(span * material.rate_hz)) for span in self.horizons_s}))
         features = FeatureSet("all", tuple(channel.name for channel in channels))
-        task = Task(features, tuple(targets[:MOST_TARGETS]), horizons, TargetMode.DELTA, material.rate_hz)
+        task = Task(features, tuple(targets[:MAX_TARGETS]), horizons, TargetMode.DELTA, material.rate_hz)
         return self.trained(task, material, MINUTES_SHARE * material.minutes)[0]
 
 
 AHEAD = (Kind.VELOCITY, Kind.ANGULAR_VELOCITY, Kind.PRESSURE, Kind.FLOW, Kind.FORCE)
 """Kinds that dynamics tell ahead; accelerations are mostly noise, positions follow from velocities."""
-MOST_TARGETS = 64
+MAX_TARGETS = 64
 MINUTES_SHARE = 0.2
 """Fraction of the time of all fits for the look-ahead network."""

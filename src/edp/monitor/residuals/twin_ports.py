@@ -24,7 +24,7 @@ from edp.monitor.residuals.groups import groups_of
 from edp.settings.bounds import above, check_bounds
 from edp.training.twin_bundle import TwinBundle
 
-MOST_PERIOD = 10_000_000
+MAX_PERIOD = 10_000_000
 """Ticks between two measured ones."""
 
 
@@ -109,8 +109,8 @@ class TwinPorts(ResidualSource):
         bundle, period, groups = parts.bundles["twin"], parts.plain["period"], parts.plain["groups"]
         if not isinstance(bundle, TwinBundle):
             raise ValueError("its network is no twin")
-        if isinstance(period, bool) or not isinstance(period, int) or not 1 <= period <= MOST_PERIOD:
-            raise ValueError(f"its period is {str(period)[:40]}; 1 to {MOST_PERIOD:,} ticks must hold")
+        if isinstance(period, bool) or not isinstance(period, int) or not 1 <= period <= MAX_PERIOD:
+            raise ValueError(f"its period is {str(period)[:40]}; 1 to {MAX_PERIOD:,} ticks must hold")
         if not isinstance(groups, list):
             raise ValueError("its groups are no list")
         named = [texts_of(group, "a group") for group in groups]

@@ -40,7 +40,7 @@ from edp.signals import Channel
 from edp.training.bundle import Bundle
 
 PREFIX = "virtual:"
-MOST_EVERY = 1000
+MAX_EVERY = 1000
 """Ticks from one run of a network to the next."""
 
 
@@ -120,8 +120,8 @@ class VirtualSensors(ResidualSource):
         inputs, middle = texts_of(parts.plain["inputs"], "its inputs"), source_arrays(parts, {})["middle"]
         groups = texts_of(parts.plain["groups"], "its groups")
         every = parts.plain.get("every", 1)  # monitors of earlier versions have none
-        if type(every) is not int or not 1 <= every <= MOST_EVERY:
-            raise ValueError(f"its networks run every {shown(every)} ticks; an integer of 1 to {MOST_EVERY} must hold")
+        if type(every) is not int or not 1 <= every <= MAX_EVERY:
+            raise ValueError(f"its networks run every {shown(every)} ticks; an integer of 1 to {MAX_EVERY} must hold")
         bundles = {}
         for group in groups:
             bundle = parts.bundles[group]
@@ -155,7 +155,7 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_bounds("virtual_sensors", self, least=above(-1.0, 1.0), every=integer(1, MOST_EVERY))
+        check_bounds("virtual_sensors", self, least=above(-1.0, 1.0), every=integer(1, MAX_EVERY))
 
     def fit(self, material: FitMaterial) -> ResidualSource | None:
         """See `ResidualSpec.fit`."""

@@ -14,7 +14,7 @@ from edp.ir import Builder
 from edp.ir.memory import Convolution
 from edp.networks.blocks.base import BLOCKS, BlockSlot, OutputSpace
 from edp.networks.streaming import Cost, Operation, State, Streaming, parameters_of
-from edp.settings.bounds import MOST_KERNEL, check_bounds, integer
+from edp.settings.bounds import MAX_KERNEL, check_bounds, integer
 
 STARTS = ("ridge", "crossed", "zero")
 
@@ -42,7 +42,7 @@ class LinearBypass:
     trained: bool = True
 
     def __post_init__(self) -> None:
-        check_bounds("linear_bypass", self, taps=integer(1, MOST_KERNEL))
+        check_bounds("linear_bypass", self, taps=integer(1, MAX_KERNEL))
         if self.start not in STARTS:
             raise ConfigError(f"linear_bypass: unknown start '{self.start}'{closest(self.start, STARTS)}")
         # A map that starts at zero and never changes adds nothing; the combination is refused, not ignored.

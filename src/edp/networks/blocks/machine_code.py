@@ -12,7 +12,7 @@ from edp.ir import Builder
 from edp.ir.layers import ScaleShift
 from edp.networks.blocks.base import BLOCKS, BlockSlot
 from edp.networks.streaming import Cost, State, Streaming, parameters_of
-from edp.settings.bounds import MOST_UNITS, check_bounds, integer
+from edp.settings.bounds import MAX_UNITS, check_bounds, integer
 
 CODE = "machine_code"
 """Last part of the name of the parameter that is the code."""
@@ -40,7 +40,7 @@ class MachineCode:
     size: int = 16
 
     def __post_init__(self) -> None:
-        check_bounds("machine_code", self, size=integer(1, MOST_UNITS))
+        check_bounds("machine_code", self, size=integer(1, MAX_UNITS))
 
     def build(self, width: int, window: int) -> Streaming:
         """Build the block on `width` channels."""

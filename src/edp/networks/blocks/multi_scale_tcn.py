@@ -12,7 +12,7 @@ from edp.errors import ConfigError
 from edp.ir import Builder
 from edp.networks.blocks.base import BLOCKS, BlockSlot, BranchMaker
 from edp.networks.streaming import Cost, State, Streaming
-from edp.settings.bounds import MOST_LEVELS, MOST_TICKS, check_bounds, check_count, integer
+from edp.settings.bounds import MAX_LEVELS, MOST_TICKS, check_bounds, check_count, integer
 
 
 @BLOCKS.register("multi_scale_tcn")
@@ -34,7 +34,7 @@ class MultiScaleTcn:
     first_dilations: tuple[int, ...] = (1, 4)
 
     def __post_init__(self) -> None:
-        check_count("multi_scale_tcn", "first_dilations", self.first_dilations, MOST_LEVELS)
+        check_count("multi_scale_tcn", "first_dilations", self.first_dilations, MAX_LEVELS)
         check_bounds("multi_scale_tcn", self, first_dilations=integer(1, MOST_TICKS))
         if len(self.first_dilations) < 2 or min(self.first_dilations) < 1:
             raise ConfigError(

@@ -16,7 +16,7 @@ from edp.ir.memory import Rotation
 from edp.networks.cells.base import CELLS
 from edp.networks.cells.scan import linear_scan
 from edp.networks.streaming import Cost, Operation, State, Streaming, parameters_of
-from edp.settings.bounds import MOST_UNITS, check_bounds, integer
+from edp.settings.bounds import MAX_UNITS, check_bounds, integer
 
 MEMORY = (2.0, 200.0)  # time constants at the start, in ticks
 FASTEST = math.pi / 5  # largest rotation per tick at the start: a tenth of the sampling rate
@@ -42,7 +42,7 @@ class DiagonalSsmCell:
     states: int = 64
 
     def __post_init__(self) -> None:
-        check_bounds("diagonal_ssm", self, states=integer(1, MOST_UNITS))
+        check_bounds("diagonal_ssm", self, states=integer(1, MAX_UNITS))
 
     def build(self, width_in: int, units: int, zoneout: float) -> Streaming:
         """One layer."""

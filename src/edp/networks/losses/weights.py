@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from edp.settings.bounds import MOST_WEIGHT, SHARE, above, below, check_bounds
+from edp.settings.bounds import MAX_WEIGHT, SHARE, above, below, check_bounds
 
 
 def output_weights(sigma: Tensor, power: float) -> Tensor:
@@ -50,7 +50,7 @@ class AdaptiveWeights:
     memory: float = 0.99
 
     def __post_init__(self) -> None:
-        check_bounds("adaptive", self, blend=SHARE, max_ratio=above(1.0, MOST_WEIGHT), memory=below(0.0, 1.0))
+        check_bounds("adaptive", self, blend=SHARE, max_ratio=above(1.0, MAX_WEIGHT), memory=below(0.0, 1.0))
 
     def weights(self, running: Tensor) -> Tensor:
         """Weights ``(horizon, output)`` from the running errors, same shape."""

@@ -18,7 +18,7 @@ from edp.networks.streaming import Operation
 from edp.settings.bounds import check_bounds, span
 
 LOADS = ("none", "gravity", "all")
-MOST_FADE_S = 3600.0
+MAX_FADE_S = 3600.0
 """Maximum time constant of the fading, longer than any horizon. Oil stiffness takes up the force within hundredths of a
 second."""
 NEAR = 3e-3
@@ -52,7 +52,7 @@ class DynamicSpec(PhysicsSpec):
             raise ConfigError(
                 f"physics: load = '{self.load}' must hold one of {', '.join(LOADS)}{closest(self.load, LOADS)}"
             )
-        check_bounds("physics", self, fade_s=span(0.0, MOST_FADE_S))
+        check_bounds("physics", self, fade_s=span(0.0, MAX_FADE_S))
 
     def channels(self) -> tuple[str, ...]:
         return (*super().channels(), *HEADS, *RODS)

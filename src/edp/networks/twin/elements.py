@@ -13,7 +13,7 @@ from edp.ir import Builder
 from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState
 from edp.networks.twin.lumped.lowering import lowered_answers
 from edp.networks.twin.lumped.parts import (
-    MOST_ELEMENTS,
+    MAX_ELEMENTS,
     Doubles,
     LagElement,
     MassElement,
@@ -25,7 +25,7 @@ from edp.networks.twin.lumped.parts import (
 )
 from edp.networks.twin.lumped.run import Values, Wiring, free_run, simulate_measured
 from edp.networks.twin.scales import Array, TwinScales
-from edp.settings.bounds import MOST_UPDATES, check_bounds, check_count, integer, span
+from edp.settings.bounds import MAX_UPDATES, check_bounds, check_count, integer, span
 
 PRIOR = 0.2
 """Plausible deviation of a level that is not measured, as a share of the tank's height."""
@@ -60,10 +60,10 @@ class ElementsBox:
     length_s: float = 0.0
 
     def __post_init__(self) -> None:
-        counts = {"steps": integer(1, 64), "starts": integer(1, 100), "rounds": integer(1, MOST_UPDATES)}
+        counts = {"steps": integer(1, 64), "starts": integer(1, 100), "rounds": integer(1, MAX_UPDATES)}
         check_bounds("elements", self, prefix_ticks=PREFIX, length_s=span(0.0, 600.0), **counts)
         for name in ("tanks", "masses", "lags"):
-            check_count("elements", name, getattr(self, name), MOST_ELEMENTS)
+            check_count("elements", name, getattr(self, name), MAX_ELEMENTS)
 
     def parts(self, channels: TwinChannels) -> Parts:
         """Return the connected elements.

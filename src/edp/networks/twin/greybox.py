@@ -38,7 +38,7 @@ from edp.networks.twin.grey.runner import GreyRunner
 from edp.networks.twin.grey.tick import MachineArrays, machine_arrays
 from edp.networks.twin.grey.validation import check_elements
 from edp.networks.twin.scales import FASTEST, HIGHEST, Array, TwinScales
-from edp.settings.bounds import MOST_NAMES, check_bounds, check_count, integer
+from edp.settings.bounds import MAX_NAMES, check_bounds, check_count, integer
 
 Doubles = NDArray[np.float64]
 POLYNOMIALS = (2, 4)
@@ -95,7 +95,7 @@ class GreyBox:
         degree = integer(0, 4)
         check_bounds("grey box", self, inertia_degree=degree, potential_degree=integer(1, 6), prefix_ticks=PREFIX)
         for name in ("cylinders", "motors", "valves", "pumps"):
-            check_count("grey box", name, getattr(self, name), MOST_NAMES)
+            check_count("grey box", name, getattr(self, name), MAX_NAMES)
         check_count("grey box", "without", self.without, len(LEFT_OUT))
         if self.linkage and self.degrees != POLYNOMIALS:
             raise ConfigError(

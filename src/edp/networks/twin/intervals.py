@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.data.twin_channels import TwinChannels
-from edp.settings.bounds import MOST_ROWS, SHARE, integer
+from edp.settings.bounds import MAX_ROWS, SHARE, integer
 from edp.storage.reading import Table
 
 Array = NDArray[np.float32]
 KNOTS_A_DECADE = 12
 """Horizons of a decade at which widths are calibrated: neighbouring ticks of a run are nearly one tick."""
-TICKS = integer(1, MOST_ROWS)
+TICKS = integer(1, MAX_ROWS)
 
 
 @dataclass(frozen=True, eq=False)

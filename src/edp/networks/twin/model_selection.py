@@ -8,14 +8,14 @@ from edp.errors import ConfigError
 from edp.networks.twin import TWINS
 from edp.networks.twin.base import PREFIX
 from edp.networks.twin.elements import ElementsBox
-from edp.networks.twin.recurrent import MOST_MEMBERS
+from edp.networks.twin.recurrent import MAX_MEMBERS
 from edp.registry import Registry
-from edp.settings.bounds import MOST_NAMES, SHARE, check_bounds, check_count, integer, span
+from edp.settings.bounds import MAX_NAMES, SHARE, check_bounds, check_count, integer, span
 
 BUDGET = span(0.0, 100_000.0)
 KINDS: Registry[type] = Registry("twin")
 """Every formulation, and the choice among several of them."""
-FOLDS = integer(1, MOST_MEMBERS)
+FOLDS = integer(1, MAX_MEMBERS)
 """Number of folds of a selection; a recurrent twin has one member per fold."""
 for _name, _formulation in TWINS.items():
     KINDS.register(_name)(_formulation)
@@ -49,7 +49,7 @@ class AutoTwin:
 
     def __post_init__(self) -> None:
         check_bounds("automatic twin", self, least_gain=SHARE, folds=FOLDS, prefix_ticks=PREFIX, minutes=BUDGET)
-        check_count("automatic twin", "candidates", self.candidates, MOST_NAMES, least=1)
+        check_count("automatic twin", "candidates", self.candidates, MAX_NAMES, least=1)
         for name in self.candidates:
             try:
                 _ = TWINS[name]

@@ -28,8 +28,8 @@ from edp.networks.twin.windows import MeasuredWindows
 from edp.settings.bounds import check_bounds, check_count, integer
 
 Doubles = NDArray[np.float64]
-MOST_ORDER, MOST_ROWS_BACK = 200, 100
-MOST_WINDOWS = 40_000
+MAX_ORDER, MAX_ROWS_BACK = 200, 100
+MAX_WINDOWS = 40_000
 """Maximum number of windows, evenly selected from long logs. Their factorisation takes seconds, and neighbouring
 windows are nearly equal."""
 CHUNK = 4096
@@ -46,10 +46,10 @@ KEPT_BACK = 5
 """Every fifth recording is kept back from the models whose orders compete."""
 SMALL = 1e-9
 """Fraction of the largest direction below which a direction counts as rounding."""
-LEAST_SHARE = 1e-4
+MIN_SHARE = 1e-4
 """Fraction of the largest singular value below which a state counts as noise. Filters of such states amplify
 rounding."""
-LEAST_NOISE = 1e-2
+MIN_NOISE = 1e-2
 """Minimum sensor noise, in standard deviations. On exact data a filter would trust one sample more than the model."""
 
 
@@ -77,7 +77,7 @@ class N4sid:
     prefix_ticks: int = 30
 
     def __post_init__(self) -> None:
-        order, rows = integer(1, MOST_ORDER), integer(2, MOST_ROWS_BACK)
+        order, rows = integer(1, MAX_ORDER), integer(2, MAX_ROWS_BACK)
         check_bounds("n4sid", self, orders=order, horizon=rows, prefix_ticks=PREFIX)
         check_count("n4sid", "orders", self.orders, 100, least=1)
 
@@ -241,7 +241,7 @@ class _Projections:
 
     def model(self, order: int) -> dict[str, Doubles]:
         """Return A, B, C and K of an order, limited to the highest order above rounding errors."""
-        order = min(order, int((self.sizes > LEAST_SHARE * self.sizes[0]).sum()))
+        order = min(order, int((self.sizes > MIN_SHARE * self.sizes[0]).sum()))
         answers = self.pairs[0][1].shape[1]
         root = np.sqrt(self.sizes[:order] / self.sizes[0])
         seen = self.left[:, :order] * root
@@ -268,7 +268,7 @@ def _windows(pairs: Sequence[Pair], horizon: int) -> Iterator[Pair]:
     length = 2 * horizon
     usable = [pair for pair in pairs if len(pair[0]) >= length]
     total = sum(len(u) - length + 1 for u, _ in usable)
-    every = max(1, total // MOST_WINDOWS)
+    every = max(1, total // MAX_WINDOWS)
     for u, y in usable:
         views = [np.moveaxis(sliding_window_view(part, length, axis=0)[::every], 2, 1) for part in (u, y)]
         for first in range(0, len(views[0]), CHUNK):
@@ -335,7 +335,7 @@ def _gain(a: Doubles, c: Doubles, process: Doubles, output: Doubles) -> Doubles:
     q, r, s = process.T @ process / rows, output.T @ output / rows, process.T @ output / rows
     # Never singular: exact data leave no noise, and a filter of none is not defined.
     q += SMALL * np.eye(len(q))
-    r += LEAST_NOISE**2 * np.eye(len(r))
+    r += MIN_NOISE**2 * np.eye(len(r))
     p = solve_discrete_are(a.T, c.T, q, r, s=s)
     return np.asarray(np.linalg.solve(c @ p @ c.T + r, (a @ p @ c.T + s).T).T)
 

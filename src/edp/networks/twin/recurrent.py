@@ -21,13 +21,13 @@ from edp.networks.twin.recurrent_cell import Bounds, TwinNetwork, buffers
 from edp.networks.twin.scales import Array, TwinScales
 from edp.networks.twin.static_map import StaticMap, StaticTwin
 from edp.networks.twin.steps import BranchResults, run_branches, run_forward
-from edp.settings.bounds import MOST_UNITS, check_bounds, integer
+from edp.settings.bounds import MAX_UNITS, check_bounds, integer
 
 PIECE = 256
 """Ticks that a run without gradients keeps at once: the loop writes what only a backward run would read."""
 MAP = "map_"
 """Prefix of the names of a static map's parameters within the twin."""
-MOST_MEMBERS = 32
+MAX_MEMBERS = 32
 MEMBER_SEED = 1000
 """Seed increment between members, so that few runs share a seed."""
 
@@ -57,7 +57,7 @@ class Recurrent:
     prefix_ticks: int = 30
 
     def __post_init__(self) -> None:
-        bounds = {"units": integer(1, MOST_UNITS), "members": integer(1, MOST_MEMBERS), "prefix_ticks": PREFIX}
+        bounds = {"units": integer(1, MAX_UNITS), "members": integer(1, MAX_MEMBERS), "prefix_ticks": PREFIX}
         check_bounds("recurrent twin", self, **bounds)
         if self.units % self.members:
             raise ConfigError(

@@ -22,10 +22,10 @@ from edp.networks.twin.greybox import Doubles, GreyBox, GreyTwin
 from edp.networks.twin.recurrent_cell import CellWeights, weight_gradients
 from edp.networks.twin.scales import Array, TwinScales
 from edp.settings.bounds import (
-    MOST_BATCH,
-    MOST_NAMES,
-    MOST_UNITS,
-    MOST_UPDATES,
+    MAX_BATCH,
+    MAX_NAMES,
+    MAX_UNITS,
+    MAX_UPDATES,
     above,
     check_bounds,
     check_count,
@@ -57,10 +57,10 @@ class Residual(GreyBox):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        count = integer(1, MOST_UPDATES)
-        bounds = {"units": integer(1, MOST_UNITS), "lanes": integer(1, MOST_BATCH), "lengths_s": above(0.0, 600.0)}
+        count = integer(1, MAX_UPDATES)
+        bounds = {"units": integer(1, MAX_UNITS), "lanes": integer(1, MAX_BATCH), "lengths_s": above(0.0, 600.0)}
         check_bounds("residual twin", self, updates=count, validate_every=count, **bounds)
-        check_count("residual twin", "lengths_s", self.lengths_s, MOST_NAMES, least=1)
+        check_count("residual twin", "lengths_s", self.lengths_s, MAX_NAMES, least=1)
         if len(self.lengths_s) != len(self.updates):
             raise ConfigError(
                 f"residual twin: {len(self.lengths_s)} lengths_s and {len(self.updates)} updates; one number of "

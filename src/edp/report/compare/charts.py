@@ -26,7 +26,7 @@ from edp.report.compare.runs import FREE, ComparedRun
 from edp.report.run.figures import log_ticks
 from edp.wording import figure, short_labels
 
-MOST_ROWS = 40
+MAX_ROWS = 40
 """Recordings that have a row of dots."""
 
 
@@ -115,7 +115,7 @@ def recording_chart(comparison: Comparison) -> Chart | None:
     measures = comparison.measures[:6]
     marks: list[Mark] = []
     base = comparison.errors(comparison.runs[0], measures[0])
-    order = [comparison.recordings[i] for i in base.argsort()][-MOST_ROWS:]
+    order = [comparison.recordings[i] for i in base.argsort()][-MAX_ROWS:]
     labels = dict(zip(order, short_labels(order), strict=True))
     for position, measure in enumerate(measures):
         when = {"measure": str(position)}

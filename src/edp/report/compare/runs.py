@@ -22,7 +22,7 @@ from edp.storage.paths import full_path, is_file_at
 from edp.storage.runs import describe_unfinished
 from edp.wording import figure, unit_text
 
-MOST_RUNS = 12
+MAX_RUNS = 12
 """Beside each other: more lines than that nobody tells apart."""
 MEAN = "mean over outputs"
 LOOK_AHEAD, FREE = "looks ahead", "runs free"
@@ -111,13 +111,13 @@ def read_runs(folders: Sequence[str | Path]) -> list[ComparedRun]:
         folders: run folders, or folders in them that `edp evaluate --data` wrote.
 
     Raises:
-        ConfigError: fewer than two, more than `MOST_RUNS`, or one twice.
+        ConfigError: fewer than two, more than `MAX_RUNS`, or one twice.
         StorageError: a folder holds no judged run, or something damaged.
         DataError: some of them look ahead and others run free.
     """
     paths = [Path(folder) for folder in folders]
-    if not 2 <= len(paths) <= MOST_RUNS:
-        raise ConfigError(f"{count_of(len(paths), 'run')} came; edp compare takes 2 to {MOST_RUNS} run folders")
+    if not 2 <= len(paths) <= MAX_RUNS:
+        raise ConfigError(f"{count_of(len(paths), 'run')} came; edp compare takes 2 to {MAX_RUNS} run folders")
     real = [full_path(path) for path in paths]
     for position, path in enumerate(real):
         if path in real[:position]:

@@ -24,7 +24,7 @@ from edp.report.control.facts import ControlFacts
 Array = NDArray[np.floating]
 LOOP = "loop"
 DIGITS = 5
-MOST_DRAWN = 1_500
+MAX_DRAWN = 1_500
 """Points of a line: more than a page's width resolves."""
 AXES = ("Boom", "Arm", "Bucket")
 
@@ -133,7 +133,7 @@ def reference_of(recording: Recording) -> Array:
 
 def drawn_rows(recording: Recording) -> slice:
     """Return the rows of drawn lines, evenly spread."""
-    return slice(0, None, max(1, recording.samples // MOST_DRAWN))
+    return slice(0, None, max(1, recording.samples // MAX_DRAWN))
 
 
 def evenly(recording: Recording, rows: slice) -> Evenly:

@@ -24,14 +24,14 @@ LEFT, RIGHT = 200, 34
 POINTS, CELLS, OVERVIEW_CELLS = 640, 320, 160
 """Most points of a line, and cells of a row: finer ones are pooled by their largest value; a page stays small."""
 PLOT_HEIGHT, ROW, TICKS_ROOM = 170, 17, 26
-MOST_RATIO = 3.0
+MAX_RATIO = 3.0
 """Statistic over limit where a line is cut off."""
 LEVELS = (1.5, 2.0, 3.0, 5.0)
 """Ends of the steps of a group's level, healthy below the first."""
 SHADES_OF_LEVELS = ("#f1f4f7", "#dbe7fb", "#9dbff5", "#e0a458", "#b3261e")
 MISSING_SHADE = "#ffffff"
-MOST_EVIDENCE = 10
-MOST_ROWS = 120
+MAX_EVIDENCE = 10
+MAX_ROWS = 120
 """Recordings of the overview."""
 MARKS = {"stop": "#b3261e", "warning": "#8f5c10", "note": "#2f7566"}
 TINTS = {"stop": "#f7dcda", "warning": "#f8ead6", "note": "#e0efeb"}
@@ -124,9 +124,9 @@ def timeline(trace: RecordingTrace, facts: MonitorFacts) -> Drawing:
 def overview(facts: MonitorFacts) -> Drawing:
     """Return one row per recording: the largest statistic over its limit as a shade, alarms as marks."""
     traces = facts.traces.recordings
-    if len(traces) > MOST_ROWS:
+    if len(traces) > MAX_ROWS:
         with_alarms = {alarm.recording for alarm in facts.alarms}
-        traces = tuple(sorted(traces, key=lambda trace: trace.name not in with_alarms))[:MOST_ROWS]
+        traces = tuple(sorted(traces, key=lambda trace: trace.name not in with_alarms))[:MAX_ROWS]
     longest = max((len(trace.ratios) for trace in traces), default=1) * facts.traces.block_s
     across = _across(max(longest, 1e-9))
     boxes, labels, patches = [], [], []
@@ -148,7 +148,7 @@ def overview(facts: MonitorFacts) -> Drawing:
 
 def evidence(alarm: AlarmFacts) -> Drawing:
     """Return the deviations of residual summaries since the onset, in healthy standard deviations."""
-    shown = alarm.evidence[:MOST_EVIDENCE]
+    shown = alarm.evidence[:MAX_EVIDENCE]
     most = max([abs(value) for _, value in shown] + [1.0])
     left, right = 260, 70
     middle, half = left + (WIDTH - left - right) / 2, (WIDTH - left - right) / 2
@@ -236,8 +236,8 @@ def _across(seconds: float) -> Across:
 
 
 def _height(ratio: float) -> float:
-    value = min(max(float(ratio), 0.0), MOST_RATIO) if np.isfinite(ratio) else 0.0
-    return round(PLOT_HEIGHT - (PLOT_HEIGHT - 16) * value / MOST_RATIO, 1)
+    value = min(max(float(ratio), 0.0), MAX_RATIO) if np.isfinite(ratio) else 0.0
+    return round(PLOT_HEIGHT - (PLOT_HEIGHT - 16) * value / MAX_RATIO, 1)
 
 
 def _path(points: Sequence[tuple[float, float]]) -> str:

@@ -17,13 +17,13 @@ from edp.settings.bounds import check_count, check_texts
 from edp.table import Column, Table, Value, figures
 from edp.wording import MISSING, count_text, label_by_name, listed, number, short_labels
 
-MOST_ALARMS = 40
+MAX_ALARMS = 40
 """With evidence each on a page, alarms that say the same as one; all of them stand in the log."""
-MOST_CAUSES = 5
+MAX_CAUSES = 5
 MAX_ENTRIES = 64
 """Maximum number of causes, and of pieces of evidence, per alarm."""
-MOST_SILENT = 6
-MOST_REMARKS = 6
+MAX_SILENT = 6
+MAX_REMARKS = 6
 OUTSIDE = "no alarm, but "
 """Beginning of a remark on residuals outside of their healthy range."""
 
@@ -152,9 +152,9 @@ def verdict(facts: MonitorFacts) -> list[str]:
         lines.append(f"What silence does not exclude: {facts.unseen}.")
     silent = sorted({name for trace in facts.traces.recordings for name in trace.silent})
     if silent:
-        shown = listed(silent[:MOST_SILENT]) + (f" and {len(silent) - MOST_SILENT} more" * (len(silent) > MOST_SILENT))
+        shown = listed(silent[:MAX_SILENT]) + (f" and {len(silent) - MAX_SILENT} more" * (len(silent) > MAX_SILENT))
         lines.append(f"Silent for want of channels in some recordings: {shown}; faults that only they show go unseen.")
-    for remark, names in list(facts.remarks.items())[:MOST_REMARKS]:
+    for remark, names in list(facts.remarks.items())[:MAX_REMARKS]:
         others = f" and {len(names) - 1} more" * (len(names) > 1)
         lines.append(f"Of {short_labels(names)[0]}{others}: {remark}.")
     if facts.classes == 0 and facts.alarms:
@@ -190,7 +190,7 @@ def alarm_table(facts: MonitorFacts) -> Table:
     """Return one row per alarm."""
     rows: list[tuple[Value, ...]] = []
     labels = label_by_name(alarm.recording for alarm in facts.alarms)
-    for alarm in facts.alarms[: 10 * MOST_ALARMS]:
+    for alarm in facts.alarms[: 10 * MAX_ALARMS]:
         start = facts.start_of(alarm.recording)
         first = alarm.causes[0] if alarm.causes else None
         rows.append((
@@ -220,7 +220,7 @@ def cause_table(alarm: AlarmFacts) -> Table | None:
             cause.at_fault if cause.at_fault != "none" else MISSING,
             cause.probability,
         )
-        for cause in alarm.causes[:MOST_CAUSES]
+        for cause in alarm.causes[:MAX_CAUSES]
     ]
     if not rows:
         return None

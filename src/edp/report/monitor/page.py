@@ -14,18 +14,18 @@ from edp.report.common.page import Page, Paragraph, Part, Section, Subsection
 from edp.report.common.templates import template
 from edp.report.monitor import facts as words
 from edp.report.monitor.drawing import LEVEL_TEXTS, MARKS, SHADES_OF_LEVELS, evidence, overview, timeline
-from edp.report.monitor.facts import MOST_ALARMS, MonitorFacts
+from edp.report.monitor.facts import MAX_ALARMS, MonitorFacts
 from edp.wording import unbroken
 
-MOST_TIMELINES = 16
+MAX_TIMELINES = 16
 
 
 def build_monitor_page(facts: MonitorFacts) -> Page:
     """Return the page of a run."""
     changes = episodes(facts.alarms)
-    alarms: list[Part] = [_alarm(facts, first, again) for first, *again in changes[:MOST_ALARMS]]
-    if len(changes) > MOST_ALARMS:
-        alarms.append(f"{len(changes) - MOST_ALARMS} more changes are in the log of the run.")
+    alarms: list[Part] = [_alarm(facts, first, again) for first, *again in changes[:MAX_ALARMS]]
+    if len(changes) > MAX_ALARMS:
+        alarms.append(f"{len(changes) - MAX_ALARMS} more changes are in the log of the run.")
     return Page(
         title=facts.title,
         kind="monitor",
@@ -58,7 +58,7 @@ def _time_lines(facts: MonitorFacts) -> list[Part]:
     with_alarms = {alarm.recording for alarm in facts.alarms}
     traces = [trace for trace in facts.traces.recordings if trace.name in with_alarms]
     # A page without alarms still shows one time line: how far below the limits all stayed.
-    shown = traces[:MOST_TIMELINES] or facts.traces.recordings[:1]
+    shown = traces[:MAX_TIMELINES] or facts.traces.recordings[:1]
     left_out = len(traces) - len(shown)
     return [
         "Each detector's statistic over its limit, alarms from their estimated onset to the moment they were raised, "

@@ -34,7 +34,7 @@ from edp.report.run.facts import INPUTS, NETWORK, TRUTH, Facts, horizon_text, la
 from edp.signals import display_offset
 from edp.wording import figure, label_by_name, short_labels
 
-MOST_PANELS, MOST_SERIES = 6, 7
+MAX_PANELS, MAX_SERIES = 6, 7
 """Units that have a panel, and signals in one: more lines nobody tells apart."""
 POINTS = 1500
 """Points of a drawn signal."""
@@ -298,16 +298,16 @@ def signal_chart(facts: Facts) -> Chart | None:
         # Numbers without a unit have no common axis: each stands alone.
         by_unit.setdefault(channel.unit if channel.unit != "1" else f"1 {column}", []).append(column)
     panels, names = [], short_labels(channel.name for channel in channels)
-    for columns in list(by_unit.values())[:MOST_PANELS]:
+    for columns in list(by_unit.values())[:MAX_PANELS]:
         unit = channels[columns[0]].unit
         marks: list[Mark] = []
-        labels = [names[column] for column in columns[:MOST_SERIES]]
+        labels = [names[column] for column in columns[:MAX_SERIES]]
         for label, column, colour in zip(labels, columns, (BLUE, *SHADES)):
             y = np.asarray(values[:, column] * channels[column].factor + display_offset(unit), dtype=np.float32)
             selected = figures.downsample(y, POINTS)
             x = (selected / rate).astype(np.float32)
             marks.append(DataSeries(x=x, y=y[selected], name=label, colour=colour, width=1.2))
-        more = f", {len(columns) - MOST_SERIES} more not drawn" if len(columns) > MOST_SERIES else ""
+        more = f", {len(columns) - MAX_SERIES} more not drawn" if len(columns) > MAX_SERIES else ""
         title = labels[0] if unit == "1" else append_unit("", unit).strip() + more
         panels.append(Panel(tuple(marks), ChartAxis("Time [s]" if facts.rate_hz else "Sample"), title=title))
     return Chart("signals", tuple(panels), height=100 + 150 * len(panels), together=True)

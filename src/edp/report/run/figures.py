@@ -17,7 +17,7 @@ from edp.report.run.facts import HIGH, INPUTS, LOW, NETWORK, NO_MODELS, TRUTH, F
 WHOLE, EXCERPT = "whole", "excerpt"
 POINT_BUDGET = 250_000  # of all prediction traces together: about 2 MB of the page
 RECORDINGS_SHOWN, HORIZONS_SHOWN = 6, 4
-LEAST_POINTS = 200  # of a trace: fewer no longer show its shape
+MIN_POINTS = 200  # of a trace: fewer no longer show its shape
 EXCERPT_SECONDS = 12.0
 Array = NDArray[np.floating]
 
@@ -116,12 +116,12 @@ def prediction_lines(facts: Facts, budget: int = POINT_BUDGET) -> list[Line]:
     horizons = horizons_shown(facts)
     each = len(facts.targets) * (1 + len(horizons) * max((_count_lines(facts, name) for name in recordings), default=0))
     # Many outputs: fewer recordings, so that what is drawn keeps its shape and the page its size.
-    recordings = recordings[: max(1, budget // (2 * LEAST_POINTS * max(each, 1)))]
+    recordings = recordings[: max(1, budget // (2 * MIN_POINTS * max(each, 1)))]
     models = sum(_count_lines(facts, name) for name in recordings)
     traces = len(facts.targets) * (len(recordings) + models * len(horizons))
     if traces == 0 or not horizons:
         return []
-    points = int(np.clip(budget // (2 * traces), LEAST_POINTS, 2000))
+    points = int(np.clip(budget // (2 * traces), MIN_POINTS, 2000))
     lines: list[Line] = []
     for recording in recordings:
         truth = facts.predictions[recording][TRUTH]

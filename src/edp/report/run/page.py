@@ -29,7 +29,7 @@ MODELS = (
     "validation part, which also chose their sizes. Only the model that is kept has met the test recordings; a dash "
     "stands where nothing was measured."
 )
-MOST_OPEN = 3
+MAX_OPEN = 3
 """Tables of models that are shown from the beginning."""
 
 
@@ -182,7 +182,7 @@ def _choice(facts: run.Facts) -> list[Part | None]:
         f"{why} The test recordings played no part in the choice.",
         candidates_table(choice),
         promise_table(facts, choice),
-        Fold("Every model, output by output", [MODELS, *models], is_open=len(models) <= MOST_OPEN),
+        Fold("Every model, output by output", [MODELS, *models], is_open=len(models) <= MAX_OPEN),
     ]
 
 

@@ -13,7 +13,7 @@ from edp.report.run.figures import aligned, headline_first
 from edp.table import Column, Table
 from edp.wording import number
 
-LEAST_LAGS, LAGS_PER_HORIZON, MOST_LAGS = 40, 3, 400
+MIN_LAGS, LAGS_PER_HORIZON, MAX_LAGS = 40, 3, 400
 """Lags of the correlogram: enough beyond the horizon to see a rhythm, few enough to draw."""
 WHITE = 2.576
 """Standard errors that hold 99 % of the correlations of white noise."""
@@ -60,7 +60,7 @@ def correlations(facts: Facts, horizon: int, output: int) -> tuple[NDArray[np.fl
         if len(piece) and np.isfinite(piece).all():
             pieces.append(piece)
     count = sum(map(len, pieces))
-    lags = min(max(LEAST_LAGS, LAGS_PER_HORIZON * horizon), MOST_LAGS, count // 4)
+    lags = min(max(MIN_LAGS, LAGS_PER_HORIZON * horizon), MAX_LAGS, count // 4)
     if not pieces or lags < 2:
         return np.empty(0), count
     mean = float(np.concatenate(pieces).mean())

@@ -25,8 +25,8 @@ MEASURES = {
 """Measures of dependence, the thesis's two figures first."""
 METRICS = {**MEASURES, "lag": "Best lag"}
 UNITS = {"information": "nat", "lag": "samples"}
-MOST_CURVES = 16
-MOST_BARS = 40
+MAX_CURVES = 16
+MAX_BARS = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +126,7 @@ def lag_views(screening: ScreeningResult) -> tuple[LagView, ...]:
     views = []
     for target in screening.targets:
         curves = [c for c in screening.lags if c.target == target and c.channel != target and math.isfinite(c.value)]
-        best = sorted(curves, key=lambda curve: -abs(curve.value))[:MOST_CURVES]
+        best = sorted(curves, key=lambda curve: -abs(curve.value))[:MAX_CURVES]
         if best:
             views.append(LagView(target, tuple(best)))
     return tuple(views)
@@ -200,9 +200,9 @@ def _stability(
             math.copysign(e.chance, e.mean),  # chance is a size; it stands on the bar's side
             e.channel in proposed,
         )
-        for e in ranked[:MOST_BARS]
+        for e in ranked[:MAX_BARS]
     )
-    return BarView(metric, target, title, _make_labels_unique(bars), max(0, len(ranked) - MOST_BARS))
+    return BarView(metric, target, title, _make_labels_unique(bars), max(0, len(ranked) - MAX_BARS))
 
 
 def _make_labels_unique(bars: Sequence[Bar]) -> tuple[Bar, ...]:
@@ -220,7 +220,7 @@ def importance_views(screening: ScreeningResult) -> tuple[BarView, ...]:
         ranked = sorted(entries, key=lambda entry: -entry.increase)
         bars = tuple(
             Bar(joined(e.members), e.increase, e.low, e.high, proposed=bool(proposed & set(e.members)))
-            for e in ranked[:MOST_BARS]
+            for e in ranked[:MAX_BARS]
         )
         if bars:
             views.append(
@@ -229,7 +229,7 @@ def importance_views(screening: ScreeningResult) -> tuple[BarView, ...]:
                     target,
                     "Permutation importance",
                     _make_labels_unique(bars),
-                    max(0, len(ranked) - MOST_BARS),
+                    max(0, len(ranked) - MAX_BARS),
                 )
             )
     return tuple(views)
@@ -242,10 +242,10 @@ def value_views(screening: ScreeningResult) -> tuple[BarView, ...]:
     for target in screening.targets:
         entries: list[Value] = [entry for entry in screening.values if entry.target == target]
         ranked = sorted(entries, key=lambda entry: -entry.gain)
-        bars = tuple(Bar(e.channel, e.gain, e.low, e.high, proposed=e.channel in proposed) for e in ranked[:MOST_BARS])
+        bars = tuple(Bar(e.channel, e.gain, e.low, e.high, proposed=e.channel in proposed) for e in ranked[:MAX_BARS])
         if bars:
             views.append(
-                BarView("value", target, "Linear value", _make_labels_unique(bars), max(0, len(ranked) - MOST_BARS))
+                BarView("value", target, "Linear value", _make_labels_unique(bars), max(0, len(ranked) - MAX_BARS))
             )
     return tuple(views)
 

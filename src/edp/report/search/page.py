@@ -18,7 +18,7 @@ from edp.storage import make_folder, write_bytes
 from edp.table import Table
 from edp.wording import escape_markdown, number
 
-MOST_IN_A_LINE = 4
+MAX_IN_A_LINE = 4
 """Sentences of a decision that are shown as text; more are a list."""
 VARIANCE = (
     "Every run of phase 0 in the same order of folds. A line joins the seeds of a run, a bar is the arm's mean: folds "
@@ -220,7 +220,7 @@ def _figure(charts: Mapping[str, Chart], name: str, text: str, title: str = "") 
 
 def _sentences(lines: Sequence[str]) -> str | Points:
     """Return sentences as text, many of them as a list."""
-    return Points(lines[1:], lines[0]) if len(lines) > MOST_IN_A_LINE else " ".join(lines)
+    return Points(lines[1:], lines[0]) if len(lines) > MAX_IN_A_LINE else " ".join(lines)
 
 
 def _settings(study: StudyFile) -> list[tuple[str, str]]:

@@ -9,7 +9,7 @@ from edp.evaluation.free_run_file import CandidateRow, CandidatesFile
 from edp.storage.paths import is_file_at
 from edp.table import Column, Table, Value, figures
 
-MOST_CANDIDATES = 100
+MAX_CANDIDATES = 100
 """Rows that are read; a choice leaves a dozen."""
 
 
@@ -21,7 +21,7 @@ def read_candidates(folder: str | Path) -> tuple[CandidateRow, ...]:
     """
     if not is_file_at(Path(folder) / CandidatesFile.NAME):
         return ()
-    return CandidatesFile.read(folder).candidates[:MOST_CANDIDATES]
+    return CandidatesFile.read(folder).candidates[:MAX_CANDIDATES]
 
 
 def choice_sentence(rows: Sequence[CandidateRow]) -> str:

@@ -31,11 +31,11 @@ from edp.signals import KINDS, Kind, display_offset
 from edp.wording import figure, label_by_name
 
 RECORDING, MODEL, COMMAND = "recording", "model", "command"
-MOST_PANELS = 6
+MAX_PANELS = 6
 """Panels of step responses."""
 DIGITS = 4
 """Significant digits of drawn values: more than a picture shows, a third of the bytes."""
-MOST_DRAWN = 4_000
+MAX_DRAWN = 4_000
 """Points of a line: more than a picture's width resolves."""
 KINDS_DRAWN = {
     "velocities": (Kind.VELOCITY, Kind.ANGULAR_VELOCITY),
@@ -119,7 +119,7 @@ def steps_chart(steps: StepResponses) -> Chart | None:
         return None
     seconds, panels = steps.seconds, []
     labels = label_by_name(answer.name for answer in steps.steps[0].answers)
-    for row, first in enumerate(steps.steps[0].answers[:MOST_PANELS]):
+    for row, first in enumerate(steps.steps[0].answers[:MAX_PANELS]):
         marks: list[Mark] = []
         for step in steps.steps:
             answer, when = step.answers[row], {COMMAND: step.command}
@@ -165,7 +165,7 @@ def write_rollout_plots(rollout: Recording, suffix: str, start_s: float, folder:
 
 def _rollout_chart(name: str, rollout: Recording, columns: list[str], suffix: str, start_s: float) -> Chart:
     # Ends belong to the picture: how far a free run is off in the end is what it shows.
-    at = np.unique(np.linspace(0, rollout.samples - 1, MOST_DRAWN).astype(int))
+    at = np.unique(np.linspace(0, rollout.samples - 1, MAX_DRAWN).astype(int))
     time_s = start_s + at / rollout.rate_hz
     panels, labels = [], label_by_name(columns)
     for column in columns:

@@ -39,7 +39,7 @@ from edp.table import Column, Table, Value, figures
 from edp.wording import figure, listed, number, percent, short_labels
 
 SITUATIONS = {"end_stops": "at an end stop", "rest": "at rest (idling)", "motion": "in motion"}
-MOST_ROWS = 40
+MAX_ROWS = 40
 """Recordings of a table, the worst first: nobody reads more."""
 PLAIN_UNIT = "1"
 
@@ -253,7 +253,7 @@ def _worst(summaries: Mapping[str, RunSummary]) -> dict[str, RunSummary]:
         return max((value or 0.0 for value in last.by_channel.values()), default=0.0)
 
     ranked = sorted(summaries.items(), key=lambda entry: -size(entry[1]))
-    return dict(ranked[:MOST_ROWS])
+    return dict(ranked[:MAX_ROWS])
 
 
 def _summary_table(

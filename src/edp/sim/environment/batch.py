@@ -23,7 +23,7 @@ ALL = slice(None)
 Infos = dict[str, object]
 Options = Mapping[str, object]
 AutoresetMode = gymnasium.vector.AutoresetMode
-MOST_MACHINES = 65_536
+MAX_MACHINES = 65_536
 
 
 class StepOutcome(NamedTuple):
@@ -143,8 +143,8 @@ def checked_mode(what: str, num_envs: int, mode: Any) -> Any:
     Raises:
         ConfigError: there is no such mode, or there are too many or too few environments.
     """
-    if not 1 <= num_envs <= MOST_MACHINES:
-        raise ConfigError(f"{what}: num_envs = {num_envs}; give 1 to {MOST_MACHINES}")
+    if not 1 <= num_envs <= MAX_MACHINES:
+        raise ConfigError(f"{what}: num_envs = {num_envs}; give 1 to {MAX_MACHINES}")
     try:
         return AutoresetMode(mode)
     except ValueError as error:

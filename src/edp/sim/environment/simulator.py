@@ -13,7 +13,7 @@ from edp.sim.environment.batch import Bools, Index, Infos, Options, PlantBatch, 
 from edp.sim.environment.library import gymnasium
 from edp.sim.environment.model import NominalMachine
 from edp.sim.environment.spec import EnvironmentSpec
-from edp.sim.environment.start import MOST_SEED, episode_start
+from edp.sim.environment.start import MAX_SEED, episode_start
 from edp.sim.environment.truth import Truth
 from edp.sim.episodes.episodes import Episodes, Moment
 from edp.sim.machine.machine import Machine
@@ -61,7 +61,7 @@ class SimulatorBatch(PlantBatch):
 
     def begin(self, index: int, seed: int | None, rng: np.random.Generator, options: Options) -> Infos:
         """Begin an episode; see `edp.sim.environment.start` for the options."""
-        seed = int(rng.integers(MOST_SEED)) if seed is None else seed
+        seed = int(rng.integers(MAX_SEED)) if seed is None else seed
         start, facts = episode_start(self._settings[index], seed, options)
         self.episodes.begin(index, start, self._present)
         self._enter(index)

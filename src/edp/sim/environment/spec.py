@@ -22,8 +22,8 @@ from edp.wording import typed
 
 OBSERVED = (*TABLE_A1, "CylStroke_1", "CylStroke_2", "CylStroke_3")
 """What is shown unless told otherwise: Table A.1, and the strokes, which have no model of a sensor."""
-MOST_LATENCY = 1000
-MOST_SAMPLES = 10_000_000
+MAX_LATENCY = 1000
+MAX_SAMPLES = 10_000_000
 """Of an episode: its random numbers are drawn at reset, 152 bytes a tick."""
 
 
@@ -72,11 +72,11 @@ class EnvironmentSpec:
         for key in ("start_strokes", "observed", "masses_t"):
             object.__setattr__(self, key, tuple(getattr(self, key)))
         object.__setattr__(self, "faults", faults_of(self.faults, "environment"))
-        check_bounds("environment", self, loop_latency=integer(0, MOST_LATENCY), lost_frames=span(0.0, 0.99))
+        check_bounds("environment", self, loop_latency=integer(0, MAX_LATENCY), lost_frames=span(0.0, 0.99))
         self.scenario(0)
-        if self.duration_s * self.rate_hz > MOST_SAMPLES:
+        if self.duration_s * self.rate_hz > MAX_SAMPLES:
             raise ConfigError(
-                f"environment: duration_s = {self.duration_s} at rate_hz = {self.rate_hz} is more than {MOST_SAMPLES} "
+                f"environment: duration_s = {self.duration_s} at rate_hz = {self.rate_hz} is more than {MAX_SAMPLES} "
                 "ticks; choose shorter episodes"
             )
         if not self.observed or len(set(self.observed)) < len(self.observed):

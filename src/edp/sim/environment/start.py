@@ -31,7 +31,7 @@ OF_SPEC = (
 """Settings that the options of a reset may override for one episode."""
 OWN = ("strokes", "oil_temperature")
 """Options besides: strokes to start from (shares of full), and the oil's temperature at the start (degC)."""
-MOST_SEED = 2**31 - 1
+MAX_SEED = 2**31 - 1
 
 
 def episode_start(spec: EnvironmentSpec, seed: int, options: Options) -> tuple[EpisodeStart, Infos]:

@@ -295,10 +295,10 @@ def _rows(start: EpisodeStart, width: int) -> tuple[Array, Array]:
     if start.strokes is not None:
         strokes = np.array(start.strokes)
     plant = Plant(machine, strokes, scenario.rate_hz, scenario.step_s, ground, spare_s(scenario.faults))
-    if len(plant.past) > tick.MOST_PAST:
+    if len(plant.past) > tick.MAX_PAST:
         raise ConfigError(
             f"machine {machine.name} has dead times of {len(plant.past)} ticks at {scenario.rate_hz} Hz; at most "
-            f"{tick.MOST_PAST} are taken: choose a lower rate_hz"
+            f"{tick.MAX_PAST} are taken: choose a lower rate_hz"
         )
     coarse, fine = plant.clocks
     soil_numbers, tables, course, heights, ground_memory = soil.no_ground() if ground is None else ground.arrays()

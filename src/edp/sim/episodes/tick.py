@@ -61,7 +61,7 @@ def scratch_of(scratch: Array) -> tuple[Array, ...]:
 
 
 SCRATCH = places.FROZEN + 28 + 3 * at.OPENINGS + 4 * places.SLOPES + terramechanics.CONTACTS + 5 * at.STATES
-MOST_PAST = 256
+MAX_PAST = 256
 """Samples of dead time that a machine may have."""
 
 
@@ -184,7 +184,7 @@ def step_all(
         levers: positions, shape (episode, 3); beyond [-1, 1] they stand at the end.
         active: episodes to step, shape (episode,).
         columns: what is shown, see `SOURCES`.
-        scratch: at least `SCRATCH` and ``6 (MOST_PAST + 2) + 9`` values.
+        scratch: at least `SCRATCH` and ``6 (MAX_PAST + 2) + 9`` values.
         out: filled for the active ones.
     """
     for e in range(memory.shape[0]):
@@ -192,8 +192,8 @@ def step_all(
         if active[e] and not finite(levers[e, 0] + levers[e, 1] + levers[e, 2]):
             return e, NOT_FINITE_LEVER
     lever, work = scratch[:3].reshape(1, 3), scratch[3:9].reshape(2, 3)
-    room = scratch[9 : 9 + at.SPOOLS * (MOST_PAST + 2)]
-    rest = scratch[9 + at.SPOOLS * (MOST_PAST + 2) :]
+    room = scratch[9 : 9 + at.SPOOLS * (MAX_PAST + 2)]
+    rest = scratch[9 + at.SPOOLS * (MAX_PAST + 2) :]
     failed, how = -1, FINE
     for e in range(memory.shape[0]):
         if not active[e]:
@@ -219,7 +219,7 @@ def step_all(
 @compiled
 def begin(memory: Array, drawn: Array, columns: NDArray[np.int64], scratch: Array, index: int, out: Out) -> None:
     """Write the observation of episode `index` before its first sample; `memory` and `drawn` are its rows."""
-    rest, work = scratch[9 + at.SPOOLS * (MOST_PAST + 2) :], scratch[3:9].reshape(2, 3)
+    rest, work = scratch[9 + at.SPOOLS * (MAX_PAST + 2) :], scratch[3:9].reshape(2, 3)
     setup = setup_of(memory, drawn, rest)
     change(memory, drawn)
     look(memory, drawn, setup, work)
@@ -228,4 +228,4 @@ def begin(memory: Array, drawn: Array, columns: NDArray[np.int64], scratch: Arra
 
 def new_scratch() -> Array:
     """Return the scratch array for `step_all` and `begin`."""
-    return np.zeros(9 + at.SPOOLS * (MOST_PAST + 2) + SCRATCH)
+    return np.zeros(9 + at.SPOOLS * (MAX_PAST + 2) + SCRATCH)

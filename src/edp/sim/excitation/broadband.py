@@ -27,7 +27,7 @@ class Broadband(Excitation):
     DRAWS = 16
     LEAN = 1.2
     """Lever per share of the stroke from where the pose should be: slow, so that it adds no power above 0.2 Hz."""
-    MOST_LEAN = 0.3
+    MAX_LEAN = 0.3
     POSES = (0.1, 0.9)
     """Strokes that courses lean to, as shares."""
     PIECE_S = 0.1
@@ -44,7 +44,7 @@ class Broadband(Excitation):
         if self._done >= len(self._course):
             self._begin()
         count = min(max(1, round(self.PIECE_S * self._rate)), len(self._course) - self._done)
-        asked = np.clip(self.LEAN * (self._pose - view.strokes), -self.MOST_LEAN, self.MOST_LEAN)
+        asked = np.clip(self.LEAN * (self._pose - view.strokes), -self.MAX_LEAN, self.MAX_LEAN)
         # A lean that follows the stroke with a second of delay: steps of it would be power at all frequencies.
         share = 1.0 - np.exp(-np.arange(1, count + 1)[:, None] / self._rate)
         leans = self._lean + (asked - self._lean) * share

@@ -18,7 +18,7 @@ class EndStops(Excitation):
     STRETCH_S = 0.4
     """A push is given in stretches, so that the end is noticed soon after it is reached."""
     HOLD_S = (0.5, 1.0)
-    MOST_STRETCHES = 13
+    MAX_STRETCHES = 13
     """Pushes (5.2 s) after which a cylinder that does not reach its end is left alone."""
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
@@ -52,7 +52,7 @@ class EndStops(Excitation):
             self._sign = 1.0 if rng.random() < extend_probability(view.strokes[self._runner], 0.6) else -1.0
             self._pushed = 0
             self._hold.start(*AxisStream.HOLD_S)
-        elif self._phase == PUSH and (reached or self._pushed >= self.MOST_STRETCHES):
+        elif self._phase == PUSH and (reached or self._pushed >= self.MAX_STRETCHES):
             self._phase = HOLD
             self._levels[self._runner] = self._sign * rng.uniform(0.3, 0.8)
             self._hold.start(*self.HOLD_S)

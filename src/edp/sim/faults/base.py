@@ -34,11 +34,11 @@ LENGTH: Units = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 TEMPERATURE: Units = {"K": 1.0}
 NO_UNIT: Units = {}
 """Units of kinds without a size."""
-MOST_FAULTS = 8
+MAX_FAULTS = 8
 """Maximum number of faults per recording. Each fault has one of the channels `edp.signals.FAULT_CHANNELS`."""
-MOST_SECONDS = 1e7
+MAX_SECONDS = 1e7
 """Maximum onset, ramp and period, s. No recording is longer."""
-LEAST_SECONDS = 0.05
+MIN_SECONDS = 0.05
 """Minimum active and inactive time of an intermittent fault, s. The kind `dropout` describes faster loose contacts."""
 
 
@@ -187,18 +187,18 @@ class FaultSpec:
         if self.site and not kind.sites:
             raise ConfigError(f"{what}: site {shown(self.site)} must be left out; a machine has one such part")
         _check_size(what, kind, self.size, self.unit)
-        seconds = span(0.0, MOST_SECONDS)
+        seconds = span(0.0, MAX_SECONDS)
         for name in ("onset_s", "ramp_s", "on_s", "off_s"):
             value = getattr(self, name)
             if not seconds.holds(value):
                 raise ConfigError(f"{what}: {name} = {shown(value)}; {seconds.rule(name)} must hold")
         if self.ramp_s > 0.0 and not kind.units:
             raise ConfigError(f"{what}: ramp_s = {setting_text(self.ramp_s)} must be 0: this kind is there or not")
-        if (self.on_s > 0.0) != (self.off_s > 0.0) or 0.0 < min(self.on_s, self.off_s) < LEAST_SECONDS:
+        if (self.on_s > 0.0) != (self.off_s > 0.0) or 0.0 < min(self.on_s, self.off_s) < MIN_SECONDS:
             raise ConfigError(
                 f"{what}: on_s = {setting_text(self.on_s)} and off_s = {setting_text(self.off_s)}; an intermittent "
                 "fault needs both, "
-                f"{LEAST_SECONDS} s at least; leave both out for one that stays"
+                f"{MIN_SECONDS} s at least; leave both out for one that stays"
             )
 
     @property

@@ -9,10 +9,10 @@ from typing import Any
 
 from edp.errors import ConfigError, closest
 from edp.settings.bounds import check_count, shown
-from edp.sim.faults.base import FAULTS, MOST_FAULTS, FaultSpec, among
+from edp.sim.faults.base import FAULTS, MAX_FAULTS, FaultSpec, among
 from edp.storage.reading import Table
 
-MOST_CHARACTERS = 200
+MAX_CHARACTERS = 200
 """Maximum length of the text of one fault."""
 GRAMMAR = "KIND[:SITE][:SIZE][@ONSET][,ramp=TIME][,on=TIME,off=TIME]"
 EXAMPLE = "internal_leak:boom:3L/min@120s,ramp=30s"
@@ -27,8 +27,8 @@ def parse_fault(text: str) -> FaultSpec:
         ConfigError: the text does not follow the grammar, or names an unknown kind, site or unit.
     """
     where = f"fault {shown(text)}"
-    if not text or len(text) > MOST_CHARACTERS or not text.isprintable():
-        raise ConfigError(f"{where}: write {GRAMMAR} with at most {MOST_CHARACTERS} characters, such as {EXAMPLE}")
+    if not text or len(text) > MAX_CHARACTERS or not text.isprintable():
+        raise ConfigError(f"{where}: write {GRAMMAR} with at most {MAX_CHARACTERS} characters, such as {EXAMPLE}")
     head, *options = text.split(",")
     what, at_sign, onset = head.partition("@")
     name, *rest = what.split(":")
@@ -81,7 +81,7 @@ def faults_of(faults: Any, where: str) -> tuple[FaultSpec, ...]:
     if isinstance(faults, str) or not isinstance(faults, Iterable):
         raise ConfigError(f"{where}: faults = {shown(faults)} must be a list of faults, such as ['{EXAMPLE}']")
     specs = tuple(map(_fault_of, faults))
-    check_count(where, "faults", specs, MOST_FAULTS)
+    check_count(where, "faults", specs, MAX_FAULTS)
     return specs
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from edp.errors import ConfigError
-from edp.settings.bounds import LEAST_POSITIVE
+from edp.settings.bounds import MIN_POSITIVE
 from edp.settings.tree import SettingsTree
 from edp.sim.machine import layout as at
 from edp.sim.machine import option_checks
@@ -24,7 +24,7 @@ from edp.wording import setting_text, typed
 MACHINE_FILE = SettingsTree(what="machine file", positions={Triple: CYLINDERS, Ratings: CYLINDERS})
 BEYOND_STOPS = math.radians(4.0)
 """How far beyond its stops a joint must still have a lever arm: impacts push it there."""
-LEAST_LEVER = 0.08
+MIN_LEVER = 0.08
 """Least lever arm |dx/dpsi| (m/rad) as a share of the stroke (m): below it an impact can turn the linkage over."""
 
 
@@ -34,7 +34,7 @@ LARGEST = 1e15
 
 @dataclass(frozen=True)
 class ParameterBound:
-    """Limits of a parameter; `above` makes the lower limit strict and refuses values below `LEAST_POSITIVE`."""
+    """Limits of a parameter; `above` makes the lower limit strict and refuses values below `MIN_POSITIVE`."""
 
     low: float = -LARGEST
     high: float = LARGEST
@@ -44,7 +44,7 @@ class ParameterBound:
     def holds(self, value: float) -> bool:
         """Return whether the value is within the bound."""
         fits = (value > self.low if self.above else value >= self.low) and value <= self.high
-        if self.above and self.low == 0.0 and value < LEAST_POSITIVE:
+        if self.above and self.low == 0.0 and value < MIN_POSITIVE:
             return False
         return fits and (not self.integer or value == int(value))
 
@@ -361,7 +361,7 @@ def _check_levers(axis: int, low: float, high: float, axes: Any, plant: Any, whe
     # Where the loop cannot close there is no lever arm: worse than any that is too short.
     levers = [sign * linkage.cylinder(axis, p, plant)[1] if ok else -math.inf for p, ok in zip(psi, closes)]
     worst = int(np.argmin(levers))
-    least = LEAST_LEVER * float(axes[axis, at.STROKE])
+    least = MIN_LEVER * float(axes[axis, at.STROKE])
     # Negated, so that NaN is refused as well.
     if not levers[worst] >= least:
         lever_text = f"{levers[worst]:.3f} m/rad" if math.isfinite(levers[worst]) else "none, the loop cannot close"
@@ -369,5 +369,5 @@ def _check_levers(axis: int, low: float, high: float, axes: Any, plant: Any, whe
             f"machine file {where} [{table}]: the lever arm of the {name} cylinder at joint angle "
             f"{math.degrees(psi[worst]):.0f} deg is {lever_text}; from 4 deg below to 4 deg above the working range "
             f"({math.degrees(low):.0f} to {math.degrees(high):.0f} deg) it must keep its sign and be at least "
-            f"{least:.3f} m/rad ({typed(LEAST_LEVER)} of the stroke); change the pins, closed_length or stroke"
+            f"{least:.3f} m/rad ({typed(MIN_LEVER)} of the stroke); change the pins, closed_length or stroke"
         )

@@ -11,9 +11,9 @@ from edp.sim.physics import lines
 from edp.wording import typed
 
 CYLINDERS = ("boom", "arm", "bucket")
-MOST_BLED = 0.1
+MAX_BLED = 0.1
 """Largest share of a pump's flow that the bleed of a load-sensing block takes at its margin."""
-LEAST_BORE = 1e-3
+MIN_BORE = 1e-3
 """m: below it a line is an orifice, and its length has no meaning."""
 SOFTEST = 1e7
 """Pa, bulk modulus of walls that give way more than any hose's, 1e8 to 1e9 Pa."""
@@ -59,14 +59,14 @@ def check_load_sensing(machine: Machine, where: str) -> None:
             f"{pumps.relief!r} Pa"
         )
     bled = conductance(pumps.bypass) * math.sqrt(pumps.load_margin)
-    least, most = pumps.min_displacement * pumps.max_flow, MOST_BLED * pumps.max_flow
+    least, most = pumps.min_displacement * pumps.max_flow, MAX_BLED * pumps.max_flow
     if not least <= bled <= most:
         raise ConfigError(
             f"machine file {where} [pumps]: bypass = {list(pumps.bypass)!r} bleeds {typed(bled * 6e4, 3)} L/min at "
             f"load_margin = {pumps.load_margin!r} Pa; with load sensing the centre is closed but for a bleed, from "
             f"{typed(least * 6e4, 3)} L/min (min_displacement, which must go somewhere) to {typed(most * 6e4, 3)} "
             "L/min "
-            f"({typed(MOST_BLED)} of max_flow); change bypass or min_displacement"
+            f"({typed(MAX_BLED)} of max_flow); change bypass or min_displacement"
         )
 
 
@@ -84,10 +84,10 @@ def check_lines(machine: Machine, where: str) -> None:
                     "lines between valve and cylinders; give line_bore in [cylinders], too, or leave it out"
                 )
         return
-    if min(cylinders.line_bore) < LEAST_BORE:
+    if min(cylinders.line_bore) < MIN_BORE:
         raise ConfigError(
             f"machine file {where} [cylinders]: line_bore = {list(cylinders.line_bore)!r} must be at least "
-            f"{typed(LEAST_BORE)} m for all cylinders, or 0 for all"
+            f"{typed(MIN_BORE)} m for all cylinders, or 0 for all"
         )
     for name, modulus in zip(CYLINDERS, cylinders.line_modulus, strict=True):
         if 0.0 < modulus < SOFTEST:

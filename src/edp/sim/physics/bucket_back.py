@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 # numbers of the back: share pushed ahead (0: the back moves no soil), N/m^2 and N/m of depth, tangent of its friction
 SHARE, WEIGHT, HOLD, LIFT = range(4)
 VALUES = 4
-LEAST_FRICTION = math.radians(0.1)
+MIN_FRICTION = math.radians(0.1)
 """Friction (rad) below which that of cohesion alone, 2 c, is reached to 0.2 %."""
 AHEAD_CELLS, BEHIND_CELLS, ASIDE_CELLS = 4, 2, 3
 """Cells over which soil spreads ahead of the back, behind it, and on either side of the heel."""
@@ -49,7 +49,7 @@ def pack(material: Material, width: float) -> Array:
     """Return the parameters of the back for compiled code, all 0 if it moves no soil."""
     if material.back_push == 0.0:
         return np.zeros(VALUES)
-    friction = max(math.radians(material.friction_deg), LEAST_FRICTION)
+    friction = max(math.radians(material.friction_deg), MIN_FRICTION)
     wall = min(math.radians(material.back_friction_deg), friction)
     k = passive_coefficient(friction, wall)
     weight = 0.5 * material.density * GRAVITY * k * width

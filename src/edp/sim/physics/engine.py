@@ -11,7 +11,7 @@ from edp.sim.machine import layout as at
 from edp.sim.physics.jit import compiled
 
 Array = NDArray[np.float64]
-LEAST_SPEED = 0.3
+MIN_SPEED = 0.3
 """Share of the governed speed at which an engine that would stall is held: below it no diesel engine runs."""
 
 
@@ -46,5 +46,5 @@ def turn(row: Array, plant: Array, time_s: float) -> None:
         new = math.sqrt(max(left, 0.0))
     elif new < 1.0 - droop:
         new = math.sqrt(max(left + per_watt * power, 0.0))
-    plant[at.ENGINE_SPEED] = max(new, LEAST_SPEED)
+    plant[at.ENGINE_SPEED] = max(new, MIN_SPEED)
     plant[at.MAX_FLOW] = plant[at.RATED_FLOW] * plant[at.ENGINE_SPEED]

@@ -47,9 +47,9 @@ STONE_STEP = 0.005
 """Travel (m) a cell of the stones' column."""
 COURSE = 8192
 """Cells of a course; its stones repeat after 41 m of travel in soil."""
-LEAST_RAKE, MOST_RAKE = 10, 120
+MIN_RAKE, MAX_RAKE = 10, 120
 """Rake (deg) to which the table of cutting factors is limited."""
-LEAST_LEAN, MOST_LEAN = 0.17, 2.1
+MIN_LEAN, MAX_LEAN = 0.17, 2.1
 """Rake (rad) within which the direction of the cutting force follows it."""
 EDGE_DEPTH = 0.05
 """Depth (m) at which the whole edge is in the ground."""
@@ -86,8 +86,8 @@ def cutting_table(material: Material) -> Array:
     Shared by all grounds of a material: not to be changed.
     """
     # a wedge needs rake + failure angle + both frictions below 180 degrees
-    most = min(MOST_RAKE, 160.0 - material.friction_deg - material.metal_friction_deg)
-    angles = np.clip(np.arange(181), LEAST_RAKE, most)
+    most = min(MAX_RAKE, 160.0 - material.friction_deg - material.metal_friction_deg)
+    angles = np.clip(np.arange(181), MIN_RAKE, most)
     return np.array([cutting_factors(a, material.friction_deg, material.metal_friction_deg) for a in angles])
 
 
@@ -174,7 +174,7 @@ def pack_soil(material: Material, machine: Machine, cone_index: float) -> Array:
 @compiled
 def cutting_force(depth: float, rake: float, surcharge: float, numbers: Array, table: Array) -> float:
     """Force (N) of the earthmoving equation at a depth (m), a rake (rad) and a surcharge (Pa)."""
-    rake_deg = min(max(rake * 57.29577951308232, LEAST_RAKE), MOST_RAKE - 1e-9)
+    rake_deg = min(max(rake * 57.29577951308232, MIN_RAKE), MAX_RAKE - 1e-9)
     k = int(rake_deg)
     part = rake_deg - k
     weight = table[k, 0] + part * (table[k + 1, 0] - table[k, 0])
@@ -217,8 +217,8 @@ def engage_edge(inward: float, ground: Ground, floor: tuple[float, float], c: Ar
         # The back of the bucket meets the soil at the supplementary rake, and has no heap before it.
         back = (1.0 - inward) * factor * cutting_force(depth, math.pi - rake, 0.0, numbers, table)
     along, rise = floor
-    if rake < LEAST_LEAN or rake > MOST_LEAN:
-        lean = min(max(rake, LEAST_LEAN), MOST_LEAN)
+    if rake < MIN_LEAN or rake > MAX_LEAN:
+        lean = min(max(rake, MIN_LEAN), MAX_LEAN)
         along, rise = math.cos(lean), math.sin(lean)
     # cosine and sine of the angle of the force, rake plus friction on metal
     c[DRAG] = force * max(rise * numbers[METAL_COS] + along * numbers[METAL_SIN], 0.3) + inward * stone

@@ -18,7 +18,7 @@ PRICE = 20.0
 and compared, so that they may hardly rise."""
 DEAREST = 1.003
 """Root-mean-square error, over that without a band, that is never exceeded."""
-LEAST_GAIN = 0.005
+MIN_GAIN = 0.005
 """Share of the absolute error below which a band is not worth its place."""
 
 
@@ -42,7 +42,7 @@ def dead_bands(predicted: DoubleArray, truth: DoubleArray, owner: NDArray[np.int
 
 def _dead_band(predicted: DoubleArray, truth: DoubleArray, owner: NDArray[np.integer]) -> float:
     square, absolute = _errors(predicted, truth, owner)
-    best, least = 0.0, -LEAST_GAIN
+    best, least = 0.0, -MIN_GAIN
     if not square > 0 or not absolute.sum() > 0:
         return best
     for width in WIDTHS:

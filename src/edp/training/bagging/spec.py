@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from edp.errors import ConfigError
-from edp.networks.trees import MOST_DEPTH
-from edp.settings.bounds import MOST_BATCH, MOST_EPOCHS, MOST_ROWS, MOST_WEIGHT, above, check_bounds, integer, span
+from edp.networks.trees import MAX_DEPTH
+from edp.settings.bounds import MAX_BATCH, MAX_EPOCHS, MAX_ROWS, MAX_WEIGHT, above, check_bounds, integer, span
 
-MOST_FOLDS = 100
-MOST_TREE_MODELS = 3
-MOST_RATE = 1.0
+MAX_FOLDS = 100
+MAX_TREE_MODELS = 3
+MAX_RATE = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,20 +61,20 @@ class BaggingSpec:
         check_bounds(
             "training.bagging",
             self,
-            folds=integer(2, MOST_FOLDS),
-            steps=integer(1, MOST_EPOCHS),
-            batch=integer(1, MOST_BATCH),
-            learning_rate=above(0.0, MOST_RATE),
-            weight_decay=span(0.0, MOST_WEIGHT),
-            robust_width=span(0.0, MOST_WEIGHT),
-            checks=integer(1, MOST_EPOCHS),
-            rows=integer(100, MOST_ROWS),
-            tree_rate=above(0.0, MOST_RATE),
-            tree_leaf=integer(1, MOST_ROWS),
-            tree_leaves=integer(0, 2**MOST_DEPTH),
-            tree_models=integer(1, MOST_TREE_MODELS),
-            tree_folds=integer(2, MOST_FOLDS),
-            tree_rows=integer(100, MOST_ROWS),
+            folds=integer(2, MAX_FOLDS),
+            steps=integer(1, MAX_EPOCHS),
+            batch=integer(1, MAX_BATCH),
+            learning_rate=above(0.0, MAX_RATE),
+            weight_decay=span(0.0, MAX_WEIGHT),
+            robust_width=span(0.0, MAX_WEIGHT),
+            checks=integer(1, MAX_EPOCHS),
+            rows=integer(100, MAX_ROWS),
+            tree_rate=above(0.0, MAX_RATE),
+            tree_leaf=integer(1, MAX_ROWS),
+            tree_leaves=integer(0, 2**MAX_DEPTH),
+            tree_models=integer(1, MAX_TREE_MODELS),
+            tree_folds=integer(2, MAX_FOLDS),
+            tree_rows=integer(100, MAX_ROWS),
         )
         if self.tree_leaves == 1:
             raise ConfigError(

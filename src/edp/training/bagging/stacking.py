@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from edp.data.lags import DoubleArray
 
-LEAST_GAIN = 0.01
+MIN_GAIN = 0.01
 """Share by which further learners must lower the error, else they get no weight: on a machine that idles nine tenths of
 the time, basis functions on few columns lowered it by less, and had more error on the test recording."""
 
-LEAST_FOLD = 1e-4
+MIN_FOLD = 1e-4
 """Share of the mean square of the liveliest fold that any fold counts with at least: a hundredth of its deviation."""
 
 
@@ -38,7 +38,7 @@ def stacking_weights(
         chosen = np.arange(len(models))
         if len(usual) < len(models):
             least = _compute_nested_error(columns[:, usual], truth, owner)
-            if not _compute_nested_error(columns, truth, owner) < (1.0 - LEAST_GAIN) * least:
+            if not _compute_nested_error(columns, truth, owner) < (1.0 - MIN_GAIN) * least:
                 chosen = usual
         shares[chosen, output] = _weights(columns[:, chosen], truth, owner)
     return shares
@@ -60,7 +60,7 @@ def _weights(columns: DoubleArray, truth: DoubleArray, owner: NDArray[np.int64])
         [np.square(truth[number == k, None] - columns[number == k]).mean(axis=0).min() for k in range(len(folds))]
     )
     # A fold that hardly moves must not rule instead.
-    left = np.maximum(left, LEAST_FOLD * left.max())
+    left = np.maximum(left, MIN_FOLD * left.max())
     by_row = left[number] ** -0.25 if left.max() > 0.0 else np.ones(len(truth))
     # Non-negative: a model that only fits the noise gets nothing, and none is played off against another.
     return np.asarray(nnls(columns * by_row[:, None], truth * by_row)[0])

@@ -18,7 +18,7 @@ from edp.networks.losses import Huber, LossSpec, Prediction, compute_masked_loss
 from edp.networks.losses.base import POINT
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_hidden, stream_predictions
-from edp.settings.bounds import MOST_UNITS, MOST_WEIGHT, WEIGHT, below, check_bounds, integer, span
+from edp.settings.bounds import MAX_UNITS, MAX_WEIGHT, WEIGHT, below, check_bounds, integer, span
 from edp.training.compression.hints import Components, hint_error
 from edp.training.objective import Objective
 from edp.training.spec import TrainingSpec
@@ -85,7 +85,7 @@ class DistillationSpec:
                 f"distillation: soft = {type(self.soft).__name__}, a loss of outputs {', '.join(self.soft.outputs)}; a "
                 "loss of point predictions must hold: teachers say one number of each target"
             )
-        check_bounds("distillation", self, hint=span(0.0, MOST_WEIGHT), components=integer(1, MOST_UNITS))
+        check_bounds("distillation", self, hint=span(0.0, MAX_WEIGHT), components=integer(1, MAX_UNITS))
 
 
 class Distillation:

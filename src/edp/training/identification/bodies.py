@@ -36,7 +36,7 @@ GUESS_TRUST = 1.0
 """Deviation of the nine numbers from those of the guess, as a share of their size: it decides where nothing moved."""
 NEAR = (0.7, 0.1, 0.1, 0.3)
 """Plausible deviations of masses (logarithm), centres of gravity (shares of length) and inertias (logarithm)."""
-MOST_POSES = 300
+MAX_POSES = 300
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +55,9 @@ class Poses:
 
     @staticmethod
     def of(machine: Machine, strokes: Doubles) -> Poses:
-        """Angles and lever arms at strokes ``(pose, 3)``; at most `MOST_POSES`, evenly chosen."""
+        """Angles and lever arms at strokes ``(pose, 3)``; at most `MAX_POSES`, evenly chosen."""
         axes, plant = pack(machine)
-        chosen = strokes[:: max(1, -(-len(strokes) // MOST_POSES))]
+        chosen = strokes[:: max(1, -(-len(strokes) // MAX_POSES))]
         chosen = np.clip(chosen, 0.0, axes[:, sim.STROKE])
         angles = np.array(
             [[linkage.angle_at_stroke(i, stroke, axes, plant) for i, stroke in enumerate(row)] for row in chosen]

@@ -16,7 +16,7 @@ from edp.storage.reading import Table
 Doubles = NDArray[np.float64]
 STATIC = ("friction", "static_fraction")
 """Fitted by what it exceeds the Coulomb fraction, so that it never falls below it."""
-LEAST_REGENERATION = 0.1
+MIN_REGENERATION = 0.1
 """Of the conductance of meter-out: where a fit begins that must find whether oil returns at all."""
 
 
@@ -135,7 +135,7 @@ def _regeneration(machine: Machine, number: MachineNumber) -> float:
     """Return the flow of a small regeneration, L/min at the rated pressure difference of the file."""
     out = number.key.replace("regeneration", "meter_out")
     (flow, bar), (_, own_bar) = (getattr(machine.valves, key)[number.cylinder] for key in (out, number.key))
-    return float(LEAST_REGENERATION * flow * np.sqrt(own_bar / bar))
+    return float(MIN_REGENERATION * flow * np.sqrt(own_bar / bar))
 
 
 def set_values(machine: Machine, values: Sequence[float] | Doubles) -> Machine:

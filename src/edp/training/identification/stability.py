@@ -27,7 +27,7 @@ from edp.training.blas import one_blas_thread
 from edp.training.grey_fit import GreyProblem
 
 Doubles = NDArray[np.float64]
-LEAST_BLOCKS, MOST_BLOCKS = 6, 16
+MIN_BLOCKS, MAX_BLOCKS = 6, 16
 """Blocks of the logs: a spread over fewer says little, and more of them take time."""
 LENGTHS = 3
 """Of the fit's last stages, from which free runs are drawn."""
@@ -94,13 +94,13 @@ def spread(theta: Doubles, matrices: Doubles, gradients: Doubles) -> Doubles:
 
 
 def divided(train: Sequence[Series], least: int) -> list[list[Series]]:
-    """Divide segments into `LEAST_BLOCKS` to `MOST_BLOCKS` groups with at least `least` samples.
+    """Divide segments into `MIN_BLOCKS` to `MAX_BLOCKS` groups with at least `least` samples.
 
     Short logs give fewer.
     """
     usable = [part for part in train if part.samples >= least]
-    pieces = [piece for part in usable for piece in _cut(part, -(-LEAST_BLOCKS // len(usable)), least)]
-    count = min(len(pieces), MOST_BLOCKS)
+    pieces = [piece for part in usable for piece in _cut(part, -(-MIN_BLOCKS // len(usable)), least)]
+    count = min(len(pieces), MAX_BLOCKS)
     return [pieces[b::count] for b in range(count)]
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from edp.settings.bounds import MOST_BATCH, RATE, check_bounds, integer
+from edp.settings.bounds import MAX_BATCH, RATE, check_bounds, integer
 
-MOST_STEPS = 1_000
+MAX_STEPS = 1_000
 """Of adaptation: the gradient goes through all of them, and each keeps its copy of the weights."""
 
 
@@ -34,8 +34,8 @@ class MetaSpec:
             "pretraining",
             self,
             inner_rate=RATE,
-            inner_steps=integer(1, MOST_STEPS),
-            shots=integer(1, MOST_BATCH),
+            inner_steps=integer(1, MAX_STEPS),
+            shots=integer(1, MAX_BATCH),
         )
 
     @property

@@ -16,7 +16,7 @@ from edp.data.task import Task
 from edp.networks.losses import Huber, compute_masked_loss
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
-from edp.settings.bounds import MOST_WEIGHT, SHARE, WEIGHT, check_bounds, span
+from edp.settings.bounds import MAX_WEIGHT, SHARE, WEIGHT, check_bounds, span
 from edp.training.objective import Objective
 from edp.training.spec import TrainingSpec
 from edp.training.strategy import BatchContext
@@ -46,7 +46,7 @@ class BothSpec:
     reversal: float = 0.0
 
     def __post_init__(self) -> None:
-        check_bounds("both domains", self, weight=WEIGHT, soft=SHARE, reversal=span(0.0, MOST_WEIGHT))
+        check_bounds("both domains", self, weight=WEIGHT, soft=SHARE, reversal=span(0.0, MAX_WEIGHT))
 
 
 class BothDomains:

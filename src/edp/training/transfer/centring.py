@@ -23,7 +23,7 @@ from edp.training.strategy import BatchContext, TrainingStrategy
 
 ROUNDS = 6  # one is enough unless the heads end in a function that bends
 # A tenth: less would divide by noise where the heads hardly answer.
-LEAST_ANSWER = 0.1
+MIN_ANSWER = 0.1
 CLOSE = 0.005  # of the mean absolute error that may be left
 SHORTEST_S = 30.0  # of logs: the mean error of fewer says little of other logs
 DEAREST = 1.01  # most that it may cost of the mean absolute error
@@ -85,7 +85,7 @@ def centre(net: Predictor, series: Sequence[Series]) -> None:
         last, (mean, size) = mean, _errors(net, series)
         # A bent end of the heads answers with less than it is given.
         share = np.divide(last - mean, step, out=np.ones_like(step), where=step != 0.0)
-        answered = np.where(step != 0.0, np.clip(share, LEAST_ANSWER, 1.0), answered)
+        answered = np.where(step != 0.0, np.clip(share, MIN_ANSWER, 1.0), answered)
     # Outputs for which centring costs more than it brings get their bias back.
     dear = torch.from_numpy(size > allowed).transpose(0, 1).to(bias.device)
     with torch.no_grad():

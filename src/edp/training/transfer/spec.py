@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 from edp.settings.bounds import (
     DECAY,
-    MOST_BATCH,
-    MOST_EPOCHS,
-    MOST_UNITS,
+    MAX_BATCH,
+    MAX_EPOCHS,
+    MAX_UNITS,
     RATE,
     WEIGHT,
     above,
@@ -17,7 +17,7 @@ from edp.settings.bounds import (
     span,
 )
 
-MOST_STEPS = 10_000
+MAX_STEPS = 10_000
 """Of the method of few steps, each over all the logs."""
 
 
@@ -78,15 +78,15 @@ class FinetuneSpec:
         check_bounds(
             "finetune",
             self,
-            **dict.fromkeys(("head_epochs", "epochs", "rounds"), integer(1, MOST_EPOCHS)),
+            **dict.fromkeys(("head_epochs", "epochs", "rounds"), integer(1, MAX_EPOCHS)),
             **dict.fromkeys(("head_rate", "backbone_rate", "rate"), RATE),
             **dict.fromkeys(("smoothness", "weight_decay"), DECAY),
             **dict.fromkeys(("source_weight", "reversal"), WEIGHT),
             depth_decay=above(0.0, 1.0),
             soft=above(0.0, 1.0),
-            batch=integer(1, MOST_BATCH),
-            patience=integer(0, MOST_EPOCHS),
-            rank=integer(1, MOST_UNITS),
+            batch=integer(1, MAX_BATCH),
+            patience=integer(0, MAX_EPOCHS),
+            rank=integer(1, MAX_UNITS),
             inner_rate=span(0.0, RATE.high),
-            inner_steps=integer(1, MOST_STEPS),
+            inner_steps=integer(1, MAX_STEPS),
         )

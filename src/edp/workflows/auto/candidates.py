@@ -32,9 +32,9 @@ from edp.training.warm_start import WarmStart
 from edp.workflows.transfer.case import tuned
 from edp.workflows.transfer.source import SourceModel, read_source
 
-LEAST_SPAN = 32
+MIN_SPAN = 32
 """Ticks that changes reach back at least, as far as the data allow: at 100 Hz a third of a second."""
-MOST_COLUMNS = 720
+MAX_COLUMNS = 720
 """Columns of a bank at most, as far as its spans can be fewer: 48 channels have all spans, 100 only powers of two. A
 ridge regression takes the square of them for each row, and its spectra the cube."""
 WINDOW = 10
@@ -61,20 +61,20 @@ NEAR, NEAR_ROWS = (0, 1, 2, 4, 8), 20_000
 """Spans of the changes that further basis functions read beside the present values, 0 for these alone, and the ticks of
 training up to which there are any. With weights that leave out one more fold, left-out errors of seven measured sets
 change by 1 % (hanging load) to -16 % (tanks), -3 % on average; an output has them where theirs falls by 1 %."""
-ROUNDS, LEAST_ROUNDS, TREE_DEPTH = 100, 40, 6
+ROUNDS, MIN_ROUNDS, TREE_DEPTH = 100, 40, 6
 """Trees of each model of an output. Fewer say too little."""
-TREE_MODELS = {3: 60, 2: LEAST_ROUNDS}
+TREE_MODELS = {3: 60, 2: MIN_ROUNDS}
 """Models of each output: of what a line leaves, of the target by few columns, of the target by all columns. The third
 one is worth its time where it leaves so many rounds: left-out errors of five measured sets fall by 0.5 to 6 %."""
 TREE_ROWS = (60_000, 30_000, 15_000, 8_000, 4_000)
-"""Rows that a tree is grown on: the most that leave time for `LEAST_ROUNDS`. On left-out logs of three measured sets
+"""Rows that a tree is grown on: the most that leave time for `MIN_ROUNDS`. On left-out logs of three measured sets
 rows are worth more than rounds (findings)."""
 TREE_FOLDS = {5: 0.8, 3: 0.6, 2: 0.4}
 """Parts that trees leave out in turn, each at the cost of a growth; and the share of rows beside the largest."""
 ALIKE_ROWS = 0.8
 """Of the rows that the network's trees are grown on, left-out trees have so many. With two parts of 11,000 rows they
 had half: left-out errors were up to three times those of the trees in use, which got too little weight."""
-TREE_RATE, MOST_TREE_RATE = 10.0, 0.2
+TREE_RATE, MAX_TREE_RATE = 10.0, 0.2
 """The rate of boosting is the first over the rounds, at least scikit-learn's 0.1: fewer trees must each do more."""
 TREE_SECONDS, TREE_CELLS_PER_S = 1.7e-3, 1.2e8
 """A tree takes this long plus its rows times columns over that rate: measured with scikit-learn, rounded up."""
@@ -94,13 +94,13 @@ EIGEN_CUBES_PER_S = 1e9
 """Cubes of the number of columns in a second, of the spectra of a fold over all sets of columns; measured: 2e9."""
 RADIAL_ROW_S, RADIAL_CELL_S = 3e-5, 3.7e-8
 """A row of radial basis functions of one length takes the first, and the second for each column: measured."""
-LEAST_SHARE = 0.5
+MIN_SHARE = 0.5
 """Of the budget is left for networks and trees, however long the linear models take."""
-LEAST_STEPS, USUAL_STEPS, MOST_STEPS = 300, 2500, 5000
+MIN_STEPS, USUAL_STEPS, MAX_STEPS = 300, 2500, 5000
 """Updates of a member: fewer learn nothing, more than `USUAL_STEPS` pay where rows are many."""
 ROW_PASSES = 20
 """How often a row may be seen before further updates only fit its noise."""
-FEW_STEPS, MOST_PASSES = 500, 200
+FEW_STEPS, MAX_PASSES = 500, 200
 """Rows of a short log are seen so often at most, but for so many updates: of 457 rows 2,500 updates leave 5 % more
 error on left-out rows than 700, of 966 rows 1,500 leave 1 % more than 300 and take five times as long."""
 LONG_ROWS = 100_000
@@ -112,7 +112,7 @@ RECURRENT_LANES, RECURRENT_CHUNK, RECURRENT_BURN_IN = 8, 128, 50
 RECURRENT_TICK = 70_000
 """Weights that a tick of the recurrent network passes through."""
 SETTING = "auto.foundation"
-LEAST_UPDATES = 120
+MIN_UPDATES = 120
 """Of a fine-tuning, where ten passes over the recordings are fewer: those of the measured ones (docs/results.md)."""
 
 
@@ -201,7 +201,7 @@ class Foundation:
             threads: CPU threads.
         """
         rounds = FinetuneSpec().rounds
-        updates = int(min(affordable, max(LEAST_UPDATES, rounds * rows / self.ticks))) // rounds
+        updates = int(min(affordable, max(MIN_UPDATES, rounds * rows / self.ticks))) // rounds
         training = replace(self._training(max(1, updates), threads), seed=seed)
         return NetworkPlan(self.source.predictor.spec, training)
 
@@ -281,7 +281,7 @@ class Amount:
     @property
     def span(self) -> int:
         """Ticks that changes reach back: a power of two, at least twice the horizon where the data allow it."""
-        least = max(LEAST_SPAN, 2 * self.horizon)
+        least = max(MIN_SPAN, 2 * self.horizon)
         span = 1
         while span < least and 2 * span <= max(1, (self.usual or self.shortest) // STRETCH_SHARE):
             span *= 2
@@ -290,7 +290,7 @@ class Amount:
     def seconds(self, kind: str) -> float:
         """Processor time for a kind of learner."""
         budget = 60 * self.minutes
-        left = max(budget - _estimate_fixed_seconds(self), LEAST_SHARE * budget)
+        left = max(budget - _estimate_fixed_seconds(self), MIN_SHARE * budget)
         shares = LONG_SHARE if self.rows > LONG_ROWS else SHARE
         match self.trial:
             case RecurrentTrial.RUNNING:
@@ -348,7 +348,7 @@ def spans_of(amount: Amount) -> Spans:
     smoothed = powers[2:]
     tried = [Spans(sorted({*powers, *halves}), smoothed), Spans(powers, smoothed), Spans(powers, [])]
     sparse = Spans(powers[::2], [])
-    return next((spans for spans in tried if spans.columns(amount.features) <= MOST_COLUMNS), sparse)
+    return next((spans for spans in tried if spans.columns(amount.features) <= MAX_COLUMNS), sparse)
 
 
 def _columns(amount: Amount) -> int:
@@ -360,8 +360,8 @@ def _steps(amount: Amount, groups: int) -> int:
     weights = MEMBERS * groups * (_columns(amount) * UNITS + UNITS * UNITS + UNITS * amount.outputs)
     affordable = amount.seconds("perceptrons") * OPERATIONS_PER_S / (PASSES * BATCH * weights)
     useful = max(USUAL_STEPS, ROW_PASSES * amount.rows // BATCH)
-    most = max(FEW_STEPS, MOST_PASSES * amount.rows // BATCH)
-    return int(min(max(affordable, LEAST_STEPS), useful, most, MOST_STEPS))
+    most = max(FEW_STEPS, MAX_PASSES * amount.rows // BATCH)
+    return int(min(max(affordable, MIN_STEPS), useful, most, MAX_STEPS))
 
 
 def _estimate_fixed_seconds(amount: Amount) -> float:
@@ -403,7 +403,7 @@ class TreePlan:
     @property
     def rate(self) -> float:
         """Learning rate of boosting."""
-        return min(MOST_TREE_RATE, max(0.1, TREE_RATE / max(1, self.rounds)))
+        return min(MAX_TREE_RATE, max(0.1, TREE_RATE / max(1, self.rounds)))
 
 
 def tree_plan(amount: Amount) -> TreePlan:

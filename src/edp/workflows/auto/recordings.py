@@ -24,13 +24,13 @@ from edp.signals import Kind
 from edp.storage.memory import check_setting
 from edp.training.spec import TrainingSpec
 from edp.wording import typed
-from edp.workflows.auto.candidates import LEAST_SPAN, Amount, Foundation
+from edp.workflows.auto.candidates import MIN_SPAN, Amount, Foundation
 from edp.workflows.auto.settings import AutoSettings
 from edp.workflows.train_evaluate import prepare_data
 
 USUAL = "FG2"
 """The feature set that is taken without a word where the recordings have its channels."""
-MOST_LISTED = 20
+MAX_LISTED = 20
 """Channels that a message lists."""
 AXES = range(1, 4)
 SOURCES = {
@@ -38,7 +38,7 @@ SOURCES = {
     **{f"CylAcc_{axis}": (f"CylVels_{axis}", Kind.ACCELERATION) for axis in AXES},
 }
 """Of which channel a channel is the derivative, and its kind."""
-LEAST_DIVIDED = 14
+MIN_DIVIDED = 14
 """Gaps that a recording is long of which 15 % are two of them."""
 COPIES = 8
 """Of what is predicted at each tick, in double precision: the truth, and what each candidate said of it."""
@@ -66,9 +66,9 @@ def fit_to_channels(settings: AutoSettings, names: Sequence[str], where: str) ->
     channels = {*names, *(entry.name for entry in (*derived, *task.derived_targets))}
     absent = [target for target in task.targets if target not in channels]
     if absent:
-        listed = ", ".join(names[:MOST_LISTED]) + (", ..." if len(names) > MOST_LISTED else "")
+        listed = ", ".join(names[:MAX_LISTED]) + (", ..." if len(names) > MAX_LISTED else "")
         raise ConfigError(
-            f"task.targets: {', '.join(absent[:MOST_LISTED])} is no channel of '{where}', which has {listed}; "
+            f"task.targets: {', '.join(absent[:MAX_LISTED])} is no channel of '{where}', which has {listed}; "
             f"name what to predict, for example --set 'task.targets=[\"{names[-1]}\"]'"
         )
     return replace(settings, task=task), notes
@@ -105,7 +105,7 @@ def divide(recordings: Sequence[Recording], settings: AutoSettings) -> tuple[Aut
     split = settings.split
     if not isinstance(split, ByRecording) or split.validation or split.test:
         return settings, []
-    gap = LEAST_SPAN + max(settings.task.horizons)
+    gap = MIN_SPAN + max(settings.task.horizons)
     task = settings.task
     derived = () if isinstance(task.features, str) else task.features.derived
     sources = {entry.name: entry.source for entry in (*derived, *task.derived_targets)}
@@ -115,7 +115,7 @@ def divide(recordings: Sequence[Recording], settings: AutoSettings) -> tuple[Aut
     by_time = ByTime(validation_share=split.validation_share, test_share=split.test_share)
     if len(recordings) > 1:
         # Of equal recordings that are too short to be divided nothing would be left to validate.
-        if all(recording.samples < LEAST_DIVIDED * gap for recording in recordings):
+        if all(recording.samples < MIN_DIVIDED * gap for recording in recordings):
             return settings, []
         moving = moving_ticks(recordings, channels, max(1, *task.horizons))
         if is_even(split, recordings, gap, every) and is_even(split, recordings, gap, moving):
@@ -183,10 +183,10 @@ def prepare(source: ReadOnce, settings: AutoSettings, foundation: Foundation | N
         )
 
     try:
-        data, amount = cut(LEAST_SPAN + 1)
+        data, amount = cut(MIN_SPAN + 1)
     except DataError:
         data, amount = cut(1)  # recordings of seconds: shorter spans will do
-    if amount.window != LEAST_SPAN + 1:
+    if amount.window != MIN_SPAN + 1:
         data, final = cut(amount.window)
         amount = replace(amount, rows=final.rows)
     return data, amount
@@ -223,8 +223,8 @@ def still_inputs(data: Prepared) -> list[str]:
     still = [channel.name for channel, moves in zip(data.inputs, moving, strict=True) if not moves]
     if not still:
         return []
-    more = f" and {len(still) - MOST_LISTED} more" if len(still) > MOST_LISTED else ""
-    return [f"Still through the training part, so without weight: {', '.join(still[:MOST_LISTED])}{more}."]
+    more = f" and {len(still) - MAX_LISTED} more" if len(still) > MAX_LISTED else ""
+    return [f"Still through the training part, so without weight: {', '.join(still[:MAX_LISTED])}{more}."]
 
 
 def _moving(parts: Sequence[FloatArray], kinds: Sequence[Kind]) -> list[bool]:

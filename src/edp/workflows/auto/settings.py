@@ -18,11 +18,11 @@ from edp.data.splits import ByRecording, SplitSpec
 from edp.errors import ConfigError
 from edp.evaluation.judge import JudgeSpec
 from edp.networks.predictor import ModelSpec
-from edp.settings.bounds import MIN_MINUTES, MOST_THREADS, SEED, check_bounds, integer, span
+from edp.settings.bounds import MAX_THREADS, MIN_MINUTES, SEED, check_bounds, integer, span
 from edp.settings.tree import merged, override, read_toml
 from edp.training.spec import TrainingSpec
 
-MOST_MINUTES = 10_000.0
+MAX_MINUTES = 10_000.0
 CHOSEN = ("model", "training")
 """Tables of an experiment that the portfolio fills in."""
 
@@ -48,7 +48,7 @@ class Portfolio:
     threads: int = 1
 
     def __post_init__(self) -> None:
-        check_bounds("auto", self, minutes=span(MIN_MINUTES, MOST_MINUTES), seed=SEED, threads=integer(0, MOST_THREADS))
+        check_bounds("auto", self, minutes=span(MIN_MINUTES, MAX_MINUTES), seed=SEED, threads=integer(0, MAX_THREADS))
         if self.candidates and ("foundation" in self.candidates) != bool(self.foundation):
             raise ConfigError(
                 f"auto.candidates = {list(self.candidates)} and auto.foundation = '{self.foundation}': the candidate "

@@ -17,7 +17,7 @@ from edp.logs.source import DataSource
 from edp.networks.losses import LOSSES
 from edp.networks.predictor import Predictor
 from edp.progress import SILENT, Progress
-from edp.settings.bounds import MOST_LEVELS, MOST_UNITS, check_bounds, integer
+from edp.settings.bounds import MAX_LEVELS, MAX_UNITS, check_bounds, integer
 from edp.settings.provenance import read_provenance
 from edp.settings.tree import SettingsTree
 from edp.storage.paths import is_file_at
@@ -56,7 +56,7 @@ class DistilSpec:
     objective: DistillationSpec | None = None
 
     def __post_init__(self) -> None:
-        check_bounds("distil", self, units=integer(1, MOST_UNITS), levels=integer(1, MOST_LEVELS))
+        check_bounds("distil", self, units=integer(1, MAX_UNITS), levels=integer(1, MAX_LEVELS))
         if self.pruned and self.levels is not None:
             raise ConfigError("a pruned student keeps all levels of its teacher; leave out the levels, or the pruning")
 

@@ -16,7 +16,7 @@ from edp.logs.source import DataSource
 from edp.networks.narrow import width_of
 from edp.networks.predictor import Predictor
 from edp.progress import SILENT, Progress
-from edp.settings.bounds import MOST_NAMES, MOST_UNITS, check_bounds, check_count, integer, shown
+from edp.settings.bounds import MAX_NAMES, MAX_UNITS, check_bounds, check_count, integer, shown
 from edp.signals import KINDS
 from edp.storage import make_folder, read_object
 from edp.storage.ledger import Ledger, Opening
@@ -70,8 +70,8 @@ class CompressionSearchSpec:
     thesis: bool = False
 
     def __post_init__(self) -> None:
-        check_count("compress", "units", self.units, MOST_NAMES)
-        check_bounds("compress", self, units=integer(1, MOST_UNITS))
+        check_count("compress", "units", self.units, MAX_NAMES)
+        check_bounds("compress", self, units=integer(1, MAX_UNITS))
         check_count("compress", "recipes", self.recipes, len(RECIPES), least=1)
         for key, names, known_names in (("formats", self.formats, FORMATS), ("recipes", self.recipes, RECIPES)):
             for name in names:

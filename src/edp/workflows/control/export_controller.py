@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edp.config.control import ControlExperiment
 from edp.control.controllers import CONTROLLERS
 from edp.control.controllers.nmpc import STEP_M_S, NmpcController, PredictiveControl
-from edp.control.controllers.pi import MOST_SUM, PiController, ProportionalIntegral
+from edp.control.controllers.pi import MAX_SUM, PiController, ProportionalIntegral
 from edp.control.geometry import AXES
 from edp.control.limits import LoopLimits
 from edp.control.models import ControlModels
@@ -32,7 +32,7 @@ from edp.workflows.control.kept import KeptController, load_kept
 
 MOST: Mapping[str, int] = {"iterations": 100, "newton": 1_000}
 """Iterations a tick: of the solver, of which 5 to 20 were seen in loops; of a grey box's equations."""
-MOST_ITERATIONS = 100_000
+MAX_ITERATIONS = 100_000
 FARTHEST_M = 100.0
 """Stroke above which the measurement counts as missing; cylinders are shorter."""
 Array = NDArray[np.float64]
@@ -119,7 +119,7 @@ def parts_of(
         lever_high=np.array(limits.lever_high),
         slew=np.array(limits.slew_per_s) / plant.rate_hz,
         sides=[_sides(valves, axis) for axis in range(AXES)],
-        gains=(loop.proportional, loop.integral, loop.rest_m_s, MOST_SUM),
+        gains=(loop.proportional, loop.integral, loop.rest_m_s, MAX_SUM),
         lead=round(loop.lead_s * plant.rate_hz),
         plan=plan,
         golden=None,
@@ -246,7 +246,7 @@ def _most(options: Mapping[str, object]) -> dict[str, int]:
                 f"--set {option}: a controller has no such option (it has {' and '.join(MOST)}); leave it out"
             )
         text = str(value)
-        if not text.isdecimal() or not 2 <= int(text) <= MOST_ITERATIONS:
-            raise ConfigError(f"--set {option}={text}: an integer from 2 to {MOST_ITERATIONS:,} must hold")
+        if not text.isdecimal() or not 2 <= int(text) <= MAX_ITERATIONS:
+            raise ConfigError(f"--set {option}={text}: an integer from 2 to {MAX_ITERATIONS:,} must hold")
         most[option] = int(text)
     return most

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from edp.config.experiment import FeatureSettings
-from edp.data.features import MOST_LAG, Derived
+from edp.data.features import MAX_LAG, Derived
 from edp.data.screening import ScreeningResult
 from edp.data.screening.proposal import CLEAR
 from edp.recording import Recording
@@ -28,7 +28,7 @@ def add_changes(
     added = []
     for channel in settings.channels:
         ticks = _lead(screening, channel) or (screening.horizon if channel in screening.targets else 0)
-        if not 1 <= ticks <= MOST_LAG:
+        if not 1 <= ticks <= MAX_LAG:
             continue
         kind = recording.channels[recording.index(channel)].kind
         seconds = round(ticks / screening.rate_hz, 9)

@@ -20,7 +20,7 @@ from edp.logs.formats.base import is_truth
 from edp.logs.resolve import resolve
 from edp.logs.source import DataSource
 from edp.progress import SILENT, Progress
-from edp.recording import MOST_ROWS, Recording
+from edp.recording import MAX_ROWS, Recording
 from edp.report import build_screening_page, write_screening_pictures
 from edp.signals import VOCABULARY, SignalMap
 from edp.storage import check_writable, make_folder, write_bytes, write_json
@@ -30,7 +30,7 @@ from edp.workflows.feature_selection.trials import OnTrial, TrialSpec, add_diffe
 
 PROPOSED, DIFFERENCES, CHANGES, ALL = "proposed", "proposed + differences", "proposed + changes", "all candidates"
 # The file stays readable; the whole list is in `screening.json`.
-_MOST_DROPPED = 200
+_MAX_DROPPED = 200
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,7 +148,7 @@ def select_features(
 def _note_sampling(recordings: Sequence[Recording], screening: ScreeningResult) -> list[str]:
     """Note that a large data set was screened on a part of its rows."""
     total = sum(recording.samples for recording in recordings)
-    if total <= MOST_ROWS:
+    if total <= MAX_ROWS:
         return []
     hours = screening.samples / screening.rate_hz / 3600.0
     return [f"Screened on {screening.samples:,} of {total:,} rows ({hours:.1f} h): evenly spread stretches of them."]
@@ -261,7 +261,7 @@ def _proposal_text(screening: ScreeningResult, features: FeatureSettings) -> str
     dropped = [
         choice for choice in screening.proposal.choices if not choice.keep and choice.channel not in screening.targets
     ]
-    tail = [f"dropped: {choice.channel}: {choice.reason}" for choice in dropped[:_MOST_DROPPED]]
+    tail = [f"dropped: {choice.channel}: {choice.reason}" for choice in dropped[:_MAX_DROPPED]]
     return set_text(_plain(features), head, reasons, tail)
 
 

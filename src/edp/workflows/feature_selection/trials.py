@@ -38,7 +38,7 @@ from edp.workflows.train_evaluate import evaluate, train
 Sets = Mapping[str, str | FeatureSettings]
 OnTrial = Callable[[str, int, int, TrainingProgress | None], None]
 COVERAGE = 0.95
-MOST_SETS = 1_000
+MAX_SETS = 1_000
 """Random sets, or seeds: each of them is a training."""
 # Small sets of few channels repeat themselves; the number of draws must end somewhere.
 _DRAWS = 20
@@ -62,8 +62,8 @@ class TrialSpec:
     seeds: tuple[int, ...] = (0,)
 
     def __post_init__(self) -> None:
-        check_bounds("trials", self, random=integer(0, MOST_SETS), draw=SEED, seeds=SEED)
-        check_count("trials", "seeds", self.seeds, MOST_SETS)
+        check_bounds("trials", self, random=integer(0, MAX_SETS), draw=SEED, seeds=SEED)
+        check_count("trials", "seeds", self.seeds, MAX_SETS)
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise ConfigError(f"trials: seeds = {list(self.seeds)}; at least one seed, each once, must hold")
 

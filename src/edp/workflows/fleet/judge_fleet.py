@@ -48,7 +48,7 @@ from edp.workflows.monitor import run_monitor
 RESULT, PAGE = "fleet_report.json", "report.html"
 BLOCK_S = 10.0
 """Blocks of which drift is told: longer than a network remembers what it misjudged."""
-LEAST_BLOCKS = 8
+MIN_BLOCKS = 8
 """Minimum number of blocks in each half for a spread."""
 
 
@@ -213,7 +213,7 @@ def drift_of(error: NDArray[np.floating], rate_hz: float) -> ErrorDrift | None:
     size = round(BLOCK_S * rate_hz)
     blocks = error[: len(error) // size * size].reshape(-1, size).mean(axis=1)
     half = len(blocks) // 2
-    if half < LEAST_BLOCKS:
+    if half < MIN_BLOCKS:
         return None
     first, second = blocks[:half], blocks[half:]
     spread = float(np.sqrt(first.var(ddof=1) / len(first) + second.var(ddof=1) / len(second)))

@@ -16,7 +16,7 @@ from edp.workflows.live.run_live import LiveOrder, LiveRun
 from edp.workflows.live.sources import SourceOptions
 from edp.workflows.live.sources.log import LogSource
 
-MOST_LINES = 6
+MAX_LINES = 6
 """Maximum number of predictions on a page; each has a chart."""
 MOST_BYTES = 1 << 30
 """Maximum size of the rows: an hour of 700 columns at 100 Hz."""
@@ -52,7 +52,7 @@ def forecast_lines(run: str | Path, recording: Recording, horizon: int | None = 
     ]
     if not lines:
         raise ConfigError(f"the log holds nothing of what '{run}' predicts; map the columns that do (--map)")
-    return lines[:MOST_LINES]
+    return lines[:MAX_LINES]
 
 
 def _line(one: Forecast, measured: int, rows: NDArray[np.float32], rate_hz: float) -> ForecastLine:

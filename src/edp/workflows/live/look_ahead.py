@@ -13,7 +13,7 @@ from edp.signals import KINDS, Channel
 from edp.training.bundle import Bundle
 from edp.workflows.live.parts import LivePart, Note, Row, columns_of
 
-MOST_HORIZONS = 6
+MAX_HORIZONS = 6
 """Maximum number of horizons on a page. Of more horizons the first, the last and some between are shown."""
 
 
@@ -106,7 +106,7 @@ class LiveNetwork(LivePart):
                 self._note("note", "the network reads all values again", "reads")
 
 
-def spread(count: int, most: int = MOST_HORIZONS) -> list[int]:
+def spread(count: int, most: int = MAX_HORIZONS) -> list[int]:
     """Return at most `most` evenly spread numbers below `count`, including the first and the last."""
     if count <= most:
         return list(range(count))

@@ -31,7 +31,7 @@ from edp.storage.paths import is_there
 LOOPBACK = "127.0.0.1"
 PIECE_S = 0.5
 """Time between batches of rows. A batch costs the same for one row as for fifty."""
-MOST_ROWS = 6000
+MAX_ROWS = 6000
 """Maximum number of rows in a batch; further rows are omitted."""
 START_S, END_S = 30.0, 3.0
 MEMORY = "1GiB"
@@ -116,7 +116,7 @@ class RerunMirror:
         waiting = session.ticks - self._sent
         if waiting <= 0:
             return
-        first, rows = session.read(session.ticks - min(waiting, MOST_ROWS), MOST_ROWS)
+        first, rows = session.read(session.ticks - min(waiting, MAX_ROWS), MAX_ROWS)
         self.skipped += first - self._sent
         self._sent = first + len(rows)
         seconds = (first + np.arange(len(rows))) / session.layout.rate_hz

@@ -13,7 +13,7 @@ from edp.training.twin_bundle import TwinBundle, holds_twin, load_twin
 from edp.wording import typed
 from edp.workflows.live.sources import LiveSource, Needs
 
-MOST_LEVERS = 12
+MAX_LEVERS = 12
 LEVER = "Lever_"
 
 
@@ -81,4 +81,4 @@ def levers_of(channels: tuple[Channel, ...], twin: TwinBundle | None) -> list[in
     pilots = [c.name for c in channels if c.kind is Kind.PILOT_PRESSURE and not c.name.endswith("Conf")]
     levers = [c.name for c in channels if c.name.startswith(LEVER)]
     chosen = levers or [c.name for c in channels if c.name in commanded] or pilots
-    return [n for n, channel in enumerate(channels) if channel.name in chosen][:MOST_LEVERS]
+    return [n for n, channel in enumerate(channels) if channel.name in chosen][:MAX_LEVERS]

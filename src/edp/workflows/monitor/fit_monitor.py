@@ -42,7 +42,7 @@ from edp.wording import percent, typed
 from edp.workflows.monitor.dictionary import build_dictionary, check_dictionary, check_dictionary_inputs, machine_of
 from edp.workflows.monitor.fit_units import UnitMap
 
-LEAST_SESSIONS = 8
+MIN_SESSIONS = 8
 """Minimum number of healthy sessions: two for training, one for selection, and some for the limit."""
 CUT_S = 480.0
 """Length of the segments into which sessions are cut if there are too few."""
@@ -302,12 +302,12 @@ def _check_values(recordings: Sequence[Recording], channels: Sequence[Channel]) 
 
 def _enough_sessions(recordings: Sequence[Recording]) -> list[Recording]:
     """Return the recordings, cut into pieces if they are few."""
-    if len(recordings) >= LEAST_SESSIONS:
+    if len(recordings) >= MIN_SESSIONS:
         return list(recordings)
     pieces = []
     for recording in recordings:
         longest = round(CUT_S * recording.rate_hz)
-        least = -(-2 * LEAST_SESSIONS // len(recordings))
+        least = -(-2 * MIN_SESSIONS // len(recordings))
         count = max(-(-recording.samples // longest), least)
         edges = np.linspace(0, recording.samples, count + 1).astype(int).tolist()
         pieces += [recording.rows(a, b) for a, b in itertools.pairwise(edges) if b > a]

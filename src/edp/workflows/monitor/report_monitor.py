@@ -22,7 +22,7 @@ from edp.storage.runs import IDENTITY, missing_text
 from edp.workflows.monitor.run_monitor import ALARM_LOG
 
 PAGE = "report.html"
-MOST_ALARMS = 100_000
+MAX_ALARMS = 100_000
 
 
 def report_monitor(
@@ -86,8 +86,8 @@ def read_alarms(file: Path) -> list[AlarmFacts]:
         StorageError: it is missing, too large or damaged; the message names the line.
     """
     lines = [line for line in read_text(file, JSON_BYTES).splitlines() if line.strip()]
-    if len(lines) > MOST_ALARMS:
-        raise StorageError(f"'{file}' has {len(lines):,} alarms; at most {MOST_ALARMS:,} must hold")
+    if len(lines) > MAX_ALARMS:
+        raise StorageError(f"'{file}' has {len(lines):,} alarms; at most {MAX_ALARMS:,} must hold")
     return [_alarm(parse_json(line, f"'{file}', line {n}"), f"'{file}', line {n}") for n, line in enumerate(lines, 1)]
 
 

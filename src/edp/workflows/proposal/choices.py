@@ -21,7 +21,7 @@ from edp.recording import Recording
 from edp.signals import Channel, Kind
 from edp.workflows.proposal.files import horizons_for
 
-MOST_TARGETS = 4
+MAX_TARGETS = 4
 """Outputs at most: each is a model of its own in the time that a first run takes."""
 _TARGETS = (
     (Kind.VELOCITY,),
@@ -34,11 +34,11 @@ _TARGETS = (
     (Kind.TEMPERATURE,),
 )
 """Kinds of proposed targets: the first of these that is measured, or otherwise all measured channels."""
-_LEAST_RECORDINGS = 5
+_MIN_RECORDINGS = 5
 """Recordings from which whole ones test; of fewer a single one would decide the score."""
 _MOVES = 0.1
 """Minimum deviation of a moving column in a log, as a fraction of its largest deviation in any log."""
-_IN_MOST, _LEAST_TESTED = 0.7, 1.5
+_IN_MOST, _MIN_TESTED = 0.7, 1.5
 """Fraction of the logs in which a machine moves all axes, and mean number of test logs in which a column should
 move."""
 _LISTED = 3
@@ -72,9 +72,9 @@ def choose_targets(proposal: MapProposal) -> tuple[tuple[str, ...], list[str]]:
     changes = [guess for guess in measured if guess in changes or {guess.column, _stem(guess.column)} & families]
     by_kind = [[g for g in measured if g.kind.kind in kinds] for kinds in _TARGETS]
     chosen = next((guesses for guesses in [by_kind[0], by_kind[1], changes, *by_kind[2:]] if guesses), list(measured))
-    if len(chosen) > MOST_TARGETS:
-        notes.append(f"{len(chosen)} columns could be predicted; the first {MOST_TARGETS} are (task.targets)")
-    return tuple(guess.channel for guess in chosen[:MOST_TARGETS]), notes
+    if len(chosen) > MAX_TARGETS:
+        notes.append(f"{len(chosen)} columns could be predicted; the first {MAX_TARGETS} are (task.targets)")
+    return tuple(guess.channel for guess in chosen[:MAX_TARGETS]), notes
 
 
 def _stem(name: str) -> str:
@@ -104,8 +104,8 @@ def _drop_common_suffix(one: str, other: str) -> tuple[str, str]:
 
 def choose_split(group: LogGroup, proposal: MapProposal, targets: Sequence[str]) -> tuple[dict[str, object], list[str]]:
     """Choose the split: whole logs if there are many, else time, blocks if ends differ; with the reason."""
-    idle = _rests_in_most(group, proposal, targets) if len(group.paths) >= _LEAST_RECORDINGS else ""
-    if len(group.paths) >= _LEAST_RECORDINGS and not idle:
+    idle = _rests_in_most(group, proposal, targets) if len(group.paths) >= _MIN_RECORDINGS else ""
+    if len(group.paths) >= _MIN_RECORDINGS and not idle:
         return {"kind": "names"}, []
     because = [idle] if idle else []
     rate = proposal.clock.wanted_hz or proposal.clock.rate_hz
@@ -136,7 +136,7 @@ def _rests_in_most(group: LogGroup, proposal: MapProposal, targets: Sequence[str
             continue
         sizes = np.array([_size(look, guess.column) for look in group.looks])
         moving = sizes > _MOVES * sizes.max()
-        if moving.mean() < _IN_MOST and tests * moving.mean() < _LEAST_TESTED:
+        if moving.mean() < _IN_MOST and tests * moving.mean() < _MIN_TESTED:
             return (
                 f"{guess.column[:40]} moves in {np.count_nonzero(moving)} of {count_of(len(sizes), 'log')}: the end "
                 "of each log "

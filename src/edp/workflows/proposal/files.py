@@ -16,7 +16,7 @@ from edp.signals import VOCABULARY, Kind, SignalMap
 from edp.storage.paths import full_path
 
 MAP, SETTINGS, DATA = "map.toml", "settings.toml", "data.toml"
-MOST_FEATURES = 48
+MAX_FEATURES = 48
 _AHEAD_S = 0.1
 """Prediction horizon that is useful to a controller: two steps of a slow hydraulic valve."""
 _SLOW_TICKS = 5
@@ -62,7 +62,7 @@ def remarks_of(paths: Sequence[Path], proposal: MapProposal) -> list[str]:
     if proposal.clock.check:
         lines.append(f"  time: {proposal.clock.check}")
     absent = [guess for guess in proposal.columns if not guess.channel and guess.role != "time"]
-    lines += [f"Not taken: {guess.column[:60]} ({guess.role}: {guess.why})" for guess in absent[:MOST_FEATURES]]
+    lines += [f"Not taken: {guess.column[:60]} ({guess.role}: {guess.why})" for guess in absent[:MAX_FEATURES]]
     return lines
 
 

@@ -29,7 +29,7 @@ from edp.workflows.proposal.choices import choose_split, choose_targets, propose
 from edp.workflows.proposal.files import (
     DATA,
     MAP,
-    MOST_FEATURES,
+    MAX_FEATURES,
     SETTINGS,
     check_files,
     data_set_text,
@@ -165,11 +165,11 @@ def propose(path: str | Path | Sequence[str | Path], progress: Progress = SILENT
         *(note for one in source.paths for note in note_ignored_files(one, paths)),
     ]
     channels = [guess.channel for guess in proposal.select_role("reference", "command", "measured")]
-    if len(channels) > MOST_FEATURES:
+    if len(channels) > MAX_FEATURES:
         notes.append(
-            f"of {count_of(len(channels), 'moving channel')} the first {MOST_FEATURES} are features (task.features)"
+            f"of {count_of(len(channels), 'moving channel')} the first {MAX_FEATURES} are features (task.features)"
         )
-        channels = list(dict.fromkeys([*channels[:MOST_FEATURES], *targets]))
+        channels = list(dict.fromkeys([*channels[:MAX_FEATURES], *targets]))
     split, why = choose_split(group, proposal, targets)
     if experiments is not None:
         tests = experiments.tests()

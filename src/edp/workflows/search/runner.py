@@ -38,7 +38,7 @@ from edp.workflows.search.trainings import Outcome, TrainingRequest
 
 TEST_SET = "test sessions"
 TEACHER = "teacher.toml"
-MOST_SECONDS, MOST_MB = 31_557_600.0, 1e9  # a year, a petabyte: caps beyond cap nothing
+MAX_SECONDS, MAX_MB = 31_557_600.0, 1e9  # a year, a petabyte: caps beyond cap nothing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ class Resources(Workers):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_bounds("search", self, seconds=above(0.0, MOST_SECONDS), memory_mb=above(0.0, MOST_MB))
+        check_bounds("search", self, seconds=above(0.0, MAX_SECONDS), memory_mb=above(0.0, MAX_MB))
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ from edp.errors import ConfigError, closest
 from edp.evaluation.controller import Budget
 from edp.evaluation.study import MODES
 from edp.settings.bounds import (
-    MOST_EPOCHS,
+    MAX_EPOCHS,
+    MAX_UNITS,
+    MAX_UPDATES,
     MOST_TICKS,
-    MOST_UNITS,
-    MOST_UPDATES,
     SEED,
     above,
     between,
@@ -30,9 +30,9 @@ from edp.workflows.search.space import ELASTIC, THESIS, WIDTHS, Space
 from edp.workflows.search.study import PRUNERS, SamplerSpec
 
 COSTS = ("parameters", "macs_tick")
-MOST_TRAININGS = 1_000_000
+MAX_TRAININGS = 1_000_000
 """Of a phase, in runs, seeds, repeats or questions; of a second each they would take eleven days."""
-COUNT = integer(1, MOST_TRAININGS)
+COUNT = integer(1, MAX_TRAININGS)
 LIMIT = above(0.0, 1e18)
 MOVED = {
     "variance_runs": "isolation.runs",
@@ -73,7 +73,7 @@ class IsolationSpec:
     seeds: int = 2
 
     def __post_init__(self) -> None:
-        check_bounds("search.isolation", self, runs=integer(2, MOST_TRAININGS), seeds=COUNT)
+        check_bounds("search.isolation", self, runs=integer(2, MAX_TRAININGS), seeds=COUNT)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +92,7 @@ class CalibrationSpec:
     warm_rounds: int = 1
 
     def __post_init__(self) -> None:
-        check_bounds("search.calibration", self, trials=COUNT, warm_rounds=integer(0, MOST_TRAININGS))
+        check_bounds("search.calibration", self, trials=COUNT, warm_rounds=integer(0, MAX_TRAININGS))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +113,7 @@ class ModuleScreeningSpec:
     trials: int = 10
 
     def __post_init__(self) -> None:
-        check_bounds("search.screening", self, runs=integer(2, MOST_TRAININGS), repeats=COUNT, trials=COUNT)
+        check_bounds("search.screening", self, runs=integer(2, MAX_TRAININGS), repeats=COUNT, trials=COUNT)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +135,7 @@ class PlanningSpec:
 
     def __post_init__(self) -> None:
         share = between(0.0, 1.0)
-        most = integer(2, MOST_TRAININGS)
+        most = integer(2, MAX_TRAININGS)
         check_bounds("search.planning", self, least_effect=share, power=share, most_runs=most)
 
 
@@ -199,7 +199,7 @@ class CompressionSpec:
     updates: int = 0
 
     def __post_init__(self) -> None:
-        bounds = {"units": integer(1, MOST_UNITS), "shares": above(0.0, 1.0), "updates": integer(0, MOST_UPDATES)}
+        bounds = {"units": integer(1, MAX_UNITS), "shares": above(0.0, 1.0), "updates": integer(0, MAX_UPDATES)}
         check_bounds("compression", self, **bounds)
         wrong = [] if self.shares else ["shares = [] (at least one)"]
         for name in self.formats:
@@ -298,11 +298,11 @@ class SearchSpec:
 
     def __post_init__(self) -> None:
         bounds = dict.fromkeys(("trial_runs", "run_seeds", "batch"), COUNT)
-        bounds |= {"seed": SEED, "horizon": integer(0, MOST_TICKS), "folds": integer(2, MOST_TRAININGS)}
-        bounds |= {"epochs": integer(1, MOST_EPOCHS), "patience": integer(0, MOST_EPOCHS)}
+        bounds |= {"seed": SEED, "horizon": integer(0, MOST_TICKS), "folds": integer(2, MAX_TRAININGS)}
+        bounds |= {"epochs": integer(1, MAX_EPOCHS), "patience": integer(0, MAX_EPOCHS)}
         check_bounds("search", self, epochs=bounds["epochs"])
         # Zero steps stand for passes over the data, which only several epochs know.
-        steps = integer(1 if self.epochs == 1 else 0, MOST_UPDATES)  # 0: passes over the data
+        steps = integer(1 if self.epochs == 1 else 0, MAX_UPDATES)  # 0: passes over the data
         bounds |= dict.fromkeys(("updates", "final_updates"), steps)
         bounds |= dict.fromkeys(("test_share", "second_share", "rungs"), between(0.0, 1.0))
         check_bounds("search", self, **bounds)

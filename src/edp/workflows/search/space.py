@@ -11,7 +11,7 @@ from edp.networks.convolution import receptive_field
 from edp.networks.heads import HEADS
 from edp.networks.losses import Smoothness
 from edp.registry import Registry
-from edp.settings.bounds import MOST_NAMES, check_bounds, check_count, span
+from edp.settings.bounds import MAX_NAMES, check_bounds, check_count, span
 from edp.workflows.search.arms import Arm
 
 Value = float | int | str
@@ -72,7 +72,7 @@ class Choice:
     options: tuple[Value, ...]
 
     def __post_init__(self) -> None:
-        check_count("a choice", "options", self.options, MOST_NAMES)
+        check_count("a choice", "options", self.options, MAX_NAMES)
         if len(self.options) < 2 or len(set(self.options)) < len(self.options):
             raise ConfigError(f"a choice of {list(self.options)}; two values or more, each once, must hold")
 

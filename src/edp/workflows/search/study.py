@@ -19,7 +19,7 @@ import numpy as np
 
 from edp.errors import ConfigError
 from edp.evaluation.study_facts import TrialRow
-from edp.settings.bounds import MOST_NAMES, check_bounds, integer
+from edp.settings.bounds import MAX_NAMES, check_bounds, integer
 from edp.storage import replacing
 from edp.workflows.search.arms import Arm
 from edp.workflows.search.space import Candidate, Choice, Range, Real, Space, check, names
@@ -99,7 +99,7 @@ class SamplerSpec:
     def __post_init__(self) -> None:
         if self.kind not in SAMPLERS:
             raise ConfigError(f"sampler '{self.kind}'; {', '.join(SAMPLERS)} must hold")
-        check_bounds("sampler", self, startup=integer(1, MOST_NAMES))
+        check_bounds("sampler", self, startup=integer(1, MAX_NAMES))
 
 
 @dataclass

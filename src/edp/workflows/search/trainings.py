@@ -23,7 +23,7 @@ from edp.logs.source import DataSource
 from edp.networks.predictor import build_model
 from edp.networks.running import window_predictions
 from edp.recording import Recording
-from edp.settings.bounds import MOST_EPOCHS, MOST_UPDATES, SEED, check_bounds, integer
+from edp.settings.bounds import MAX_EPOCHS, MAX_UPDATES, SEED, check_bounds, integer
 from edp.storage.ledger import Record
 from edp.training.bundle import blank_scaler
 from edp.training.parts import fit_part
@@ -87,8 +87,8 @@ class TrainingRequest:
             )
 
     def _check_length(self) -> None:
-        check_bounds("order", self, seed=SEED, epochs=integer(1, MOST_EPOCHS), patience=integer(0, MOST_EPOCHS))
-        check_bounds("order", self, updates=integer(1 if self.epochs == 1 else 0, MOST_UPDATES))
+        check_bounds("order", self, seed=SEED, epochs=integer(1, MAX_EPOCHS), patience=integer(0, MAX_EPOCHS))
+        check_bounds("order", self, updates=integer(1 if self.epochs == 1 else 0, MAX_UPDATES))
         if self.updates % self.epochs:
             raise ConfigError(
                 f"order: updates = {self.updates} in {self.epochs} epochs; a multiple of them, or 0 for passes over "

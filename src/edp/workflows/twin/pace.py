@@ -14,7 +14,7 @@ SHARES = (0.125, 0.25, 0.5, 1.0)
 """Lengths of the stages, of the longest one."""
 VALIDATED = 1.5
 """Length of a free run that chooses, of the longest one that is trained on."""
-LEAST_TICKS = 16
+MIN_TICKS = 16
 """Of the longest stage, below which its shares are hardly different."""
 
 
@@ -34,7 +34,7 @@ def paced(training: FreeRunSpec, rate_hz: float, block: int) -> FreeRunSpec:
     slow = rate_hz < SLOW_HZ
     longest = min(max(asked, MOST_TICKS) if slow else asked, block // 2)
     named = (training.lengths_s, training.validation_s) != (usual.lengths_s, usual.validation_s)
-    if named or longest < LEAST_TICKS or not (slow or longest < asked):
+    if named or longest < MIN_TICKS or not (slow or longest < asked):
         return training
     lengths_s = tuple(round(share * longest) / rate_hz for share in SHARES)
     return replace(training, lengths_s=lengths_s, validation_s=round(VALIDATED * longest) / rate_hz)

@@ -11,7 +11,7 @@ import numpy as np
 from edp.data.derived_velocities import matched
 from edp.errors import ConfigError, DataError, count_of
 from edp.evaluation.beyond import RANGES, commands_beyond
-from edp.evaluation.free_run import MOST_SECONDS, FreeRunJudgeSpec, free_run_scores, runs_of
+from edp.evaluation.free_run import MAX_SECONDS, FreeRunJudgeSpec, free_run_scores, runs_of
 from edp.evaluation.free_run_file import TWIN, CommandExcess, FreeRunFile, FreeRunScores
 from edp.logs import write_recording
 from edp.logs.as_before import read_as_before
@@ -135,10 +135,10 @@ def _only(recordings: Sequence[Recording]) -> Recording:
 def _span(twin: Twin, recording: Recording, seconds: float, start_s: float | None) -> tuple[int, int]:
     """First tick of a free run and its length, which both lie in the log."""
     rate, prefix = recording.rate_hz, twin.prefix_ticks
-    if not above(0.0, MOST_SECONDS).holds(seconds):
-        raise ConfigError(f"--seconds {setting_text(seconds)}: {above(0.0, MOST_SECONDS).rule('seconds')} must hold")
-    if start_s is not None and not span(0.0, MOST_SECONDS).holds(start_s):
-        raise ConfigError(f"--from {setting_text(start_s)}: {span(0.0, MOST_SECONDS).rule('from')} must hold")
+    if not above(0.0, MAX_SECONDS).holds(seconds):
+        raise ConfigError(f"--seconds {setting_text(seconds)}: {above(0.0, MAX_SECONDS).rule('seconds')} must hold")
+    if start_s is not None and not span(0.0, MAX_SECONDS).holds(start_s):
+        raise ConfigError(f"--from {setting_text(start_s)}: {span(0.0, MAX_SECONDS).rule('from')} must hold")
     start = prefix if start_s is None else round(start_s * rate)
     ticks = max(1, round(seconds * rate))
     if recording.samples < prefix + 2:

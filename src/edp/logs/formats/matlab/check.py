@@ -24,7 +24,7 @@ _COPIES = 2
 """An array is in memory as it was unpacked and as a column."""
 _UNSTORED_BYTES = 1 << 20
 """Maximum size of an array beyond its stored bytes: HDF5 need not store values that were never written."""
-_MOST_OBJECTS = 1_000_000
+_MAX_OBJECTS = 1_000_000
 """Objects of a file; a Simulink log of 1,000 signals has some 30,000."""
 _LINKS = {
     h5py.h5l.TYPE_SOFT: "a soft link",
@@ -128,8 +128,8 @@ class _Walk:
         if address in self.seen:
             return
         self.seen.add(address)
-        if len(self.seen) > _MOST_OBJECTS:
-            raise DataError(f"'{self.path}' holds more than {_MOST_OBJECTS} objects; save fewer variables in a file")
+        if len(self.seen) > _MAX_OBJECTS:
+            raise DataError(f"'{self.path}' holds more than {_MAX_OBJECTS} objects; save fewer variables in a file")
         self.todo.append((name, part))
 
     def links(self, name: str, group: Any) -> None:

@@ -12,7 +12,7 @@ from edp.logs.formats.matlab.library import MatlabOpaque
 
 _ONE = re.compile(r"(?P<variable>.+)\{(?P<number>[1-9][0-9]{0,5})\}")
 """Name of one experiment: that of its variable and its number, as MATLAB takes one out of a cell."""
-_LEAST_ROWS, _LEAST_FIELDS = 10, 2
+_MIN_ROWS, _MIN_FIELDS = 10, 2
 """Rows that two fields of an experiment have in common at least; an element with one field of numbers is a channel."""
 
 
@@ -54,7 +54,7 @@ def _is_experiment(element: Any) -> bool:
         return False
     fields = [np.asarray(element.ravel()[0][name]) for name in element.dtype.names]
     rows = [max(field.shape) for field in fields if field.dtype.kind in "fiub" and field.size]
-    return any(rows.count(count) >= _LEAST_FIELDS for count in rows if count >= _LEAST_ROWS)
+    return any(rows.count(count) >= _MIN_FIELDS for count in rows if count >= _MIN_ROWS)
 
 
 def _split_iddata(value: MatlabOpaque) -> list[Any]:

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 from edp.errors import ConfigError
 from edp.settings.bounds import (
-    MOST_BATCH,
-    MOST_NAMES,
-    MOST_UPDATES,
+    MAX_BATCH,
+    MAX_NAMES,
+    MAX_UPDATES,
     SHARE,
     WEIGHT,
     above,
@@ -17,7 +17,7 @@ from edp.settings.bounds import (
     integer,
 )
 
-MOST_STARTS = 100
+MAX_STARTS = 100
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,17 +63,17 @@ class GreyFitSpec:
     validation_runs: int = 32
 
     def __post_init__(self) -> None:
-        length, count = above(0.0, 600.0), integer(1, MOST_UPDATES)
+        length, count = above(0.0, 600.0), integer(1, MAX_UPDATES)
         bounds = {"lengths_s": length, "validation_s": length, "rounds": count, "steps": count, "ticks": count}
-        bounds |= {"final_rounds": integer(0, MOST_UPDATES), "final_ticks": count, "final_memory": SHARE}
+        bounds |= {"final_rounds": integer(0, MAX_UPDATES), "final_ticks": count, "final_memory": SHARE}
         bounds |= {
-            "starts": integer(1, MOST_STARTS),
-            "lanes": integer(1, MOST_BATCH),
-            "validation_runs": integer(1, MOST_BATCH),
+            "starts": integer(1, MAX_STARTS),
+            "lanes": integer(1, MAX_BATCH),
+            "validation_runs": integer(1, MAX_BATCH),
             "validate_every": count,
         }
         check_bounds("grey box fit", self, stroke_weight=WEIGHT, delta=WEIGHT, memory=SHARE, **bounds)
-        check_count("grey box fit", "lengths_s", self.lengths_s, MOST_NAMES, least=1)
+        check_count("grey box fit", "lengths_s", self.lengths_s, MAX_NAMES, least=1)
         if len(self.lengths_s) != len(self.rounds):
             raise ConfigError(
                 f"grey box fit: {len(self.lengths_s)} lengths_s and {len(self.rounds)} rounds; one number of rounds "

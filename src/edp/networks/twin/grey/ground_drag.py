@@ -43,14 +43,14 @@ PARAMETERS = [
 PARAMETERS += [Parameter("ground", "across_by_depth", "N/m", 1.0, 0.0, 5e4, positive=False)]
 PLAUSIBLE = Priors.from_parameters(PARAMETERS).width
 """Prior standard deviations of the numbers."""
-LEAST_DEPTH, LEAST_SPEED = -0.1, 0.03
+MIN_DEPTH, MIN_SPEED = -0.1, 0.03
 """Rows of a fit are at least as deep (m), and at least as fast (m/s): at rest friction answers, whatever the ground."""
 CLEAR_M = 0.3
 """Above the surface; forces that the logs show there are errors of the equations, and are taken off."""
 BLOCK = 200
 """Ticks whose errors are taken as one: they lie close together."""
 ROUNDS, HUBER = 4, 1.345
-LEAST_ROWS = 500
+MIN_ROWS = 500
 METRES, BUCKET = span(-20.0, 20.0), above(0.0, 20.0)
 
 
@@ -104,10 +104,10 @@ class DragLaw(GroundLaw):
         blank = np.zeros(contact.NUMBERS)
         empty = cls(blank, blank, float(own.bodies.length[-1]), -own.chassis.boom_foot_height)
         terms, forces, blocks = empty._rows_of(twin, logs)
-        if len(forces) < LEAST_ROWS:
+        if len(forces) < MIN_ROWS:
             raise DataError(
                 f"the tip of the bucket moves below the surface ({empty.surface_m:.2f} m from the boom foot) in "
-                f"{len(forces)} ticks of the training part; {LEAST_ROWS} must hold: give logs of work in the ground, "
+                f"{len(forces)} ticks of the training part; {MIN_ROWS} must hold: give logs of work in the ground, "
                 "or another machine in twin.linkage"
             )
         numbers, deviations = _solve_parameters(terms, forces, blocks)
@@ -168,7 +168,7 @@ class DragLaw(GroundLaw):
             terms = lfilter([LOG_SHARE], [1.0, LOG_SHARE - 1.0], terms, axis=0)
             clear = depths < -CLEAR_M
             bias = np.median(forces[clear], axis=0) if clear.sum() > BLOCK else np.zeros(strokes.shape[1])
-            rows = np.flatnonzero((depths > LEAST_DEPTH) & (speeds > LEAST_SPEED))
+            rows = np.flatnonzero((depths > MIN_DEPTH) & (speeds > MIN_SPEED))
             parts.append((terms[rows], forces[rows] - bias, 1_000_000 * number + rows // BLOCK))
         terms, forces, blocks = (np.concatenate(part) for part in zip(*parts, strict=True))
         return terms, forces, blocks

@@ -24,11 +24,11 @@ REACH = 2
 """Ticks before and after over which velocities are differenced: noise falls, and swings of a few Hz stay."""
 FEW = 40_000
 """Rows that are solved for at most."""
-LEAST_INERTIA = 0.02
+MIN_INERTIA = 0.02
 """Of what is plausible."""
 SHARE_RANGE = (0.2, 1.0)
 """Of rod area by head area; values outside are not believed."""
-LEAST_ERROR = 0.02
+MIN_ERROR = 0.02
 """Of the forces, as a share of their deviation: rows never agree better with what the bodies leave out."""
 INDEPENDENT = 1_000
 """Rows that many rows count as: neighbours say the same."""
@@ -101,7 +101,7 @@ def _balance_bodies(table: ParameterTable, matrix: Array, goal: Array) -> tuple[
     of_bodies, of_goal = np.linalg.solve(normal, others.T @ bodies), np.linalg.solve(normal, others.T @ goal)
     left, sought = bodies - others @ of_bodies, goal - others @ of_goal
     free = np.linalg.lstsq(left, sought, rcond=None)[0]
-    error = max(float(np.mean((left @ free - sought) ** 2)), LEAST_ERROR**2)
+    error = max(float(np.mean((left @ free - sought) ** 2)), MIN_ERROR**2)
     weight = INDEPENDENT / len(goal) / error
     square, span = weight * left.T @ left, slice(table.inertia_at, table.potential_at)
 
@@ -161,7 +161,7 @@ def _insert_solution(table: ParameterTable, solution: Array, declared: Sequence[
     start = np.diag([values[table.inertia_at + k * table.inertia_terms] for k, (p, r) in enumerate(inertia) if p == r])
     moments, vectors = np.linalg.eigh(np.linalg.solve(start, np.linalg.solve(start, mass).T))
     # At least a fiftieth of it along each direction (200 kg): noise must not make an inertia negative.
-    low = start @ np.linalg.cholesky((vectors * np.maximum(moments, LEAST_INERTIA)) @ vectors.T)
+    low = start @ np.linalg.cholesky((vectors * np.maximum(moments, MIN_INERTIA)) @ vectors.T)
     for k, (p, r) in enumerate(inertia):
         values[table.inertia_at + k * table.inertia_terms] = low[p, r]
     potential = len(table.exponents) - 1

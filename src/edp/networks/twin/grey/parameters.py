@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 MAX_ACTUATORS, MAX_VALVES = 12, 48
 """Maximum numbers of elements: their equations are compiled, which takes seconds and a gigabyte at these sizes."""
-MOST_OF_LOAD = 5_000
+MAX_OF_LOAD = 5_000
 """Numbers of a load: a fit holds their matrix, 200 MB of it."""
 LEFT_OUT = {
     "power_limit": {"power_limit": 1e6},
@@ -214,11 +214,11 @@ def _check_size(elements: Elements, degrees: tuple[int, int]) -> None:
         )
     entries = actuators * (actuators + 1) // 2
     count = entries * comb(variables + degrees[0], variables) + comb(variables + max(degrees), variables)
-    if count > MOST_OF_LOAD:
+    if count > MAX_OF_LOAD:
         motors = f" and {len(elements.motors)} motors" if elements.motors else ""
         raise ConfigError(
             f"grey box: the load of {len(elements.cylinders)} cylinders{motors} with inertia_degree = {degrees[0]} and "
-            f"potential_degree = {degrees[1]} has {count:,} numbers; at most {MOST_OF_LOAD:,} must hold: lower the "
+            f"potential_degree = {degrees[1]} has {count:,} numbers; at most {MAX_OF_LOAD:,} must hold: lower the "
             "degrees"
         )
 

@@ -14,7 +14,7 @@ from edp.networks.twin.parameters import Parameter
 from edp.networks.twin.scales import TwinScales
 
 Doubles = NDArray[np.float64]
-MOST_ELEMENTS = 32
+MAX_ELEMENTS = 32
 """Of a kind; tangents of all numbers run side by side, and twice the elements take four times as long."""
 ZERO = 0.04
 """Plausible height of a gauge's zero above the orifice, or below it, as a share of the highest level."""
