@@ -27,7 +27,7 @@ class VelocityModel(ABC):
 
     Attributes:
         reads: measured channels of a row, commands not among them.
-        ticks: how far ahead it looks.
+        ticks: prediction horizon in samples.
     """
 
     reads: tuple[str, ...]
@@ -54,7 +54,7 @@ class PredictorAhead(VelocityModel):
 
     Args:
         bundle: it must read pilot pressures and predict the velocities.
-        ticks: how far ahead; its nearest horizon is taken.
+        ticks: prediction horizon in samples; the nearest horizon of the predictor is used.
 
     Raises:
         ConfigError: other targets, no commands, or no horizon near `ticks`.
@@ -119,8 +119,8 @@ class TwinAhead(VelocityModel):
     What the plant does not measure, such as pump pressures, is a free port of the twin: it reads its own last answer.
 
     Args:
-        twin: of the channels of Table A.1.
-        ticks: how far ahead.
+        twin: twin with the channels of Table A.1.
+        ticks: prediction horizon in samples.
         measured: names of the channels that the plant measures.
 
     Raises:

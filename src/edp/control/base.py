@@ -33,9 +33,9 @@ class ControlEvent:
     """Event in which a controller deviated from its regular output.
 
     Attributes:
-        tick: at which it began.
-        ticks: for how many ticks in a row.
-        text: what it was.
+        tick: first sample of the event.
+        ticks: number of consecutive samples.
+        text: description.
     """
 
     tick: int
@@ -70,13 +70,13 @@ class Controller(ABC):
     `spared`, and `fallback` answers in place of `levers`.
 
     Args:
-        plant: what it controls.
-        limits: of its levers.
+        plant: controlled plant.
+        limits: limits of the levers.
         reads: names of the measured channels without which it has no answer.
-        spared: those of them without which it has one, where a guard does not trust them.
+        spared: channels without which the controller still works if a guard does not trust them.
 
     Attributes:
-        events: what was logged since `reset`, at most `MAX_EVENTS`.
+        events: events since `reset`, at most `MAX_EVENTS`.
         info: figures of the last tick, such as the iterations of a solver; numbers only.
 
     Raises:
@@ -99,7 +99,7 @@ class Controller(ABC):
 
         Args:
             measured: the channels of `reads` at the start, finite.
-            reference: to follow.
+            reference: reference to follow.
         """
 
     @abstractmethod
@@ -120,7 +120,7 @@ class Controller(ABC):
         Args:
             measured: the channels of `reads`, finite; NaN where a spared one is not trusted.
             tick: row of the reference that belongs to now.
-            reason: of the guard, for the log.
+            reason: reason of the guard, for the log.
 
         Raises:
             ControlFault: it has no answer without its model.
@@ -151,7 +151,7 @@ class Controller(ABC):
 
         Args:
             observation: SI values in the order of the plant's channels.
-            reference: to follow, at the rate of the plant.
+            reference: reference to follow, at the rate of the plant.
 
         Raises:
             ConfigError: another rate, or a channel that is missing at the start.
@@ -178,7 +178,7 @@ class Controller(ABC):
         Args:
             observation: SI values in the order of the plant's channels; NaN where one is missing.
             tick: row of the reference that belongs to now.
-            verdict: what a guard says of this tick.
+            verdict: verdict of a guard on this sample.
         """
         asked, fault = self._compute_levers(observation, tick, verdict)
         if fault:
@@ -193,7 +193,7 @@ class Controller(ABC):
         Args:
             before: levers of the tick before, shape (3,).
             tick: row of the reference that belongs to now.
-            reason: for the log.
+            reason: reason for the log.
         """
         self._log(tick, f"{reason}: spools to neutral")
         self.missed(tick)

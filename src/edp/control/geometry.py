@@ -21,7 +21,7 @@ class TipGeometry:
     of the line from the bucket pin to the tip. It is measured on a machine with a tape, so controllers may know it.
 
     Attributes:
-        machine: whose it is.
+        machine: machine that the geometry describes.
         full_m: full stroke of each cylinder, shape (3,), m.
         reach_m: longest distance of the tip from the boom foot, m.
         ground_m: height of level ground in the frame of the tip, m.

@@ -24,7 +24,7 @@ class GuardVerdict:
     Attributes:
         untrusted: names of measured channels whose values controllers must not read.
         fall_back: whether the model of the controller is not to be trusted, so that its fallback has to answer.
-        reason: for the log; one short sentence without a full stop.
+        reason: reason for the log; one short sentence without a full stop.
     """
 
     untrusted: frozenset[str] = frozenset()
@@ -73,8 +73,8 @@ def verdict_of(guard: LoopGuard, plant: PlantInterface, observation: Array) -> G
     """Return the verdict of a sample. A guard that fails or names an unknown channel causes a fallback.
 
     Args:
-        guard: that is asked.
-        plant: that it was reset for.
+        guard: guard to ask.
+        plant: plant for which the guard was reset.
         observation: SI values in the order of the plant's channels.
     """
     shown = np.asarray(observation).view()

@@ -65,7 +65,7 @@ class LoopLimits:
 
         Args:
             levers: asked for, shape (3,), finite.
-            before: of the tick before, shape (3,).
+            before: levers of the previous sample, shape (3,).
             rate_hz: ticks per second.
         """
         step = np.array(self.slew_per_s) / rate_hz

@@ -42,10 +42,10 @@ class LoopResult:
         recording: a row a tick: observations, true values under names that end in `TRUE`, heights of the ground where
             there is one, reference, levers.
         score: over the judged ticks.
-        events: what the controller logged.
+        events: events logged by the controller.
         solve_s: time of each step of the controller, shape (ticks,), s.
         infos: figures that the controller gave, by name, shape (ticks,) each; NaN where it gave none.
-        warnings: what the guard said, but for ticks at which nothing was wrong.
+        warnings: warnings of the guard, without samples at which nothing was wrong.
     """
 
     recording: Recording
@@ -80,11 +80,11 @@ def run_loop(
     Args:
         env: a gymnasium environment as `edp.control.base.interface_of` reads it, whose ``info["truth"]`` is a mapping
             of noise-free values by channel.
-        controller: what moves the levers; made for an environment of the same channels.
+        controller: controller, built for an environment with the same channels.
         task: reference and limits.
-        seed: of the environment.
+        seed: seed of the environment.
         options: further options of the environment's reset.
-        guard: what says at each tick which channels the controller may read, and whether it has to fall back.
+        guard: guard that states at each sample which channels the controller may read, and whether it must fall back.
         deadline_s: time of the clock after which an answer of the controller counts as missing: levers go towards
             neutral in its place. 0: none. A loop with a deadline depends on what else the computer does.
 

@@ -39,12 +39,12 @@ class ModelBatch(PlantBatch):
         rate_hz: ticks per second.
         prefix: ticks at rest before an episode.
         duration_s: length of an episode.
-        count: how many plants.
+        count: number of plants.
 
     Attributes:
         machine: parameter set of the machine.
         commands: nominal pilot pressures (Pa) of levers.
-        noun: how messages of a reset call the plant.
+        noun: name of the plant in messages of a reset.
 
     Raises:
         ConfigError: there is no such machine or channel.
@@ -150,13 +150,13 @@ class ModelEnvironment(SingleEnvironment):
     """An environment whose machine is a model.
 
     Args:
-        batch: of one plant.
+        batch: batch of one plant.
 
     Attributes:
-        channels: of an observation, in its order.
+        channels: channels of an observation, in order.
         machine: parameter set of the machine.
         commands: nominal pilot pressures (Pa) of levers.
-        source: how messages call the plant.
+        source: name of the plant in messages.
     """
 
     _batch: ModelBatch
@@ -174,7 +174,7 @@ def check_plant_channels(what: str, commands: Sequence[str], answers: Sequence[s
         what: the plant, for the message.
         commands: names of what commands it.
         answers: names of what it answers.
-        change: what to do, for the message.
+        change: advice for the message.
 
     Raises:
         ConfigError: names the first channel that lacks, or that is none of a lever's pilot pressures.

@@ -24,12 +24,12 @@ class PlantInterface:
     """Controller's view of a plant: measured channels, mapping from levers to commands, and machine geometry.
 
     Attributes:
-        channels: of an observation, in its order; SI units.
+        channels: channels of an observation, in order; SI units.
         rate_hz: ticks per second.
         geometry: kinematics of the machine.
         command_channels: pilot pressures that levers command, in the order of `commands`.
         commands: nominal pilot pressures (Pa), shape (..., command), of lever positions, shape (..., 3).
-        source: how messages call the plant.
+        source: name of the plant in messages.
     """
 
     channels: tuple[Channel, ...]

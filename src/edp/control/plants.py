@@ -71,8 +71,8 @@ def bundle_of(run: str | Path, machine: Machine, rate_hz: float | None = None) -
 
     Args:
         run: folder.
-        machine: that it is to be a twin of.
-        rate_hz: that it must have; None for any.
+        machine: expected machine of the twin.
+        rate_hz: expected sample rate; None for any.
 
     Raises:
         EdpError: there is none, it learned from a machine with other cylinders, or it is of another rate.

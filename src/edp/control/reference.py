@@ -21,7 +21,7 @@ class TipReference:
         rate_hz: ticks per second.
         strokes: cylinder strokes, m, shape (ticks, 3).
         tip: tip x, y (m) and attitude (rad), shape (ticks, 3), at these strokes.
-        judged: which ticks a score counts, shape (ticks,); a lead-in is left out.
+        judged: mask of the samples that a score counts, shape (ticks,); a lead-in does not count.
     """
 
     rate_hz: float
@@ -59,11 +59,11 @@ def reference_of_tip(
     """Create a reference from tip poses.
 
     Args:
-        name: of the task, for messages.
+        name: name of the task, for messages.
         poses: tip x, y (m) and attitude (rad), shape (ticks, 3).
-        geometry: of the machine.
+        geometry: geometry of the machine.
         rate_hz: ticks per second.
-        judged: which ticks count, shape (ticks,); None: all.
+        judged: mask of the samples that count, shape (ticks,); None for all.
         margin: share of the stroke at either end that must stay free.
 
     Raises:
@@ -126,10 +126,10 @@ def check_speeds(name: str, reference: TipReference, geometry: TipGeometry, fast
     """Raise ConfigError if a reference requires a higher cylinder speed than possible.
 
     Args:
-        name: of the task, for messages.
-        reference: to check.
-        geometry: of the machine.
-        fastest: of each cylinder, m/s, shape (2, 3): extending, then retracting.
+        name: name of the task, for messages.
+        reference: reference to check.
+        geometry: geometry of the machine.
+        fastest: maximum speed of each cylinder, m/s, shape (2, 3): extending, then retracting.
 
     Raises:
         ConfigError: names the cylinder, the speed and the time.

@@ -81,9 +81,9 @@ def scored(trace: LoopTrace, reference: TipReference, limits: LoopLimits, missed
     """Score a loop.
 
     Args:
-        trace: what it did; it may be shorter than the reference, but must reach its judged part.
-        reference: what it was to follow.
-        limits: what it was to keep.
+        trace: trace of the loop; it may be shorter than the reference, but must include its evaluated part.
+        reference: reference of the loop.
+        limits: limits of the loop.
         missed: ticks at which the controller had no answer.
     """
     ticks, rate = len(trace.tip), reference.rate_hz

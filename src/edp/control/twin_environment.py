@@ -74,7 +74,7 @@ class TwinEnvironment(ModelEnvironment):
     name lets it act, uncut. A twin draws nothing.
 
     Args:
-        twin: of an excavator, with the channels of Table A.1 and strokes.
+        twin: twin of an excavator with the channels of Table A.1 and strokes.
         machine: name or file of the machine whose kinematics, nominal commands and pressures at rest are used.
         duration_s: length of an episode.
         ground: law of the ground that acts where a reset names a material; it stands for any.

@@ -66,9 +66,9 @@ def check_levers(valves: ValveMap, reference: TipReference, limits: LoopLimits) 
     """Refuse limits of the levers with which a cylinder cannot be nearly as fast as its reference.
 
     Args:
-        valves: of the plant.
-        reference: that is to be followed.
-        limits: of the levers.
+        valves: valve map of the plant.
+        reference: reference to follow.
+        limits: limits of the levers.
 
     Raises:
         ConfigError: names cylinder, speeds and limit.
@@ -93,7 +93,7 @@ def measure_valve_map(env: Any, plant: PlantInterface, seed: int = 0) -> ValveMa
     Args:
         env: the plant; it is reset for each of the positions.
         plant: its interface.
-        seed: of its sensors.
+        seed: seed of the sensors.
 
     Raises:
         ConfigError: the plant measures no velocities, or a cylinder does not move.
@@ -120,7 +120,7 @@ def map_of_speeds(levels: Array, measured: Array, source: str) -> ValveMap:
     Args:
         levels: positions, shape (levels,), rising.
         measured: mean speed (m/s) at each, in its direction, shape (3, 2, levels).
-        source: of the plant, for messages.
+        source: name of the plant in messages.
 
     Raises:
         ConfigError: a cylinder that no position moves.

@@ -34,9 +34,9 @@ def loss_with(net: Predictor, weights: Mapping[str, Tensor], objective: Objectiv
 
     Args:
         net: the network.
-        weights: by name of the parameter; those that are not given are the network's own.
+        weights: weights by parameter name; missing ones are those of the network.
         objective: the loss.
-        pieces: what it is taken on.
+        pieces: segments for the loss.
     """
     x, future, valid = pieces
     with torch.no_grad():

@@ -88,7 +88,7 @@ class Stochastic:
     Before, the weights themselves are validated. A training with it is not stopped early.
 
     Attributes:
-        share: of all updates, at the end, that are averaged.
+        share: fraction of all updates, at the end, that are averaged.
         rate: learning rate while averaging, as a share of the base rate; 0 leaves it to the schedule.
 
     Raises:

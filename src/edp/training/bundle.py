@@ -68,7 +68,7 @@ class Bundle:
         descriptions: description of each target.
         provenance: data digest, environment, settings, training time.
         scores: held-out scores of the network, by horizon and target; empty before evaluation.
-        adaptation: how its predictions are corrected on board, where they are.
+        adaptation: settings of the on-board correction, if there is one.
     """
 
     predictor: Predictor
@@ -199,10 +199,10 @@ def sealed_header(file: Path, what: str, readable: Sequence[int], again: str) ->
     """Return the header of a model after a check of its schema, hash and rate.
 
     Args:
-        file: of the header.
+        file: path of the header.
         what: kind of the model, for the message.
         readable: schemas that are read, rising.
-        again: what to do about another schema.
+        again: advice for another schema.
 
     Raises:
         BundleError: another schema, or it was damaged or changed.

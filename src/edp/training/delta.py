@@ -91,8 +91,8 @@ class Delta:
         facts: plain values, such as the machine's name, logs and errors.
         vectors: changes by the name of a parameter, float32.
         whole: changes of matrices, with all axes but the first as columns.
-        narrow: of others, two matrices ``(rank, rows)`` and ``(rank, columns)``; the transposed first one times the
-            second is the change.
+        narrow: change of other matrices as two matrices ``(rank, rows)`` and ``(rank, columns)``; the transposed first
+            one times the second is the change.
     """
 
     base: str
@@ -130,7 +130,7 @@ def delta_of(
         base: before.
         tuned: after; of the same parts.
         facts: plain values to keep with it.
-        most_bytes: of the file.
+        most_bytes: maximum size of the file.
 
     Raises:
         BundleError: networks of other parts, or the vectors alone take more.

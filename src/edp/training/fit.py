@@ -53,8 +53,8 @@ def fit(
     Args:
         data: prepared series.
         model: the network.
-        spec: how to train.
-        run: where the training writes; where given, a checkpoint after each epoch makes it resumable.
+        spec: settings of the training.
+        run: run folder; with it, a checkpoint after each epoch makes the training resumable.
         on_event: called with progress.
         strategy: weights to begin with, a teacher, or what fits the network by itself; it is part of what the key of
             `run` must tell apart. A strategy has no folds: with it a committee trains by gradient (see

@@ -18,8 +18,8 @@ class FreeRunProgress(ResultFile):
 
     Attributes:
         update: updates done, of `updates`.
-        updates: of all stages.
-        length_s: of the free runs now.
+        updates: number of updates of all stages.
+        length_s: present length of the free runs, s.
         seconds_left: estimated.
         validation: error of the last validation, in deviations of the velocities; None before the first.
         best: whether that is the least one so far.

@@ -65,17 +65,17 @@ class FreeRunSpec:
     """Training settings of a twin.
 
     Attributes:
-        seed: of the weights, the starts and the measured ports.
+        seed: seed of the weights, the starts and the measured ports.
         lanes: free runs side by side in an update.
         lengths_s: lengths of the free runs, stage after stage.
         updates: updates of each stage.
         measured_share: share of the lanes that are measured throughout, as a filter is.
         mixed_share: share of the lanes in which each port is measured or free by chance, as with missing sensors.
-        stroke_weight: of an error of a stroke in its deviations, beside that of a velocity; small errors add up.
-        pressure_weight: of an error of a pressure in its deviations.
-        delta: where the Huber loss turns from a square to a line, in weighted deviations.
+        stroke_weight: weight of a standardised stroke error relative to a velocity error; small errors accumulate.
+        pressure_weight: weight of a standardised pressure error.
+        delta: weighted error above which the Huber loss is linear, in standard deviations.
         clip: bound on the norm of a gradient.
-        optimizer: with the learning rate that rises over `warmup` and falls to zero by a cosine.
+        optimizer: optimiser; its learning rate rises over `warmup` and falls to zero by a cosine.
         warmup: share of all updates.
         validate_every: updates from one validation to the next.
         validation_s: length of a free run of the validation, and of those that choose a formulation.
@@ -152,7 +152,7 @@ def fit_free_runs(
         twin: untrained, or trained before; it is changed.
         train: training stretches.
         validation: stretches that choose among the weights on the way.
-        spec: how to train.
+        spec: settings of the training.
         on_event: called with progress, after each validation.
         run: folder and key of the run; where given, a checkpoint after each validation makes it resumable.
         trained: whether the twin was trained before: its weights as they are take part in the choice.
@@ -300,9 +300,9 @@ class FreeRunValidation:
     """Free runs from evenly spaced starts in the validation segments.
 
     Args:
-        twin: whose answers are judged.
+        twin: twin to evaluate.
         series: validation stretches.
-        ticks: of a free run; cut to the longest stretch.
+        ticks: length of a free run in samples; cut to the longest segment.
         lanes: number of runs at most.
 
     Raises:

@@ -25,12 +25,12 @@ class MemberTraining:
     """The training of one network on free runs, ready for another process.
 
     Attributes:
-        label: how messages call it.
+        label: name in messages.
         twin: untrained.
         train: stretches to learn from.
-        validation: those that choose among its weights.
-        training: how, with its own seed.
-        folder: where its checkpoints stand, with the key of the run; None: it cannot go on after a stop.
+        validation: segments that select among its weights.
+        training: settings with the seed of this member.
+        folder: folder of its checkpoints, with the key of the run; None for a training that cannot continue.
         trained: whether the twin was trained before, so that its weights as they are may be the best.
     """
 
@@ -135,10 +135,10 @@ def fit_members(
         form: its options.
         parts: channels, scales, and the fitted static map that all members share, where there is one.
         series: training stretches, and those that choose among the weights of each member.
-        training: how; the first member has its seed, the others one of their own.
+        training: settings; the first member has this seed, the others have their own.
         on_event: called with progress of each member in turn.
         run: folder and key of the run; where given, each member's training is resumable.
-        train_all: how members are trained.
+        train_all: function that trains the members.
     """
     if form.members == 1:
         return fit_free_runs(form.member(*parts, training.seed), *series, training, on_event, run)

@@ -31,8 +31,8 @@ def check_training_memory(net: Predictor, data: Prepared, spec: TrainingSpec, pa
 
     Args:
         net: the network, freshly built.
-        data: what it trains on.
-        spec: how.
+        data: training data.
+        spec: settings of the training.
         passes: through the network that one update goes back through; more than one where it adapts on the way.
 
     Raises:

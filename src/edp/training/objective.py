@@ -14,8 +14,8 @@ class Objective:
     """The training loss of a batch; it remembers the running error of each output where weights adapt to it.
 
     Args:
-        spec: how to train.
-        code: of the network's targets.
+        spec: settings of the training.
+        code: code of the network's targets.
 
     Attributes:
         running: mean absolute error ``(horizon, output)`` in standard deviations, led on by `follow`.
@@ -32,7 +32,7 @@ class Objective:
         """Return the loss of a batch.
 
         Args:
-            answer: what the network says.
+            answer: output of the network.
             future: targets, SI units, ``(batch, time, horizon, output)``.
             features: physical, ``(batch, time, feature)``.
             valid: ``(batch, time)``: ticks that count.

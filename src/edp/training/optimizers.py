@@ -96,7 +96,7 @@ class Discriminative:
 
     Attributes:
         rates: pairs of a part, as the beginning of its parameters' names, and its rate; the first that fits counts.
-        learning_rate: of all other parameters.
+        learning_rate: learning rate of all other parameters.
         weight_decay: lambda.
         beta1: decay of the mean of gradients.
         beta2: decay of the mean of squares.

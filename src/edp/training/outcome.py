@@ -37,7 +37,7 @@ class Fitted:
     """A trained predictor with its history.
 
     Attributes:
-        predictor: with the best weights, in evaluation mode.
+        predictor: predictor with the best weights, in evaluation mode.
         history: a row per epoch.
         seconds: training time over all sittings.
         targets_per_s: ticks with a loss per second of the update loop in this sitting.
@@ -56,7 +56,7 @@ class Diverged(TrainingError, NotFiniteError):
 
     Attributes:
         fitted: the best weights before that, None where no epoch was finished.
-        facts: where it happened, plain values.
+        facts: position of the divergence, plain values.
     """
 
     exit_code = 4

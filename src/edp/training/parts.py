@@ -35,9 +35,9 @@ def fit_part(
     Args:
         data: prepared series.
         model: the network.
-        spec: how to train; without a refit.
+        spec: settings of the training, without a refit.
         until: the last update of this part where there is one epoch, else its last epoch; None for the end.
-        start: what an earlier part of the same training left; None for the beginning.
+        start: state at the end of an earlier part of this training; None for the beginning.
         windowed: whether what validates is predicted from reset over each window, and not as a stream.
 
     Returns:

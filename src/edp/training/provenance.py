@@ -22,11 +22,11 @@ def training_provenance(
     """Return the provenance of a training.
 
     Args:
-        source: where the recordings are.
+        source: source of the recordings.
         data: the recordings, divided.
-        seed: of the training.
-        threads: with which it ran.
-        seconds: that it took.
+        seed: seed of the training.
+        threads: number of threads of the training.
+        seconds: processor time of the training, s.
         frozen: digests and names of recordings that no later training may see.
     """
 

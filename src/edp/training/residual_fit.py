@@ -20,7 +20,7 @@ class ResidualFit(FittedTwin):
         twin: the twin that is used.
         grey_error: mean error of the velocities over the free runs of the validation part, in deviations, of the grey
             box alone.
-        error: the same with the network.
+        error: free-run error with the network.
     """
 
     twin: ResidualTwin

@@ -25,7 +25,7 @@ def start_bypass(predictor: Predictor, train: Sequence[Series], validation: Sequ
     those whose source is not itself a feature. Does nothing without a skip connection or where it starts from zero.
 
     Args:
-        predictor: with its fitted scaler.
+        predictor: predictor with its fitted scaler.
         train: the map is fitted here.
         validation: chooses penalty and history for each horizon and target; a crossed start is fitted on it too.
 

@@ -24,7 +24,7 @@ class BatchContext:
     """A batch as a training strategy sees it.
 
     Attributes:
-        answer: what the network says, standardised.
+        answer: output of the network, standardised.
         future: targets, SI units, ``(batch, time, horizon, output)``.
         features: physical, ``(batch, time, feature)``.
         hidden: representation of the backbone, ``(batch, time, width)``.

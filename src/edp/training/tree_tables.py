@@ -27,7 +27,7 @@ def complete_tables(model: HistGradientBoostingRegressor, depth: int) -> Tables:
 
     Args:
         model: fitted on numbers, without categories.
-        depth: of the complete trees, at least that of the model's.
+        depth: depth of the complete trees, at least that of the model.
 
     Raises:
         ValueError: a tree is deeper, splits by categories, or holds a number beyond single precision.
@@ -49,8 +49,8 @@ def stack_tables(tables: Sequence[Tables], trees: int) -> Tables:
     """Tables of several outputs, ``(output, tree, ...)``; missing trees give zero.
 
     Args:
-        tables: of each output, of one depth.
-        trees: of each output, at least as many as any of them has.
+        tables: tables of each output, with equal depth.
+        trees: number of trees of each output, at least the largest number of any output.
 
     Raises:
         ValueError: one of them has more.

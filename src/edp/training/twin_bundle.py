@@ -65,7 +65,7 @@ class TwinBundle:
         twin: ready to run.
         provenance: data digest, environment, settings, training time.
         scores: held-out scores; empty before they are known.
-        intervals: of free runs, where they were calibrated.
+        intervals: intervals of free runs, if calibrated.
         ground: law of the ground on which loops with a material stand; None: the twin knows free air alone.
     """
 

@@ -30,7 +30,7 @@ class ModelInversion:
     """Velocities ahead are solved for the levers, axis by axis, by trying levers around the last solution.
 
     Attributes:
-        lead_s: how far ahead the model looks and the reference's speed is read.
+        lead_s: prediction horizon of the model, and lead at which the speed of the reference is read, s.
         proportional: speed by stroke error, 1/s.
         integral: speed by the integral of the stroke error, 1/s^2.
         rest_m_s: wanted speeds below this leave a lever at neutral.

@@ -68,7 +68,7 @@ class PredictiveControl:
         trust_m_s: most by which a tick may change a speed of the plan: linear models hold near it only.
         window_s: time over which the twin's predictions are compared with what came, for the disturbance.
         smoothing: share of a new error that the disturbance takes over in a tick; 0: offsets stay.
-        load: the same of forces against the cylinders, which a twin with a load (`greybox`) is told of; others are not.
+        load: the fraction for forces against the cylinders, which only a twin with a load (`greybox`) has.
         fallback: whether a PI loop answers where the program has no solution, or a guard asks for it; otherwise the
             levers go to neutral.
     """
@@ -170,7 +170,7 @@ class NmpcController(Controller):
         """Raise an error for a plan shorter than the machine's response time, simulated by the twin from steady state.
 
         Raises:
-            ConfigError: at its end less than `MIN_ANSWER` of a speed is there, so that it would run away.
+            ConfigError: less than `MIN_ANSWER` of a speed is reached at the end of the plan, so that it would diverge.
         """
         self.model.begin(measured)
         shares = response(self.model, measured, self._valves, self._slew)
@@ -280,8 +280,8 @@ class NmpcController(Controller):
         """Products of the derivatives of weighted tip errors by the variables, and of these with the errors.
 
         Args:
-            strokes: of all runs, the base first, m, shape (variable + 1, tick, 3).
-            steps: by which each variable differs in its run, m/s, shape (variable,).
+            strokes: strokes of all runs, the base first, m, shape (variable + 1, tick, 3).
+            steps: step of each variable in its run, m/s, shape (variable,).
             tick: now.
 
         Returns:
@@ -299,9 +299,9 @@ class NmpcController(Controller):
         """Soft rows of the program at the ends of the blocks: strokes and pressures that come near a limit.
 
         Args:
-            strokes: of all runs, the base first, m, shape (variable + 1, tick, 3).
-            pressures: likewise, Pa, shape (variable + 1, tick, number).
-            steps: by which each variable differs in its run, m/s, shape (variable,).
+            strokes: strokes of all runs, the base first, m, shape (variable + 1, tick, 3).
+            pressures: pressures of all runs, Pa, shape (variable + 1, tick, number).
+            steps: step of each variable in its run, m/s, shape (variable,).
 
         Returns:
             Slopes by the variables, shape (row, variable), least and largest change, shape (row,) each.

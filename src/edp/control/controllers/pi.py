@@ -30,7 +30,7 @@ class ProportionalIntegral:
     Attributes:
         proportional: speed by stroke error, 1/s.
         integral: speed by the integral of the stroke error, 1/s^2.
-        lead_s: how far ahead the reference's speed is read: the time in which the machine answers.
+        lead_s: lead at which the speed of the reference is read, s: the response time of the machine.
         rest_m_s: wanted speeds below this leave a lever at neutral.
     """
 

@@ -33,11 +33,11 @@ class FmuVariable:
     """A variable of an FMU.
 
     Attributes:
-        name: as its author wrote it.
+        name: name given by the author of the FMU.
         reference: its value reference.
         causality: ``input``, ``output``, ``parameter``, ``local`` or another one.
         real: whether it is one double-precision number.
-        unit: as it is written; empty where none is.
+        unit: unit as stated; empty without one.
         bases: exponents of the base units, the factor and the offset of its unit, where it is defined.
     """
 
@@ -54,10 +54,10 @@ class FmuDescription:
     """Properties of an FMU that a plant needs.
 
     Attributes:
-        version: of FMI, 2 or 3.
+        version: version of FMI, 2 or 3.
         token: GUID or instantiation token.
         identifier: name of its library.
-        variables: by name.
+        variables: variables by name.
         step_s: length of a step that it proposes or demands; None where it says nothing.
         any_step: whether it takes steps of any length.
         window: measured ticks that form the memory of an exported twin; 0 of other FMUs.

@@ -24,7 +24,7 @@ class FmuInstance:
 
     Args:
         archive: checked.
-        description: of it.
+        description: description of the FMU.
 
     Raises:
         ConfigError: FMPy is not installed.

@@ -35,8 +35,8 @@ class FmuPorts:
     Attributes:
         commands: pilot pressures that it reads.
         answers: channels that it gives.
-        inputs: of the commands.
-        outputs: of the answers.
+        inputs: value references of the commands.
+        outputs: value references of the outputs.
         measured: inputs that take a measured value of each answer, and their flags; empty where it has none.
         starts: parameters of the strokes at the start; empty where it has none.
     """
@@ -53,7 +53,7 @@ def ports_of(description: FmuDescription, where: str) -> FmuPorts:
     """Return the ports of an FMU.
 
     Args:
-        description: of it.
+        description: description of the FMU.
         where: the FMU, for messages.
 
     Raises:

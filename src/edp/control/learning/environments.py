@@ -24,14 +24,14 @@ class TaskEnvironment(SingleEnvironment):
     lost.
 
     Args:
-        settings: what is to be done, and on what.
+        settings: task and plant.
         render_mode: None; there is nothing to render.
         changes: settings of a `LearningSpec` laid over these.
 
     Attributes:
         settings: see `LearningSpec`.
-        plant: as a controller sees it.
-        names: of the values of an observation, in their order.
+        plant: interface of the plant for controllers.
+        names: names of the values of an observation, in order.
         rate_hz: ticks per second.
 
     Raises:
@@ -53,9 +53,9 @@ class VectorTaskEnvironment(VectorEnvironment):
     the same to rounding.
 
     Args:
-        num_envs: how many.
-        settings: as in `TaskEnvironment`, like the attributes.
-        autoreset_mode: as in `edp.sim.environment.VectorExcavatorEnv`.
+        num_envs: number of environments.
+        settings: settings, see `TaskEnvironment`, which also describes the attributes.
+        autoreset_mode: see `edp.sim.environment.VectorExcavatorEnv`.
         render_mode: None; there is nothing to render.
         changes: settings of a `LearningSpec` laid over these.
 

@@ -38,14 +38,14 @@ class TaskEpisodes(EpisodeBatch):
     """Episodes of one task, each with its own reference, plant and base controller.
 
     Args:
-        spec: of the task.
-        count: how many.
+        spec: settings of the task.
+        count: number of episodes.
 
     Attributes:
-        plant: as a controller sees it.
-        features: what is observed.
+        plant: interface of the plant for controllers.
+        features: observed features.
         position_m: distance of each tip to its reference now, shape (count,).
-        tick: of each episode, shape (count,).
+        tick: current sample of each episode, shape (count,).
 
     Raises:
         EdpError: settings or plant cannot be used.

@@ -41,14 +41,14 @@ class TaskFeatures:
     """Builds observations; the same for an environment and for a controller.
 
     Args:
-        spec: of the task.
-        plant: as a controller sees it.
+        spec: settings of the task.
+        plant: interface of the plant for controllers.
 
     Attributes:
-        names: of the values, in their order.
+        names: names of the values, in order.
         reads: channels that are read.
         preview: ticks ahead of which the reference is shown.
-        depth: how many past levers must be remembered.
+        depth: number of past levers to store.
 
     Raises:
         ConfigError: the plant does not measure one of the channels.
@@ -86,8 +86,8 @@ class TaskFeatures:
         Args:
             measured: channels of `reads`, SI units, shape (lanes, channel).
             now: the reference.
-            levers: those of the last ticks, the latest first, shape (lanes, depth, 3).
-            base: those of the base controller for this tick, shape (lanes, 3); not read without one.
+            levers: past levers, the latest first, shape (lanes, depth, 3).
+            base: levers of the base controller for this sample, shape (lanes, 3); not read without a base controller.
         """
         lanes = len(measured)
         strokes = measured[:, self._strokes]
@@ -110,7 +110,7 @@ class ReferenceRows:
     """References of a batch as arrays, so that one look-up serves all environments.
 
     Args:
-        lanes: how many.
+        lanes: number of environments.
         ticks: most ticks of an episode.
         preview: ticks ahead that are looked up.
     """

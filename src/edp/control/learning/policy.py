@@ -27,11 +27,11 @@ class PolicyController(Controller):
     """Levers of a policy that was learned in a `TaskEnvironment`: the same observation, the same limits.
 
     Args:
-        policy: what was learned; it is asked every `hold` ticks.
-        spec: of the environment in which it was learned; its plant and reward are not read.
-        plant: what it controls now.
-        limits: of its levers.
-        models: with the valve map of the plant, where the spec has a base controller.
+        policy: learned policy, evaluated every `hold` samples.
+        spec: settings of the training environment; its plant and reward are not read.
+        plant: plant to control now.
+        limits: limits of the levers.
+        models: models with the valve map of the plant, if the spec has a base controller.
 
     Raises:
         ConfigError: the plant does not measure what the policy reads, has another rate, or the map is missing.

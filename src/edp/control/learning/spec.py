@@ -42,8 +42,8 @@ class LearningSpec:
         duration_s: longest episode; a longer reference is cut off there.
         hold: ticks for which an action holds.
         observed: measured channels in the observation; strokes are always among what is read.
-        preview_s: how far ahead the reference's stroke velocities are shown.
-        past_s: how far back levers are shown, beside the last ones.
+        preview_s: lead up to which the stroke velocities of the reference are observed, s.
+        past_s: time back to which past levers are observed, in addition to the last ones, s.
         base: controller that the action corrects, such as ``pi``; empty: the action is the levers.
         gains: options of that controller.
         authority: levers of an action of one, with a base.

@@ -55,7 +55,7 @@ def fill_ways(targets: Array, before: Array, step: Array, last_ticks: NDArray[np
         targets: shape (run, block, axis).
         before: levers of the tick before, shape (axis,).
         step: shape (axis,).
-        last_ticks: of each block, shape (block,).
+        last_ticks: last sample of each block, shape (block,).
         levers: written, shape (run, tick, axis).
     """
     runs, ticks, axes = levers.shape
@@ -75,9 +75,9 @@ def fill_poses(strokes: Array, angles: Array, full: Array, lengths: Array, tips:
 
     Args:
         strokes: m, shape (rows, axis).
-        angles: of the joints at nodes of the strokes, rad, shape (nodes, axis).
+        angles: joint angles at nodes of the strokes, rad, shape (nodes, axis).
         full: m, shape (axis,).
-        lengths: of the links, m, shape (axis,).
+        lengths: lengths of the links, m, shape (axis,).
         tips: written, shape (rows, 3).
         jacobians: written, shape (rows, 3, axis).
     """
@@ -108,10 +108,10 @@ def fill_normal(
     """Compute the normal equations of the weighted tip errors over a horizon.
 
     Args:
-        strokes: of all runs, the base first, m, shape (variable + 1, tick, axis).
-        steps: by which each variable differs in its run, shape (variable,).
-        tips: of the base, shape (tick, 3).
-        jacobians: of the tips by the strokes, shape (tick, 3, axis).
+        strokes: strokes of all runs, the base first, m, shape (variable + 1, tick, axis).
+        steps: step of each variable in its run, shape (variable,).
+        tips: tips of the base run, shape (tick, 3).
+        jacobians: derivatives of the tips by the strokes, shape (tick, 3, axis).
         directions: rows that weight a tip error, shape (tick, 3, 3).
         goals: tips of the reference, shape (tick, 3).
         normal: written, shape (variable, variable + 1): derivatives' products, then those with the errors.
@@ -152,9 +152,9 @@ def fill_limits(
     """Rows of values that come near a limit; their number.
 
     Args:
-        values: of all runs at the ends of the blocks, the base first, shape (variable + 1, block, number).
-        steps: by which each variable differs in its run, shape (variable,).
-        unit: what a value is divided by, shape (number,).
+        values: values of all runs at the ends of the blocks, the base first, shape (variable + 1, block, number).
+        steps: step of each variable in its run, shape (variable,).
+        unit: divisor of each value, shape (number,).
         ends: least and largest share of the unit, shape (number,) each, and the distance within which one is near.
         room: written: slopes by the variables, shape (block * number, variable), least and largest change.
     """

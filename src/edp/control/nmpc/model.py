@@ -27,10 +27,10 @@ class TwinModel:
 
     Args:
         twin: commanded by pilot pressures of Table A.1; answers the strokes and velocities of three cylinders.
-        plant: that is controlled.
+        plant: controlled plant.
         window: ticks over which predictions are compared with what was measured.
         smoothing: share of an error that the disturbance takes over in a tick; 0: no disturbance.
-        load: the same of forces that the model is told of, where its formulation has a load.
+        load: the fraction for forces against the cylinders, if the twin has a load.
 
     Attributes:
         reads: channels of the plant that it reads, in the order of the twin's answers.

@@ -22,7 +22,7 @@ class SpeedToLever:
 
     Args:
         valves: the map.
-        limits: of the levers.
+        limits: limits of the levers.
 
     Attributes:
         slowest: least speed (m/s) that each lever's range gives, shape (3,), negative.
@@ -93,7 +93,7 @@ class Moves:
         """Return the base run and one run per variable in which it differs by a step.
 
         Args:
-            speeds: of the plan, m/s, shape (block, 3).
+            speeds: speeds of the plan, m/s, shape (block, 3).
             steps: m/s, shape (block, 3).
 
         Returns:

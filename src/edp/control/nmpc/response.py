@@ -25,7 +25,7 @@ def response(model: TwinModel, measured: Array, valves: SpeedToLever, slew: Arra
     Each cylinder moves away from its nearer end, alone, at the slew limit of its lever.
 
     Args:
-        model: whose memory is that of the machine at rest at this row.
+        model: model whose memory is the steady state at this row.
         measured: row of its `reads`.
         valves: inverse valve map.
         slew: most that a lever moves in a tick, shape (3,).

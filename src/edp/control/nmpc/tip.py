@@ -20,7 +20,7 @@ class TipTable:
     """Poses of the bucket tip and their Jacobians by the strokes, from tables of the joint angles.
 
     Args:
-        geometry: of the machine.
+        geometry: geometry of the machine.
 
     Attributes:
         full_m: full stroke of each cylinder, shape (3,), m.

@@ -32,11 +32,11 @@ class ControlTask:
     """A reference to follow, with what belongs to it.
 
     Attributes:
-        name: in `TASKS`.
-        reference: to follow.
-        limits: to keep.
+        name: name in `TASKS`.
+        reference: reference to follow.
+        limits: limits to respect.
         material: soil in which the bucket works; empty for free air.
-        seed: of which it was drawn.
+        seed: seed of the draw.
     """
 
     name: str
@@ -53,12 +53,12 @@ class TaskSpec(ABC):
     Attributes:
         speed_m_s: top speed of the tip; None draws it from `SPEED_M_S`.
         law: time law, see `edp.control.tasks.time_law.LAWS`.
-        ramp_s: of speeding up and slowing down.
+        ramp_s: time to speed up and to slow down, s.
         lead_s: rest before the start, not judged.
         hold_s: rest after the end, judged.
         margin: share of the stroke at either end that a reference leaves free.
         material: soil; empty for free air.
-        limits: of the loop.
+        limits: limits of the loop.
     """
 
     speed_m_s: float | None = None
@@ -135,9 +135,9 @@ def draw_task(spec: TaskSpec, geometry: TipGeometry, rate_hz: float, seed: int) 
 
     Args:
         spec: options of a registered task.
-        geometry: of the machine.
+        geometry: geometry of the machine.
         rate_hz: ticks per second.
-        seed: the same seed gives the same task.
+        seed: random seed; equal seeds give equal tasks.
 
     Raises:
         ConfigError: no draw fits; the message is that of the last one, with the pose or stroke and its time.

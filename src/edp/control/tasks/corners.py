@@ -19,8 +19,8 @@ class CornerPath(TaskSpec):
     """A rectangle's corners one after another: along, up, back, down; cut after some legs.
 
     Attributes:
-        width_m: of the rectangle.
-        height_m: the same.
+        width_m: range of the rectangle's width, m.
+        height_m: range of the rectangle's height, m.
         legs: number of its sides that are run.
     """
 

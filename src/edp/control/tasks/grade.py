@@ -30,7 +30,7 @@ class Grade(TaskSpec):
         length_m: shortest and longest line.
         direction: ``inwards``, ``outwards`` or ``drawn``.
         attitude_deg: least and largest attitude; None: that of the strokes drawn, in soil `SOIL_ATTITUDE_DEG`.
-        depth_m: with a material, least and largest depth of the line's start below level ground.
+        depth_m: in a material, range of the depth of the line's start below level ground, m.
     """
 
     slope_deg: float = 0.0

@@ -32,8 +32,8 @@ def progress(time_s: Array, length_s: float, ramp_s: float, law: str) -> Array:
 
     Args:
         time_s: since the start, any shape.
-        length_s: of the whole way.
-        ramp_s: of speeding up, and of slowing down; at most half of `length_s` is used.
+        length_s: duration of the whole path, s.
+        ramp_s: time to speed up, and to slow down, s; at most half of `length_s`.
         law: name in `LAWS`.
     """
     ramp = min(ramp_s, 0.5 * length_s)
@@ -60,7 +60,7 @@ def timed(
         seconds: length of each leg.
         rate_hz: ticks per second.
         ramp_s: see `progress`.
-        law: the same.
+        law: time law, see `progress`.
         lead_s: rest at the first point, not judged.
         hold_s: rest at the last one, judged.
 

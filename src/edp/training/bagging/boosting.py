@@ -42,7 +42,7 @@ class _Boosted:
     Attributes:
         count: trees with the least error on left-out rows; 0 where all of them raise it.
         left_out: predictions of rows by trees that did not see them, ``(row,)``.
-        tables: of the trees that were grown on all rows; None without trees.
+        tables: trees grown on all rows; None without trees.
     """
 
     count: int
@@ -56,7 +56,7 @@ class _Kind:
 
     Attributes:
         direct: the targets themselves, or what the linear model leaves of them.
-        columns: that they read, ``(column,)``.
+        columns: columns that the trees read, ``(column,)``.
     """
 
     direct: bool

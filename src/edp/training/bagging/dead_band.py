@@ -31,8 +31,8 @@ def dead_bands(predicted: DoubleArray, truth: DoubleArray, owner: NDArray[np.int
     """Return the dead band width of each output, ``(output,)``; 0 if it brings no gain.
 
     Args:
-        predicted: of left-out rows, standardised, ``(row, output)``.
-        truth: likewise; zero is no change.
+        predicted: predictions of left-out rows, standardised, ``(row, output)``.
+        truth: measured changes, same shape; zero is no change.
         owner: the fold that left out each row, ``(row,)``. A band must lower the absolute error of every fold: the gain
             of one stretch may be chance.
     """

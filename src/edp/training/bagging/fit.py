@@ -42,7 +42,7 @@ class Bagged:
     Attributes:
         fitted: the predictor with its history.
         left_out: predictions of each row by what did not train on it, standardised, ``(row, output)``.
-        linear: those of the linear model alone.
+        linear: errors of the linear model alone.
         table: the rows.
     """
 
@@ -55,7 +55,7 @@ class Bagged:
         """Return left-out predictions of each segment at every sample, standardised ``(tick, output)``.
 
         Args:
-            truth: what was to be predicted, of each stretch of the training part, then of the validation part.
+            truth: targets of each segment of the training part, then of the validation part.
         """
         return self.table.predict_all(self.left_out - self.table.targets, truth)
 
@@ -66,7 +66,7 @@ def fit_bagged(data: Prepared, model: ModelSpec, spec: TrainingSpec, on_event: E
     Args:
         data: prepared series.
         model: a network with the backbone ``committee`` and the head ``linear``.
-        spec: how to train; its `bagging` is given.
+        spec: settings of the training, which include `bagging`.
         on_event: called with progress.
 
     Raises:

@@ -27,7 +27,7 @@ class FoldFit:
     Attributes:
         net: the network; its bank is set, its other parts wait for their numbers.
         data: prepared series.
-        spec: how to train.
+        spec: settings of the training.
         table: the rows.
         linear: the linear models of the folds.
         tell: called with progress.
@@ -63,7 +63,7 @@ class HeadPart:
     """A learner's part of the linear head.
 
     Attributes:
-        weight: of its numbers of the representation, ``(number, output)``.
+        weight: weights of its part of the representation, ``(number, output)``.
         bias: ``(output,)``.
         linear: share of the linear model that it takes away, ``(output,)``: of those that predict without it.
     """

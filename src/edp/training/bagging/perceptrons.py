@@ -147,10 +147,10 @@ class CheckedErrors:
     Attributes:
         check: number of the check, from 1.
         updates: done so far.
-        loss: of the training; not a number if nothing was trained.
+        loss: training loss; NaN if nothing was trained.
         validation: loss on the rows left out.
         absolute: absolute error on them, in standard deviations, mean over outputs.
-        each: the same for each output.
+        each: error of each output.
         rate: learning rate.
     """
 

@@ -39,8 +39,8 @@ class _Kernel:
     """A fit with one length.
 
     Attributes:
-        scale: of each column, length times spread, ``(column,)``.
-        basis: from basis functions to directions of unit norm of the Gaussian kernel, ``(centre, direction)``.
+        scale: scale of each column, length times standard deviation, ``(column,)``.
+        basis: map from basis functions to directions of unit norm of the Gaussian kernel, ``(centre, direction)``.
         ridge: the folds' ridge regressions on the directions.
     """
 

@@ -23,10 +23,10 @@ class BaggingSpec:
         steps: updates of each member.
         batch: rows of each update.
         learning_rate: largest one, of AdamW; it rises over a tenth of the steps and falls as a cosine.
-        weight_decay: of AdamW.
+        weight_decay: weight decay of AdamW.
         robust_width: every second member of a fold is trained with the Huber loss of this threshold, in spreads of
             what the linear model leaves, instead of `training.loss`; 0 for none.
-        checks: how often members are compared on the rows that they leave out.
+        checks: number of comparisons of the members on their left-out rows.
         rows: rows that train at most, evenly spread over longer recordings.
         tree_rate: share of each boosted tree's leaves that is added.
         tree_leaf: rows of a leaf at least.

@@ -26,10 +26,10 @@ def stacking_weights(
     the rows that they would be judged by.
 
     Args:
-        models: what each one adds to the linear prediction of left-out rows, ``(row, output)`` each.
-        residual: what is to be added, ``(row, output)``.
+        models: addition of each model to the linear prediction of left-out rows, ``(row, output)`` each.
+        residual: sum that the additions should reach, ``(row, output)``.
         owner: the fold that left out each row, ``(row,)``.
-        further: which of the models must earn their place.
+        further: models that are used only if they reduce the error.
     """
     shares = np.zeros((len(models), residual.shape[1]))
     usual = np.flatnonzero(~np.asarray(further, dtype=bool))

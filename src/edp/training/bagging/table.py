@@ -57,8 +57,8 @@ class BaggingTable:
         Where rows were thinned out, the error of the row before a tick stands for that of the tick.
 
         Args:
-            error: of each row, prediction less target, ``(row, output)``.
-            truth: what was to be predicted, of each stretch of the training part, then of the validation part.
+            error: error of each row, prediction minus target, ``(row, output)``.
+            truth: targets of each segment of the training part, then of the validation part.
         """
         rows = [
             first + np.maximum(0, np.arange(len(part)) - tick) // self.stride
@@ -175,7 +175,7 @@ def bank_rows(net: Predictor, part: Series, chosen: range | None = None) -> NDAr
     """Return the bank features of a segment, as a stream from its first sample, ``(row, column)``.
 
     Args:
-        net: with a committee.
+        net: network with a committee.
         part: the stretch.
         chosen: rows that are wanted; all where it is None. Of a long stretch all would fill the memory.
     """

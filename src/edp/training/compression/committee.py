@@ -15,8 +15,8 @@ def committee_start(teacher: Predictor, model: ModelSpec, data: Prepared, seed: 
     Args:
         teacher: the committee; another backbone gives None.
         model: the student's settings.
-        data: what it is trained on.
-        seed: of the perceptrons' first weights.
+        data: training data.
+        seed: seed of the initial weights of the perceptrons.
     """
     if not isinstance(teacher.backbone, Committee):
         return None

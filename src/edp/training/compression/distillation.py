@@ -62,7 +62,7 @@ class DistillationSpec:
 
     Attributes:
         truth: alpha, weight of the truth; 0 learns from the teachers alone.
-        soft: what is made small between student and teachers: a loss of point predictions, or `SoftmaxDivergence`.
+        soft: loss between student and teachers: a loss of point predictions, or `SoftmaxDivergence`.
         hint: weight of the hidden-feature hint; 0 for none.
         components: principal components of the teachers' hidden features that the hint compares.
 

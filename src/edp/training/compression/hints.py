@@ -53,7 +53,7 @@ def hint_error(hidden: Tensor, teacher_components: Tensor, valid: Tensor) -> Ten
     feature count.
 
     Args:
-        hidden: of the student, ``(batch, time, width)``.
+        hidden: hidden features of the student, ``(batch, time, width)``.
         teacher_components: components of the teachers' features, ``(batch, time, component)``.
         valid: ``(batch, time)``.
     """

@@ -125,7 +125,7 @@ class CommitteeImitation:
         Args:
             data: the training and validation parts give rows.
             model: the student's settings, such that `imitates` holds.
-            spec: how to train.
+            spec: settings of the training, of which only the seed is used.
             on_event: called with progress.
 
         Raises:
@@ -257,9 +257,9 @@ def move_rows(rows: Tensor, count: int, draw: torch.Generator) -> Tensor:
     """Rows moved by a part of what changes between two other ones that lie at most `REACH` apart, ``(point, column)``.
 
     Args:
-        rows: of the bank, ``(row, column)``, in order of time.
-        count: how many.
-        draw: what they are drawn with.
+        rows: rows of the bank, ``(row, column)``, in order of time.
+        count: number of rows.
+        draw: random generator.
     """
     start = torch.randint(len(rows), (count,), generator=draw)
     first, second = _neighbours(rows, count, draw)

@@ -20,10 +20,10 @@ class Quantised:
     """Network with rounded arithmetic, and its storage size.
 
     Attributes:
-        predictor: to be judged and streamed like any other; it cannot be saved as a bundle.
+        predictor: network for evaluation and streaming; it cannot be saved as a bundle.
         weight_bytes: parameters as stored: one byte for each quantised weight, four for the others; as in Table 4.9
             scales are left out.
-        largest_error: by layer, the largest change of a weight.
+        largest_error: largest change of a weight, by layer.
     """
 
     predictor: Predictor

@@ -23,7 +23,8 @@ class RoundingSpec:
     """Roundings in training; weights have 8 bits, with one step size per output.
 
     Attributes:
-        activation_bits: of what convolutions, recurrent and linear layers read: 16, 8 (an experiment), or 0 for none.
+        activation_bits: bits of the inputs of convolutions, recurrent and linear layers: 16, 8 (experimental), or 0 for
+            no rounding.
         recurrent: False leaves the matrices of recurrent layers in float, as the thesis does (3.3.7).
 
     Raises:
@@ -47,7 +48,7 @@ class QuantisationAware:
     Args:
         start: a trained network; the training must be of its own specs.
         strategy: teachers, see `Distillation`; None learns from the truth alone.
-        spec: what is rounded.
+        spec: values to round.
     """
 
     def __init__(

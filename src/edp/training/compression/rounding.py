@@ -57,7 +57,7 @@ class Site:
     """Values at one place of a network: how large they become, then rounded to a fixed grid.
 
     Args:
-        bits: of a value, sign included.
+        bits: bits of a value, including the sign.
     """
 
     def __init__(self, bits: int) -> None:
@@ -107,7 +107,7 @@ class NetworkRounding:
 
     Args:
         network: the network.
-        activation_bits: of what weighted parts read; 0 leaves it as it is.
+        activation_bits: bits of the inputs of weighted parts; 0 for no rounding.
         recurrent: False leaves the matrices of recurrent layers as they are.
     """
 

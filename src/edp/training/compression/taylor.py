@@ -26,8 +26,8 @@ class FeatureImportance:
     """Squared first-order change of the loss when a feature is set to zero, averaged over segments of the data.
 
     Attributes:
-        sites: by module, ``(channel,)`` or ``(unit,)``: convolutions, temporal blocks and recurrent layers.
-        hidden: of the heads' hidden layers, each ``(output, feature)``.
+        sites: importance by module, ``(channel,)`` or ``(unit,)``: convolutions, temporal blocks and recurrent layers.
+        hidden: importance of the heads' hidden layers, each ``(output, feature)``.
     """
 
     sites: dict[nn.Module, Tensor]
@@ -42,7 +42,7 @@ def importance(predictor: Predictor, series: Sequence[Series], pieces: int = 64)
     Args:
         predictor: the network; left as it was.
         series: data to measure on, usually those it was trained on.
-        pieces: at most so many pieces of 256 ticks count, spread evenly.
+        pieces: maximum number of evenly spaced segments of 256 samples.
 
     Raises:
         DataError: no series is longer than the largest horizon.

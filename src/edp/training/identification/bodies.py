@@ -102,10 +102,10 @@ def grey_load(
     """Gravity torques ``(pose, 3)``, N m, and joint inertia ``(pose, 3, 3)``, kg m^2, of a grey box.
 
     Args:
-        table: of its numbers.
-        load: those of the load, in its units.
+        table: parameter table of the grey box.
+        load: parameters of the load, in the units of the grey box.
         z_of: middle and scale of the strokes.
-        poses: where.
+        poses: poses to evaluate.
     """
     z, n, terms = (poses.strokes - z_of[0]) * z_of[1], poses.strokes.shape[1], table.inertia_terms
     value = np.prod(z[:, None] ** table.exponents, axis=2)
@@ -131,7 +131,7 @@ def solve_base(torque: Doubles, inertia: Doubles, poses: Poses, guess: Machine) 
     Args:
         torque: ``(pose, 3)``.
         inertia: ``(pose, 3, 3)``.
-        poses: of both.
+        poses: poses of torques and inertia.
         guess: machine whose lengths hold, and whose bodies decide where the poses tell nothing.
     """
     by_torque, by_inertia = load_by_base(poses, guess.bodies.length, guess.gravity)

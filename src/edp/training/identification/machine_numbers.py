@@ -26,11 +26,11 @@ class MachineNumber:
 
     Attributes:
         section: table of the file.
-        key: in it.
-        cylinder: which one; None for a number of the whole machine.
-        group: of numbers that are judged together.
+        key: key in the machine file.
+        cylinder: index of the cylinder; None for a parameter of the whole machine.
+        group: name of the group of parameters that are evaluated together.
         width: plausible deviation of its logarithm from the guess.
-        unit: of the value.
+        unit: unit of the value.
     """
 
     section: str
@@ -143,7 +143,7 @@ def set_values(machine: Machine, values: Sequence[float] | Doubles) -> Machine:
 
     Args:
         machine: the one whose other numbers stay.
-        values: of `MACHINE_NUMBERS`, as `MachineNumber.of` gives them.
+        values: values of `MACHINE_NUMBERS` in the form of `MachineNumber.of`.
     """
     sections: dict[str, Table] = {}
     for number, value in zip(MACHINE_NUMBERS, values, strict=True):

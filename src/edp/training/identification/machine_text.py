@@ -19,9 +19,9 @@ def machine_text(machine: Machine, head: Sequence[str], comments: Mapping[tuple[
     """TOML that `edp.sim.machine.machine_files.parse_machine` reads back to the same machine, rounded to `DIGITS`.
 
     Args:
-        machine: what is written.
+        machine: machine to write.
         head: lines of comment at the top.
-        comments: by section and key, behind its line; one line of printable text each.
+        comments: comments by section and key, appended to their line; one line of printable text each.
     """
     lines = [f"# {_one_line(text)}" for text in head]
     tables = []

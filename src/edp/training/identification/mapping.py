@@ -43,12 +43,12 @@ class GreyParts:
     """Mapping from grey-box elements to machine parts.
 
     Attributes:
-        table: of its numbers.
+        table: parameter table of the grey box.
         primary: valve of each cylinder ``(3,)``.
         conflux: second valve of each cylinder, -1 where it has none.
-        reach: what a full command of each valve is, as a share of the machine's full pilot ``(valve,)``.
-        celsius: of the oil in the logs.
-        step_s: of the grey box's solver.
+        reach: full command of each valve as a fraction of the machine's full pilot pressure ``(valve,)``.
+        celsius: oil temperature of the logs, degC.
+        step_s: step of the grey box's solver, s.
     """
 
     table: ParameterTable
@@ -76,8 +76,8 @@ def grey_numbers(machine: Machine, parts: GreyParts, load: Doubles) -> Doubles:
     """Numbers of the grey box of a machine, in its own units ``(number,)``.
 
     Args:
-        machine: of the simulator.
-        parts: which element is which.
+        machine: machine of the simulator.
+        parts: assignment of elements.
         load: numbers of the load, in units of the grey box, which stay as they are.
     """
     machine = replace(machine, oil=replace(machine.oil, temperature=parts.celsius))

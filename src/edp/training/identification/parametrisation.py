@@ -51,7 +51,7 @@ class MachineParametrisation:
 
     Attributes:
         base: the machine that is guessed.
-        parts: which element of the grey box is which part of it.
+        parts: assignment of grey-box elements to parts of the machine.
         load: load parameters from which a fit begins, in units of the grey box.
         free: coordinates that move; the others stay at the guess ``(number of the machine,)``.
         begin: initial coordinates of a fit ``(coordinate,)``.

@@ -29,9 +29,9 @@ class IdentifiedNumber:
 
     Attributes:
         label: section, key and cylinder.
-        group: of numbers that are judged together.
-        unit: of the values.
-        base: in the machine that was guessed.
+        group: name of the group of parameters that are evaluated together.
+        unit: unit of the values.
+        base: value of the guessed machine.
         value: identified; that of the guess where the logs do not tell it.
         low: lower end of an approximate 95 % interval; `high` the upper one.
         high: upper end.
@@ -67,7 +67,7 @@ def number_rows(base: Machine, machine: Machine, left: Doubles, excited: NDArray
         base: the guess.
         machine: the identified one.
         left: deviations that the data leave, as shares of the plausible ones ``(number,)``.
-        excited: which numbers the logs tell.
+        excited: mask of the parameters that the logs identify.
     """
     rows = []
     for number, share, is_known in zip(MACHINE_NUMBERS, left, excited, strict=True):
@@ -92,9 +92,9 @@ def body_rows(
     Args:
         parametrisation: the guess, and which element is which.
         load: load parameters, in units of the grey box.
-        covariance: of their coordinates.
+        covariance: covariance of their coordinates.
         z_of: middle and scale of the strokes.
-        poses: of the logs.
+        poses: poses of the logs.
     """
     base, table = parametrisation.base, parametrisation.parts.table
 

@@ -46,7 +46,7 @@ def covariance(
         parametrisation: the coordinates.
         theta: the optimum, in plausible deviations ``(coordinate,)``.
         train: stretches that the fit has learned from.
-        seed: of the free runs.
+        seed: seed of the free runs.
     """
     rate, prefix = twin.channels.rate_hz, twin.prefix_ticks
     lengths = sorted({max(1, round(length * rate)) for length in twin.spec.fit.lengths_s[-LENGTHS:]})
@@ -71,8 +71,8 @@ def spread(theta: Doubles, matrices: Doubles, gradients: Doubles) -> Doubles:
 
     Args:
         theta: the optimum ``(coordinate,)``.
-        matrices: by length and by half of the blocks, even and odd ``(length, 2, coordinate, coordinate)``.
-        gradients: by length and by block ``(length, block, coordinate)``.
+        matrices: matrices by length and by half of the blocks, even and odd ``(length, 2, coordinate, coordinate)``.
+        gradients: gradients by length and by block ``(length, block, coordinate)``.
     """
     lengths, blocks, size = gradients.shape
     prior = np.eye(size)

@@ -33,7 +33,7 @@ class BothSpec:
     """Weight of the source domain relative to the target.
 
     Attributes:
-        weight: of the source's loss; that of the target's is one.
+        weight: weight of the source's loss; the target's loss has weight one.
         soft: share of it that compares with what the source's network says, not with the truth.
         reversal: weight of the reversed gradient of a classifier of the two domains; 0 for none.
 
@@ -55,7 +55,7 @@ class BothDomains:
     Args:
         start: the source's network.
         kept: training series of the source, with truth.
-        spec: how much they count.
+        spec: weights of the domains.
     """
 
     def __init__(self, start: Predictor, source_series: Sequence[Series], spec: BothSpec) -> None:

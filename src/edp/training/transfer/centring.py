@@ -68,7 +68,7 @@ def centre(net: Predictor, series: Sequence[Series]) -> None:
 
     Args:
         net: a trained network, changed in place.
-        series: with truth; each from reset, after a whole window.
+        series: series with measured targets; each starts from a reset and counts after a whole window.
     """
     bias = net.heads.biases[-1]  # (target, horizon * value), of which the first value is the prediction
     before = bias.detach().clone()

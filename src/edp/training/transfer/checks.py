@@ -47,7 +47,7 @@ def check_channels(recordings: Sequence[Recording], task: Task) -> None:
     """Refuse logs that lack a channel or have another rate, with all that is wrong at once.
 
     Raises:
-        DataError: which channels of which logs, and what to do.
+        DataError: channels are missing or rates differ; the message names channels, logs and advice.
     """
     sources = {entry.name: entry.source for entry in task.derived}
     needed = dict.fromkeys([*task.inputs, *(sources.get(name, name) for name in task.targets)])
@@ -80,7 +80,7 @@ def check_lengths(data: Prepared, chunks: ChunkSpec, window: int) -> None:
     """Refuse logs whose parts are shorter than a start-up and the horizon.
 
     Raises:
-        DataError: which parts, and how long the shortest log must be.
+        DataError: parts are too short; the message names them and the minimum length of the shortest log.
     """
     # The longest start-up of the regime, so that at least one tick is left to learn from.
     lead = max(window, chunks.burn_in if chunks.regime == "chunk" else chunks.length + chunks.consecutive - 2)
@@ -104,7 +104,7 @@ def check_moving(data: Prepared) -> None:
     """Refuse targets that do not move in the training or test part.
 
     Raises:
-        DataError: which targets.
+        DataError: targets do not move; the message names them.
     """
     for part in ("train", "test"):
         values = np.concatenate([series.targets for series in getattr(data, part)]).astype(np.float64)
@@ -134,11 +134,11 @@ def check_units(data: Prepared, scaler: FrontEnd) -> None:
     A machine that rests is no wrong unit: smallness counts only where all channels of a kind, two or more, have it.
 
     Args:
-        data: of the target.
-        scaler: of the source, with the middle and spread of each channel that it reads.
+        data: data of the target.
+        scaler: scaler of the source, with centre and spread of each channel.
 
     Raises:
-        DataError: which channels, how large they are here and there, and what to change.
+        DataError: magnitudes differ; the message names channels, both magnitudes and advice.
     """
     names = data.task.features.channels
     offset, width = (values[: len(names)].detach().double().cpu().numpy() for values in (scaler.offset, scaler.width))
@@ -171,14 +171,14 @@ def check_signs(data: Prepared, source: Prepared | None) -> list[str]:
     """Refuse logs in which targets move against the pilot pressures that moved them in the source.
 
     Args:
-        data: of the target.
-        source: of the source; None holds the logs against the convention of the built-in names.
+        data: data of the target.
+        source: data of the source; None to compare with the sign convention of the built-in names.
 
     Returns:
         What could not be found out, in sentences.
 
     Raises:
-        DataError: which targets move the other way, and what to change.
+        DataError: targets move in the opposite direction; the message names them and the advice.
     """
     pairs = list(_pairs(data))
     if not pairs:

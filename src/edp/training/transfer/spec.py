@@ -26,8 +26,8 @@ class FinetuneSpec:
     """Phases, rates and regularisers of a fine-tuning.
 
     Attributes:
-        head_epochs: of phase 1, in which only the head learns.
-        epochs: of phase 2, in which everything learns.
+        head_epochs: number of epochs of phase 1, which trains only the head.
+        epochs: number of epochs of phase 2, which trains the whole network.
         head_rate: learning rate of the head, in both phases.
         backbone_rate: learning rate of the backbone in phase 2.
         depth_decay: rate of a part of the backbone over that of the part above it; 1 for one rate.
@@ -37,8 +37,8 @@ class FinetuneSpec:
         smoothness: weight of the second difference of consecutive predictions; 0 for none.
         weight_decay: lambda of AdamW and SOAP.
         patience: epochs without a better validation score before a phase ends; 0 never ends early.
-        rank: of the low-rank adapters.
-        source_weight: of the source's loss beside the target's, of methods that rehearse it.
+        rank: rank of the low-rank adapters.
+        source_weight: weight of the source's loss relative to the target's, for methods with rehearsal.
         soft: share of that loss that compares with what the source's network says, of the method that distils.
         reversal: weight of the reversed gradient of the classifier of domains, of the adversarial method.
         inner_rate: learning rate of the method of few steps; 0 for that of the source's meta-learning, or 0.5.

@@ -25,7 +25,7 @@ class LowRank:
 
     Args:
         start: a trained network of the specs to train.
-        rank: of each change; a matrix with fewer rows or columns has a change of full rank.
+        rank: rank of each change; a matrix with fewer rows or columns has a change of full rank.
     """
 
     def __init__(self, start: Predictor, rank: int) -> None:
