@@ -290,7 +290,7 @@ def waiting(text: str, quiet: bool = False, every_s: float = 15.0) -> Iterator[N
     """Report a long step of unknown duration on standard error, at increasing intervals.
 
     Args:
-        text: what is being done.
+        text: description of the step.
         quiet: say nothing.
         every_s: until it is said again; twice as long each time.
     """

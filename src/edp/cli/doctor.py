@@ -67,7 +67,7 @@ class InstallationCheck:
         what: its name.
         state: ``ok``, ``missing`` (optional) or ``broken`` (edp needs it).
         value: version, size or path.
-        needed_for: what would not work without it, and how to get it.
+        needed_for: consequence of its absence, and how to install it.
     """
 
     what: str

@@ -154,7 +154,7 @@ def _source(options: Mapping[str, object]) -> tuple[str, object]:
     """Return the given source; raises ConfigError unless there is exactly one.
 
     Raises:
-        ConfigError: none, or several.
+        ConfigError: there is no source, or more than one.
     """
     chosen = [(name, value) for name, value in options.items() if value is not None]
     if len(chosen) != 1:

@@ -158,7 +158,7 @@ def within(bound: Bound) -> Callable[[typer.CallbackParam, Any], Any]:
     """Return a Typer callback that raises ConfigError for a value outside a bound, also within lists.
 
     Raises:
-        ConfigError: when called, with the option, the value and the bound.
+        ConfigError: a value is outside the bound; the message names option, value and bound.
     """
 
     def check(parameter: typer.CallbackParam, value: Any) -> Any:

@@ -50,7 +50,7 @@ class Display:
         """Update the bar and print a line.
 
         Args:
-            text: what is shown.
+            text: text to show.
             share: completed fraction of the command; None leaves the bar where it is.
             left: time left, for the line; the bar estimates its own.
             line: print a line.

@@ -28,11 +28,11 @@ class ControlExperiment:
     """Everything that settles closed loops.
 
     Attributes:
-        task: what is to be followed.
-        controller: what moves the levers.
+        task: task to follow.
+        controller: controller of the levers.
         machine: name of a machine, or path of a machine file.
         loops: number of loops, each of a seed of its own.
-        seed: of the first loop; the next ones count on.
+        seed: seed of the first loop; the following loops have the following seeds.
         rate_hz: ticks per second.
         deadline_ms: time of the clock after which an answer of the controller counts as missing, and levers go towards
             neutral; 0: none. With one, loops depend on what else the computer does.

@@ -139,11 +139,11 @@ class Experiment:
     """All settings of a training and its evaluation.
 
     Attributes:
-        task: what is read and predicted.
-        split: how recordings are divided.
+        task: channels to read and to predict.
+        split: division of the recordings.
         model: the network.
-        training: how it is trained.
-        judge: how it is judged.
+        training: settings of the training.
+        judge: settings of the evaluation.
     """
 
     task: TaskSettings = field(default_factory=TaskSettings)

@@ -44,10 +44,10 @@ class DictionarySpec:
         machine: name or file of the machine that is simulated; empty takes the one that the logs name, ``none`` makes
             no dictionary.
         draws: sessions of each fault and size; two at least, so that some are left out.
-        before_s: of a session until its fault begins.
-        after_s: of a session from there on.
-        minutes: of processor time; a draw that would take longer is not begun, two are made in any case.
-        kinds: of faults; empty for all.
+        before_s: length of a session before its fault, s.
+        after_s: length of a session after the onset, s.
+        minutes: processor time, min. A draw that would exceed it is not started, except for the first two.
+        kinds: kinds of faults; empty for all.
 
     Raises:
         ConfigError: a value is out of its bounds.
@@ -78,8 +78,8 @@ class MonitorExperiment:
 
     Attributes:
         residuals: sources, each a registered part.
-        chain: from residuals to alarms.
-        dictionary: of faults, that names causes.
+        chain: settings from residuals to alarms.
+        dictionary: settings of the dictionary of faults, which names causes.
         channels: names of the channels that are watched; empty takes all that sensors can give.
         groups: names of channels that virtual sensors judge together; empty where names and kinds are to tell.
         hours_per_false_alarm: operating hours to one false alarm that are promised.

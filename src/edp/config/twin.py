@@ -31,11 +31,11 @@ class TwinExperiment:
     """All settings of a twin and its evaluation.
 
     Attributes:
-        channels: which channels command, and which it answers.
-        split: how recordings are divided.
+        channels: commands and outputs.
+        split: division of the recordings.
         twin: the formulation, or the choice among several.
-        training: how it is trained, where it is trained on free runs.
-        judge: how it is judged.
+        training: settings of a training on free runs.
+        judge: settings of the evaluation.
         ground: law of the ground that a grey box of free air learns from recordings in soil; empty: none.
     """
 

@@ -219,7 +219,7 @@ def read_study(path: str | Path) -> StudyFile:
     """Return the checked content of a study's file.
 
     Args:
-        path: of ``study.json``, or of the folder that holds it.
+        path: path of ``study.json``, or of its folder.
 
     Raises:
         StorageError: missing, unreadable, of another schema, or no study.

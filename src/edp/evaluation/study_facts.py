@@ -72,11 +72,11 @@ class TrialRow:
     """A trial of phase 1, 4 or 5.
 
     Attributes:
-        values: of its dimensions, and of the options of its modules.
+        values: values of its dimensions, and of the options of its modules.
         score, mae: mean over runs; None if it was not trained to its end.
-        modules: that were on; None in phase 1.
-        parameters, macs_tick: of its network; None if the values make no network.
-        statuses: how its trainings ended; phase 1 only.
+        modules: active modules; None in phase 1.
+        parameters, macs_tick: size of its network; None if the values give no network.
+        statuses: final statuses of its trainings; phase 1 only.
         rungs: steps and scores before the end; `pruned`: whether it was ended at the last of them.
     """
 
@@ -222,7 +222,7 @@ class JointFacts:
     """Common results of phases 4 and 5: the best trial, and how often each module was active.
 
     Attributes:
-        settings: of the best trial, like `values`, `modules`, `score` and `costs`.
+        settings: settings of the best trial; also `values`, `modules`, `score` and `costs`.
         on: fraction of the trials with each module.
         said_of_pruned: a sentence on trials that were ended at a rung, if any were.
         front: numbers of the trials that no other surpasses in score and cost.

@@ -20,8 +20,8 @@ class ExportTarget(Protocol):
 
         Args:
             bundle: the trained network.
-            name: what the network is called there.
-            folder: where to.
+            name: name of the network in the exported files.
+            folder: output folder.
 
         Returns:
             The files, the one to read first in front.

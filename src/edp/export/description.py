@@ -31,7 +31,7 @@ class Description:
     """Network to be described.
 
     Attributes:
-        name: of the network in the exported form.
+        name: name of the network in the exported form.
         bundle: the trained network.
         graph: its layers.
     """
@@ -92,7 +92,7 @@ def float_graph(predictor: Predictor, form: str, solves: bool = False) -> Graph:
 
     Args:
         predictor: the network.
-        form: what the form is called.
+        form: name of the form.
         solves: whether it holds the equations of a grey box.
 
     Raises:

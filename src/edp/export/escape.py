@@ -189,7 +189,7 @@ def fill(template: str, values: Mapping[str, object]) -> Code:
     """Fill in the blanks of a template.
 
     Args:
-        template: with blanks as `string.Template` reads them.
+        template: template with blanks in the form of `string.Template`.
         values: numbers, `Code`, or text of letters, digits, blanks and ``_.,:+-`` only, which is harmless everywhere.
 
     Raises:

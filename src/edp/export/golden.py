@@ -100,7 +100,7 @@ def at_thresholds(predictor: Predictor, inputs: Rows, near: float = NEAR) -> Row
     Args:
         predictor: the network.
         inputs: ``(tick, input)``, from reset.
-        near: how far a number may be off before it meets a threshold, in standard deviations and as a share.
+        near: possible error of a value near a threshold, in standard deviations and as a fraction.
 
     Returns:
         ``(tick, number)``: twice the range of the predictions with all thresholds moved by up to so much; zero where

@@ -33,8 +33,8 @@ def si_names(names: Iterable[str], kinds: Iterable[Kind]) -> list[str]:
     in the SI unit, or that belong to a generic channel, whose numbers are those of the log, stay as they are.
 
     Args:
-        names: of the channels in the log.
-        kinds: of the same channels.
+        names: names of the channels in the log.
+        kinds: kinds of these channels.
     """
     listed = list(names)
     si_forms = [_si_name(name, kind) for name, kind in zip(listed, kinds, strict=True)]

@@ -18,7 +18,7 @@ def check_numbers(bundle: Bundle) -> None:
     """Refuse a rate, horizons or coverages that no generated code can state.
 
     Raises:
-        ExportError: which one, and what must hold.
+        ExportError: a value cannot be stated; the message names it and the rule.
     """
     rate, horizons, coverages = bundle.task.rate_hz, bundle.task.horizons, bundle.predictor.output.coverages
     if not (isinstance(rate, int | float) and math.isfinite(rate) and 1e-6 <= rate <= 1e6):
@@ -34,7 +34,7 @@ def check_sizes(sizes: Mapping[str, int], limit: int = LARGEST) -> None:
     """Refuse sizes beyond the index range of the generated code.
 
     Args:
-        sizes: by what they are sizes of.
+        sizes: sizes by their description.
         limit: the largest one.
 
     Raises:

@@ -21,8 +21,8 @@ class FloatArithmetic(Arithmetic):
     """Arithmetic given by its functions.
 
     Attributes:
-        functions: by their words.
-        operations: by their words.
+        functions: functions by name.
+        operations: operations by name.
         in_order: whether sums are taken one after the other, as a loop in C does; NumPy's own sum adds in pairs.
     """
 

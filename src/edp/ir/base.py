@@ -42,9 +42,9 @@ class Slot:
 
     Attributes:
         name: within the layer.
-        shape: for a ring, ticks first, the oldest one in row 0.
+        shape: shape; a ring has samples first, the oldest one in row 0.
         fill: every number's value after a reset, unless the graph says otherwise.
-        number: what they are.
+        number: meaning of the numbers.
     """
 
     name: str
@@ -92,9 +92,9 @@ class LayerRun:
     """What the equations of a layer read and change in addition to its inputs.
 
     Attributes:
-        constants: of the layer, in the number type of the interpreter.
-        memory: what the layer remembers; it is brought on.
-        others: what all layers remember, by their names.
+        constants: constants of the layer, in the number type of the interpreter.
+        memory: memory of the layer, which is updated.
+        others: memories of all layers, by name.
         arithmetic: functions and sums.
     """
 
@@ -118,7 +118,7 @@ class Layer(ABC):
     """One computation of a tick: vectors in, one vector out.
 
     Attributes:
-        name: of the layer and of the value that it gives; unique in its graph, lower case, parts joined by dots.
+        name: name of the layer and of its value; unique in its graph, lower case, parts joined by dots.
         inputs: values that it reads.
         matrices: constants that the C runtime multiplies with, which lie in panels there.
         counted: whether its C state has a ring or a counter.

@@ -20,7 +20,7 @@ def find_leaves(feature: Indices, threshold: NDArray[Any], leaf: NDArray[Any], x
 
     Args:
         feature: ``(output, tree, node)``.
-        threshold: likewise; compared as they come, so their type and that of `x` must hold the same numbers.
+        threshold: thresholds, same shape. They are compared without conversion, so `x` must have the same number type.
         leaf: ``(output, tree, leaf)``.
         x: ``(..., input)``.
 

@@ -23,23 +23,23 @@ class HydraulicTick(Layer):
     Units within are m, s, MPa, MN and Gg. Places are those of numbers in `numbers`, `NONE` where there is none.
 
     Attributes:
-        numbers: of the machine.
+        numbers: parameters of the machine.
         full: the largest command of each valve.
-        knots: of all opening curves.
-        middle: of each stroke; `scale` from a stroke to -1..1, 0 where it is not measured.
+        knots: knots of all opening curves.
+        middle: centre of each stroke; `scale` maps a stroke to -1..1, 0 for a stroke that is not measured.
         scale: see there.
-        offset: of each answer, in units within; `answer_width` likewise.
+        offset: offset of each output, in internal units; `answer_width` is its width.
         answer_width: see there.
         linkage: of three cylinders, as `edp.networks.twin.grey.parameter_index` orders it; one zero: the load is
             polynomials.
         sides: commands that extend and retract ``(valve, 2)``.
         valve_at: places of each valve's numbers ``(valve, 13)``.
-        valve_actuator: of each valve.
-        valve_pump: of each valve; `NONE`: it is fed at constant pressure.
+        valve_actuator: actuator of each valve.
+        valve_pump: pump of each valve; `NONE` for a supply at constant pressure.
         actuator_at: places of each actuator's numbers.
         pump_at: places of each pump's; without any, one entry `NONE`.
         ports: velocity 0, stroke 1 or pressure 2, and which ``(answer, 2)``.
-        exponents: of the load's monomials ``(term, actuator)``.
+        exponents: exponents of the load's monomials ``(term, actuator)``.
         load: places of the first coefficient of the inertia's root (of the first body of a linkage) and of the
             potential, and coefficients of each entry of the root between them.
         circuit: place of the circuit's numbers.

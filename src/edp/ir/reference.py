@@ -17,12 +17,12 @@ class Interpreter:
 
     Args:
         graph: the layers.
-        arithmetic: of the layers that compute with floats.
-        dtype: of their values.
-        streams: how many.
+        arithmetic: arithmetic of the layers that compute with floats.
+        dtype: number type of their values.
+        streams: number of streams.
 
     Attributes:
-        memory: what each layer remembers, by its name.
+        memory: memory of each layer, by its name.
     """
 
     def __init__(self, graph: Graph, arithmetic: Arithmetic, dtype: type[np.floating], streams: int = 1) -> None:

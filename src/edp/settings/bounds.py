@@ -122,9 +122,9 @@ def check_bounds(what: str, spec: object, **bounds: Bound) -> None:
     """Raise ConfigError if values of a settings object are outside their bounds. None passes.
 
     Args:
-        what: how messages call the spec.
+        what: name of the settings in messages.
         spec: object whose attributes are checked; of tuples and lists every entry.
-        bounds: by the attribute's name.
+        bounds: bounds by attribute name.
 
     Raises:
         ConfigError: every one that is out, with its bound.

@@ -33,7 +33,7 @@ class DataOrigin:
     """Origin of recordings.
 
     Attributes:
-        source: in words.
+        source: description of the source.
         reader: how to read them again, see `edp.logs.source.DataSource.to_plain`.
         rate_hz: samples per second.
         train, validation, test: parts; None if unknown.
@@ -65,10 +65,10 @@ class Provenance:
     Attributes:
         edp_version: version of EDP.
         created: time, ISO 8601.
-        command: that made the result.
+        command: command that produced the result.
         environment: versions and machine, see `edp.storage.provenance.environment`.
         data: recordings; None without recordings.
-        seed: of random numbers.
+        seed: seed of random numbers.
         seconds: computing time.
         more: entries of single commands by name, such as ``strategy`` of a fine-tuning.
     """
@@ -130,7 +130,7 @@ def new_provenance(data: DataOrigin | None = None, threads: int = 1) -> Provenan
     """Return the provenance of a result that this process makes.
 
     Args:
-        data: where its recordings come from; None without recordings.
+        data: origin of its recordings; None without recordings.
         threads: number of threads that computed the result.
     """
     created = time.strftime("%Y-%m-%dT%H:%M:%S%z")

@@ -27,10 +27,10 @@ class ResultFile:
     Any other field is always written, None as null.
 
     Attributes:
-        NAME: of the file.
+        NAME: name of the file.
         SCHEMA: version of the form, the first key of the file; 0 for files without one.
         WHAT: noun for the content in messages.
-        ADVICE: what to do about a damaged file.
+        ADVICE: advice for a damaged file.
     """
 
     NAME: ClassVar[str]

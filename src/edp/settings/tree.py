@@ -136,9 +136,9 @@ class SettingsTree:
 
     Args:
         parts: registries by the name of the field that holds one of their parts.
-        usual_kinds: by field, the kind that a table without ``kind`` means.
+        usual_kinds: kind of a table without ``kind``, by field.
         what: the kind of file, as messages call it.
-        positions: by the type of a list of fixed length, what stands at each position.
+        positions: description of each entry of a list of fixed length, by its type.
         null_is_nan: whether null stands for a number that is not finite, for which JSON has no word.
     """
 
@@ -161,7 +161,7 @@ class SettingsTree:
 
         Args:
             value: the spec, or a value of one.
-            name: of the field that holds it.
+            name: name of its field.
         """
         if name in self.parts and is_dataclass(value):
             return {"kind": self.parts[name].name_of(value)} | self._plain_fields(value)
@@ -183,7 +183,7 @@ class SettingsTree:
         Args:
             cls: dataclass of the tree's root.
             table: nested plain values by key.
-            where: how messages call the file or the changes that the table is of.
+            where: name of the file or of the changes in messages.
             path: key of the table in that file; empty for the whole file.
 
         Raises:
@@ -212,7 +212,7 @@ class SettingsTree:
             cls: dataclass of the tree's root.
             path: settings file; None takes the defaults.
             overrides: each ``key.path=value``, in any order.
-            of: how messages call the settings where there is no file.
+            of: name of the settings in messages if there is no file.
             options: plain values by key.
 
         Raises:

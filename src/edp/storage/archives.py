@@ -66,7 +66,7 @@ class ArchiveEntry:
         packed: bytes in the archive.
         method: 0 (stored) or 8 (deflated).
         crc: CRC-32 of the unpacked bytes.
-        at: where its local header lies.
+        at: position of its local header.
     """
 
     name: str
@@ -86,12 +86,12 @@ class ZipReader:
 
     Args:
         source: a regular file, or its content.
-        what: what it is, for messages (``FMU 'a.fmu'``).
-        limits: what it may hold.
-        advice: what to do where it is refused.
+        what: description for messages (``FMU 'a.fmu'``).
+        limits: limits of the content.
+        advice: advice if the archive is refused.
 
     Attributes:
-        entries: by name.
+        entries: entries by name.
 
     Raises:
         DataError: not an archive, or one that is damaged, too large, encrypted or packed by another method; or whose
@@ -340,8 +340,8 @@ def zip_bytes(files: Iterable[tuple[str, bytes]], date: tuple[int, int, int, int
 
     Args:
         files: names inside the archive, and contents.
-        date: of every entry: year, month, day, hour, minute, second.
-        mode: of every entry on Unix.
+        date: date of every entry: year, month, day, hour, minute, second.
+        mode: Unix mode of every entry.
     """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:

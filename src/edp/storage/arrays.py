@@ -69,10 +69,10 @@ def checked_arrays(
     """Return the arrays of a file in the types of their rules.
 
     Args:
-        arrays: as they were read.
+        arrays: arrays as read.
         rules: declaration of each array; a dimension gets its size from the first array that has it.
-        where: what the arrays belong to, for the message.
-        sizes: of dimensions that other parts of the file say.
+        where: owner of the arrays, for the message.
+        sizes: sizes of dimensions that other parts of the file state.
 
     Raises:
         ValueError: an array is missing or not declared, or has another type, shape or range.

@@ -35,7 +35,7 @@ def check_kind(folder: str | Path, *allowed: str, what: str) -> None:
     """Refuse to write into a folder of another kind.
 
     Args:
-        folder: where a command is about to write.
+        folder: output folder of a command.
         allowed: kinds of `MARKS` that the command may write into, beside absent, empty and foreign folders.
         what: the command, for the message.
 

@@ -37,8 +37,8 @@ def check_files(files: object, folder: str | Path, advice: str) -> None:
 
     Args:
         files: value of `FILES`, hashes by name, see `digests_of`; empty in a file of an earlier version.
-        folder: of the JSON file.
-        advice: what to do about it.
+        folder: folder of the JSON file.
+        advice: advice for the message.
 
     Raises:
         StorageError: a file is missing, or was changed or replaced since, or `files` has another form.

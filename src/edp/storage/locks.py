@@ -69,8 +69,8 @@ def holding(path: str | Path, what: str) -> Iterator[None]:
     """Hold a lock file while a command works, and remove the file afterwards.
 
     Args:
-        path: of the lock file.
-        what: what it protects, for the message.
+        path: path of the lock file.
+        what: protected object, for the message.
 
     Raises:
         BusyError: another process holds it; nothing was changed.

@@ -35,8 +35,8 @@ class Compiler:
     Args:
         part: name of the part, with which the folder's name begins.
         sources: gives the source files that compiled code comes from.
-        facts: what compiled code contains besides, from files that are not among the sources.
-        options: of ``numba.njit``, in addition to `OPTIONS`.
+        facts: content of compiled code that comes from files other than the sources.
+        options: options of ``numba.njit``, in addition to `OPTIONS`.
     """
 
     def __init__(

@@ -115,8 +115,8 @@ def check_memory(path: Path, needed: int, what: str, advice: str) -> None:
     Args:
         path: the file.
         needed: bytes that reading takes.
-        what: what takes them.
-        advice: what to do instead.
+        what: user of the memory, for the message.
+        advice: advice for the message.
 
     Raises:
         DataError: `needed` is more than this machine can give.
@@ -140,8 +140,8 @@ def check_setting(needed: float, what: str, advice: str) -> None:
 
     Args:
         needed: bytes.
-        what: which settings take them.
-        advice: what to do instead.
+        what: settings that need the memory.
+        advice: advice for the message.
 
     Raises:
         ConfigError: says what it would take and what is free.

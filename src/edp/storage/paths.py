@@ -26,7 +26,7 @@ def status_at(path: str | Path, follow: bool = True) -> os.stat_result | None:
     """Return the file status of a path; None if the path does not exist.
 
     Args:
-        path: of a file, a folder or anything else.
+        path: path of a file, a folder or anything else.
         follow: whether to follow a symbolic link at the end of the path.
 
     Raises:

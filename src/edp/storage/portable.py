@@ -46,9 +46,9 @@ else:
         """Lock an open file for this process; closing it, or the end of the process, frees it.
 
         Args:
-            stream: of a file that is open for writing, or for reading if `shared`.
+            stream: stream of a file that is open for writing, or for reading if `shared`.
             wait: whether to wait for another holder.
-            shared: with others that ask for the same.
+            shared: whether other processes may hold a shared lock as well.
 
         Raises:
             OSError: another process holds it (`HELD`), or the file system has no locks.

@@ -40,9 +40,9 @@ def read_bytes(path: str | Path, limit: int, where: str = "", error: type[Except
     """Return the content of a regular file, or of a link to one. Pipes and devices are refused.
 
     Args:
-        path: of the file.
+        path: path of the file.
         limit: most bytes; a larger file is refused before its bytes are read.
-        where: what to call the file in messages.
+        where: name of the file in messages.
         error: kind of error to raise.
 
     Raises:
@@ -111,9 +111,9 @@ def read_object(
     """Read a JSON file that holds one object.
 
     Args:
-        path: of the file.
-        keys: what it must hold.
-        where: what to call the file in messages.
+        path: path of the file.
+        keys: required keys.
+        where: name of the file in messages.
         error: kind of error to raise.
 
     Raises:
@@ -143,7 +143,7 @@ def parse_json(text: str, where: str, error: type[Exception] = StorageError, fin
 
     Args:
         text: the JSON.
-        where: what to call it in messages.
+        where: name of the text in messages.
         error: kind of error to raise.
         finite: refuse NaN and infinity, which are not JSON; Python writes them all the same.
 
@@ -168,8 +168,8 @@ def read_toml(
     """Read a TOML file; see `parse_toml`.
 
     Args:
-        path: of the file.
-        where: what to call the file in messages.
+        path: path of the file.
+        where: name of the file in messages.
         error: kind of error to raise.
         advice: added to the message of a file that cannot be read.
 

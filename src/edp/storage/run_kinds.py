@@ -14,8 +14,8 @@ class RunKind:
     """A kind of run.
 
     Attributes:
-        name: as `edp runs` shows it and `run.json` states it.
-        command: that writes such a run.
+        name: name in `edp runs` and in `run.json`.
+        command: command that writes such a run.
         result: file that only this kind of run has. Runs of earlier versions, which do not state their kind, are
             recognised by it.
         model: header of the model that a finished run has; empty for a kind without a model.

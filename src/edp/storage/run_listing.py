@@ -38,13 +38,13 @@ class ListedRun:
     """A run on disk.
 
     Attributes:
-        folder: where it is.
+        folder: folder of the run.
         kind: name of its kind, see `edp.storage.run_kinds`; ``-`` for a folder that cannot be read.
         state: ``finished``, ``running``, ``stopped``, ``diverged``, or ``damaged`` where a file cannot be read, its
             settings are no TOML, or what it made is not there or not as it was written; ``cannot be read: REASON``
             for a folder that this process has no right to look into.
-        when: of its last state, as its files say; else of its files.
-        data: where its recordings were.
+        when: time of its last state according to its files, otherwise time of its files.
+        data: source of its recordings.
         score: its error on test logs in words; empty where it was not judged.
     """
 

@@ -83,7 +83,7 @@ class Run:
                 records its end, and its kind is the one of the run.
             kind: name of the kind of run, see `edp.storage.run_kinds`.
             key: see `run_key`.
-            settings: of the run, as TOML; empty for a run without settings.
+            settings: settings of the run, as TOML; empty for a run without settings.
 
         Raises:
             BusyError: another process holds the folder.
@@ -217,10 +217,10 @@ def missing_text(folder: str | Path, kind: str, what: str = "", file: str = "") 
     """Return the message about a folder without the result of a kind of run: unfinished, of another kind, or no run.
 
     Args:
-        folder: that a command was given.
+        folder: folder given to a command.
         kind: name of the kind of run that the command reads, see `edp.storage.run_kinds`.
         what: noun phrase for what is read; by default the run of its command.
-        file: that is missing; by default the result of the kind.
+        file: missing file; by default the result of the kind.
 
     Raises:
         StorageError: the folder cannot be looked into, or its identity or status is damaged.
@@ -252,7 +252,7 @@ def check_claimable(path: str | Path | Run, kind: str) -> None:
     Nothing is made or changed: a command that is refused later leaves no folder. A run that is open already passes.
 
     Args:
-        path: of a run folder to be, or an open run.
+        path: path of a future run folder, or an open run.
         kind: name of the kind of run, see `edp.storage.run_kinds`.
 
     Raises:
@@ -295,7 +295,7 @@ def check_free(path: str | Path, what: str) -> None:
     """Refuse a folder in which a new run would lie among the files of something else.
 
     Args:
-        path: of a run folder to be: absent, empty, that of a run, or what a killed run left.
+        path: path of a future run folder: absent, empty, a run, or left by a killed run.
         what: the command, for the message.
 
     Raises:
@@ -320,8 +320,8 @@ class KeyedRun:
     """A run folder with the key of the training in it, by which its checkpoints are known.
 
     Attributes:
-        folder: where the training writes.
-        key: of the training, see `run_key`.
+        folder: folder in which the training writes.
+        key: key of the training, see `run_key`.
     """
 
     folder: Run

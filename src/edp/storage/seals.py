@@ -45,8 +45,8 @@ def unsealed(content: Any, where: str, error: type[Exception]) -> Any:
     """Return an object without its hash, which is checked; anything without a hash is noted and returned.
 
     Args:
-        content: what a file of EDP holds.
-        where: what to call the file in messages.
+        content: content of a file of EDP.
+        where: name of the file in messages.
         error: kind of error to raise.
 
     Raises:
@@ -81,8 +81,8 @@ def check_sealed_line(line: str, where: str, error: type[Exception]) -> None:
     """Check the hash of a line that `seal_line` wrote.
 
     Args:
-        line: without its end.
-        where: what to call the line in messages.
+        line: line without its end.
+        where: name of the line in messages.
         error: kind of error to raise.
 
     Raises:

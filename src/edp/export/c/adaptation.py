@@ -32,7 +32,7 @@ def values(adaptation: Adaptation, upper: str, intervals: int) -> dict[str, obje
     Args:
         adaptation: the adaptation.
         upper: name of the model in capitals.
-        intervals: how many it states.
+        intervals: number of intervals.
     """
     targets, inputs, n = len(adaptation.columns), len(adaptation.offset), adaptation.features
     row = n + 2 * targets

@@ -26,7 +26,7 @@ class Calls:
 
     Args:
         graph: the layers.
-        plan: where their values lie.
+        plan: positions of the values in memory.
     """
 
     def __init__(self, graph: Graph, plan: MemoryPlan) -> None:

@@ -65,7 +65,7 @@ class CConstant:
 
     Attributes:
         kind: C type of its entries.
-        name: in C.
+        name: name in C.
         count: entries.
         text: its definition; empty where a template holds it.
     """
@@ -97,7 +97,7 @@ def constants_of(graph: Graph, plan: MemoryPlan, written: bool = False) -> Itera
     Args:
         graph: its layers.
         plan: places in the work memory.
-        written: with their texts, which take time; without them they are counted only.
+        written: whether to return their texts, which take time, instead of counting only.
     """
     calls = Calls(graph, plan)
     for layer in graph.layers:

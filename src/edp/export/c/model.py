@@ -301,8 +301,8 @@ def make_model(name: str, bundle: Bundle, tangent: bool = False, adapts: bool = 
     Args:
         name: C prefix of the model.
         bundle: the trained network.
-        tangent: with tangents.
-        adapts: with the bundle's adaptation, where it has one.
+        tangent: whether to include tangents.
+        adapts: whether to include the bundle's adaptation, if there is one.
 
     Raises:
         ExportError: a part of the network has no form as a layer, a tangent of integers is asked for, or a size is

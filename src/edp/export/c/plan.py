@@ -14,9 +14,9 @@ class MemoryPlan:
     """Places from the start of the work memory of their kind of number.
 
     Attributes:
-        values: of each layer's value.
-        scratch: of each layer's scratch numbers, where it needs any.
-        sizes: of the work memories.
+        values: position of the value of each layer.
+        scratch: position of the scratch numbers of each layer that needs any.
+        sizes: sizes of the work memories.
     """
 
     values: Mapping[str, int]

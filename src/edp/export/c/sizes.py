@@ -45,8 +45,8 @@ def constant_bytes(graph: Graph, adaptation: Adaptation | None = None, machine: 
 
     Args:
         graph: its layers.
-        adaptation: of its run, if it has one.
-        machine: where they lie.
+        adaptation: adaptation of the run, if there is one.
+        machine: target machine.
     """
     more = [] if adaptation is None else adapting.constants(adaptation)
     return total_bytes(constants_of(graph, plan(graph)), machine) + total_bytes(more, machine)

@@ -25,12 +25,12 @@ class ConstantTables:
 
     Attributes:
         owner: word for what the constants belong to, in messages.
-        lines: of C.
-        double_entries: of the table of arrays of doubles.
-        entries: of the table of other arrays.
+        lines: lines of C.
+        double_entries: entries of the table of arrays of doubles.
+        entries: entries of the table of other arrays.
         double_crc: CRC-32 of the doubles so far.
         crc: CRC-32 of the others so far.
-        bytes: of all of them.
+        bytes: total size of the arrays.
     """
 
     owner: str

@@ -22,8 +22,8 @@ class Tangents:
 
     Args:
         graph: the layers.
-        plan: where their values lie.
-        changes: where the changes of their values lie.
+        plan: positions of the values in memory.
+        changes: positions of the tangents in memory.
     """
 
     def __init__(self, graph: Graph, plan: MemoryPlan, changes: MemoryPlan) -> None:

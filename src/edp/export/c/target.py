@@ -34,7 +34,8 @@ class CTarget:
     """C99, float32 or w8a16: ``NAME.h``, ``NAME.c``, constants, runtime, host test, fuzzer, example task, CMake.
 
     Attributes:
-        tangent: with ``NAME_tangent.h`` and ``NAME_tangent.c``: how predictions change with inputs and past; float32.
+        tangent: whether to write ``NAME_tangent.h`` and ``NAME_tangent.c``: derivatives of predictions by inputs and
+            past; float32.
         adapts: whether this form holds the adaptation of a bundle that has one: ``NAME_adaptation.h`` and ``.c``.
     """
 

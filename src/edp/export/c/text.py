@@ -102,8 +102,8 @@ def reference_array(kind: str, name: str, values: NDArray[np.floating], missing:
 
     Args:
         kind: ``float`` or ``double``.
-        name: of the array.
-        values: of it.
+        name: name of the array.
+        values: values of the array.
         missing: whether a value that is not finite becomes ``NAN``; else it is refused.
     """
     literal = double_number if kind == "double" else number
@@ -123,9 +123,9 @@ def enumeration(
     """Return the entries of an enumeration from 0 on, each with a comment, which is escaped here.
 
     Args:
-        prefix: of each entry.
-        names: what follows the prefix, as any text.
-        comments: behind the entries.
+        prefix: prefix of each entry.
+        names: text after the prefix, any text.
+        comments: comments after the entries.
         longest: characters of what follows the prefix, by default what C99 promises to tell apart.
         aligned: whether the comments begin in one column.
     """

@@ -14,7 +14,7 @@ class Horizon:
 
     Args:
         network: a `Network` that was compiled.
-        library: what `Network.compile` made.
+        library: result of `Network.compile`.
         steps: ticks.
         commands: numbers that are chosen for each tick, by which is differentiated.
         carry, feed: see `Network.horizon`.

@@ -32,7 +32,7 @@ class Network:
     """An exported network.
 
     Attributes:
-        about: what ``NAME.json`` says.
+        about: content of ``NAME.json``.
         inputs, targets: names, in the order of ``u`` and of the predictions.
         rate_hz: ticks a second.
         start: the state after a reset, ``(state,)``.

@@ -16,8 +16,8 @@ class Place:
     """A slot in the column.
 
     Attributes:
-        layer: that remembers it.
-        slot: which.
+        layer: layer of the state.
+        slot: slot within the layer.
         at: its first number.
     """
 

@@ -98,7 +98,7 @@ class LaneModel:
         """Yield the statements of a time step. Neighbouring layers without products share one loop over the copies.
 
         Args:
-            free: where no port is measured, what they read is the last answers, and the layers between are left out.
+            free: whether no port is measured; ports then read the last outputs, and the layers between are omitted.
         """
         calls, together = Calls(self.model.graph, self.model.plan), list[str]()
         for layer in self.model.graph.layers:
@@ -165,7 +165,7 @@ def lane_model(name: str, bundle: Bundle) -> LaneModel:
 
     Args:
         name: C prefix of the model.
-        bundle: of a `TwinPlant`.
+        bundle: bundle of a `TwinPlant`.
 
     Raises:
         ExportError: no twin, one in integer arithmetic, or one with a layer that solves equations by iterations.

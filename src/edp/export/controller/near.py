@@ -99,7 +99,7 @@ def near_model(name: str, plan: PlanParts) -> NearModel | None:
 
     Args:
         name: C prefix of the model.
-        plan: on it.
+        plan: plan on the twin.
 
     Raises:
         ExportError: a part of it has no form as a layer.

@@ -24,7 +24,7 @@ class PilotCommand:
         axis: 0 boom, 1 arm, 2 bucket.
         second: whether it is that of a conflux spool.
         extend: whether positive levers give it.
-        share: of the demand that a conflux spool takes; 1 for others.
+        share: fraction of the demand for a conflux spool; 1 for others.
     """
 
     axis: int
@@ -49,7 +49,7 @@ class PlanParts:
         sides: speeds (m/s) and levers of the continuous inverse map, by axis, extending and retracting.
         slowest: least speed (m/s) that a lever's range gives, shape (3,).
         fastest: largest, shape (3,).
-        step_m_s: by which a speed is changed to see its effect.
+        step_m_s: step of a speed to determine its effect, m/s.
         window: ticks over which predictions are compared with what was measured.
         weights: along, attitude_m, change, feedforward, trust_m_s, smoothing, as `nmpc` has them.
         margin: share of a stroke that is to stay free at either end.
@@ -107,7 +107,7 @@ class GoldenLoop:
         measured: values of the controller's inputs, shape (ticks, input).
         before: what it remembered before each tick, shape (ticks, number): levers; speeds of the plan, those asked for
             last (of a plan only); sums of the PI loop; disturbance, and forces against the cylinders (of a plan only).
-        levers: that the controller gave, shape (ticks, 3).
+        levers: levers of the controller, shape (ticks, 3).
         strokes: reference of the strokes (m), shape (rows, 3), at least as long as the ticks and the horizon.
         tip: reference of the tip, shape (rows, 3).
     """
@@ -127,21 +127,21 @@ class ControllerParts:
         title: a line about it.
         machine: name of the machine.
         inputs: measured channels, in the order in which they are given; of a PI loop the three strokes.
-        limits_low: of the inputs, beyond which they count as missing, shape (input,).
-        limits_high: the same.
+        limits_low: lower limits of valid inputs, shape (input,). Values outside the limits count as missing.
+        limits_high: upper limits of valid inputs, shape (input,).
         stroke_inputs: inputs that are the strokes.
         rate_hz: ticks per second.
         angles: joint angles (rad) at evenly spaced strokes, shape (nodes, 3).
         full_m: full strokes, shape (3,).
-        lengths_m: of the links, shape (3,).
+        lengths_m: lengths of the links, m, shape (3,).
         lever_low: least positions, shape (3,).
         lever_high: largest ones.
         slew: most that a lever moves in a tick, shape (3,).
         sides: speeds (m/s) and levers of the valve map, by axis, extending and retracting.
-        gains: of the PI loop: proportional, integral, rest (m/s), most sum (m/s).
+        gains: gains of the PI loop: proportional, integral, rest (m/s), maximum sum (m/s).
         lead: ticks by which the PI loop reads the reference's speed ahead.
-        plan: of a predictive controller; None for the PI loop alone.
-        golden: of a self-test; None without one.
+        plan: plan of a predictive controller; None for a PI loop alone.
+        golden: data of a self-test; None without one.
     """
 
     title: str

@@ -36,7 +36,7 @@ def plant_files(template: str, model: Model, values: Mapping[str, object], runti
     Args:
         template: name of the template of header and source, without its ending.
         model: the layers.
-        values: of the template.
+        values: values of the template.
         runtime: files of this package that the model needs in addition to its own.
     """
     path, name = f"controller/templates/{template}", model.name

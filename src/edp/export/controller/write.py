@@ -44,7 +44,7 @@ class ControllerFiles:
     Attributes:
         name: C prefix.
         parts: its numbers.
-        model: of its plan; None for a PI loop alone.
+        model: model of its plan; None for a PI loop alone.
         tables: its constants.
     """
 

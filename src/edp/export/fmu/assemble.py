@@ -69,7 +69,7 @@ def fmu_files(
     """Return the FMUs of a model by file name.
 
     Args:
-        about: what the XML files tell.
+        about: content of the XML files.
         core: C code of the model by file name, `model_header` as ``fmu_model.h`` among it.
         description: JSON, a file of its resources.
         version: a name of `VERSIONS`.

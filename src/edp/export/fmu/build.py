@@ -23,10 +23,10 @@ class Platform:
     """Platform of a shared library.
 
     Attributes:
-        target: what the compiler calls it; the number is the oldest glibc.
-        ending: of the library's name.
-        folders: of the library in an FMU, by version of FMI.
-        flags: of the compiler besides `FLAGS`.
+        target: name of the platform for the compiler; the number is the oldest glibc.
+        ending: ending of the library's name.
+        folders: folder of the library in an FMU, by version of FMI.
+        flags: compiler flags in addition to `FLAGS`.
         last: libraries.
     """
 
@@ -49,7 +49,7 @@ class Sources:
     """Source files to compile.
 
     Attributes:
-        name: of the libraries.
+        name: name of the libraries.
         files: sources and headers, file name to text.
         common: C files of all versions of FMI.
         own: C files that only one version has, by version.

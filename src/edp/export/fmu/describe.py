@@ -28,13 +28,13 @@ class About:
     """Content of the XML files.
 
     Attributes:
-        name: of the model and its binaries.
+        name: name of the model and its binaries.
         token: content address of sources and interface, in the form of a GUID.
         title: the network in a line.
         rate_hz: ticks a second.
         listed: variables in the order of their value references.
         derivatives: whether directional derivatives are provided.
-        facts: what else is known, by name.
+        facts: further properties by name.
     """
 
     name: str

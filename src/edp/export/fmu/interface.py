@@ -21,9 +21,9 @@ class Variable:
     Attributes:
         name: unique.
         causality: input, output or local.
-        description: for people.
+        description: description for readers.
         form: real number, integer, or true and false.
-        kind: what a real number measures.
+        kind: physical quantity of a real number.
         nominal: usual size of a real number, SI unit.
     """
 

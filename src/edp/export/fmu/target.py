@@ -33,10 +33,10 @@ class FmuTarget:
     """FMI 2.0 and 3.0 for co-simulation, float32 or w8a16: ``NAME_fmi2.fmu`` and ``NAME_fmi3.fmu``.
 
     Attributes:
-        version: of FMI: 2, 3 or both.
+        version: version of FMI: 2, 3 or both.
         binaries: shared libraries beside the sources: linux64, win64, both or none.
-        derivatives: with directional derivatives, float32 only and not of grey boxes; a second copy of the weights is
-            in the code for them.
+        derivatives: whether to include directional derivatives, float32 only and not for grey boxes; the code then
+            contains the weights twice.
     """
 
     version: str = "both"

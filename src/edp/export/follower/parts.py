@@ -25,7 +25,7 @@ class GoldenTicks:
     Attributes:
         inputs: commands, measured values and predictions ``(tick, number)``.
         forecasts: velocities ``(tick, horizon and velocity)``, NaN where there is none.
-        factors: of the groups at the end ``(group,)``.
+        factors: factors of the groups at the end ``(group,)``.
         taught: stretches that have taught.
     """
 
@@ -42,7 +42,7 @@ class FollowerParts:
     Attributes:
         title: a line about it.
         twin: the grey box of the machine as it was.
-        spec: how its numbers follow.
+        spec: settings of the parameter adaptation.
         targets: names of the predicted channels, velocities of the twin.
         horizons: ticks ahead.
         limit: largest correction ``(horizon, target)``, SI units.

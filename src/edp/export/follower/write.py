@@ -54,7 +54,7 @@ class FollowerFiles:
 
     Attributes:
         name: C prefix.
-        parts: what it is made of.
+        parts: content of the follower.
         model: layers of the grey box.
         machine: its layer of equations.
     """
@@ -211,7 +211,7 @@ def write_follower(parts: FollowerParts, plant: Bundle, name: str, folder: Path)
     """Write a follower under `folder`, in place of the export that it holds.
 
     Args:
-        parts: what it is made of.
+        parts: content of the follower.
         plant: its grey box as exported forms take it (`edp.training.twin_bundle.plant_bundle`).
         name: prefix of its C functions and files.
         folder: made when absent.

@@ -53,7 +53,7 @@ def write_monitor_fmu(parts: MonitorParts, name: str, folder: Path, options: Map
 
     Args:
         parts: its numbers.
-        name: of the model.
+        name: name of the model.
         folder: made when absent.
         options: ``version`` and ``binaries`` as of the target `fmu`.
 

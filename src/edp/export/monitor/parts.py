@@ -31,12 +31,12 @@ class NetworkPart:
     Attributes:
         bundle: the network.
         reads: inputs of the monitor that it is fed, in its order.
-        middle: what stands in for each of them before it was ever there, shape (reads,).
+        middle: substitute for each input that was never received, shape (reads,).
         judged: input of the monitor that each residual judges.
         results: place of each prediction among those of the network, horizon by horizon.
         delays: ticks by which each prediction is older than what it is compared with; 0 for a virtual sensor.
         scaled: whether residuals are divided by half the width of the first interval.
-        least_width: of that half.
+        least_width: minimum of that half width.
         every: ticks from one run of the network to the next, between which its residuals hold; 1 where it has delays.
         first: tick of its first run, below `every`.
     """
@@ -58,9 +58,9 @@ class TwinPart:
     """Residuals of a twin that runs once per group of its outputs, with the ports of the group free.
 
     Attributes:
-        bundle: of its plant: commands, measured answers and flags in, answers one tick ahead out.
+        bundle: bundle of its plant, which maps commands, measured outputs and flags to outputs one sample ahead.
         reads: inputs of the monitor that are its commands and measured answers.
-        middle: what stands in for each of them before it was ever there, shape (reads,).
+        middle: substitute for each input that was never received, shape (reads,).
         groups: answers that are judged together, by their place.
         prefix: ticks at which all is measured.
         period: ticks from one measured tick of a group to the next.
@@ -99,7 +99,7 @@ class WatchCode:
         watch: the view.
         detector: ``cusum``, ``ewma``, ``glr`` or ``separate_cusums``.
         option: its slack, weight or window.
-        rows: of its state.
+        rows: number of rows of its state.
         passes: over its directions in a block.
     """
 
@@ -156,7 +156,7 @@ class GoldenChain:
         statistics: shape (blocks, watches).
         alarms: place of the watch that raised one, -1 without, shape (blocks,).
         since: block after which the deviation began, shape (blocks,).
-        evidence: of the last alarm, shape (summaries,).
+        evidence: evidence of the last alarm, shape (summaries,).
     """
 
     statistics: Array
@@ -172,7 +172,7 @@ class GoldenResiduals:
     Attributes:
         inputs: shape (ticks, inputs).
         residuals: shape (ticks, residuals); NaN where silent.
-        tolerance: how far another form may be off, shape (residuals,).
+        tolerance: tolerance of another form, shape (residuals,).
     """
 
     inputs: NDArray[np.float32]
@@ -193,10 +193,10 @@ class MonitorParts:
         residuals: names.
         reads: inputs that each residual depends on.
         columns: place of each input among `inputs`, by its name in the monitor.
-        sources: in the order of the residuals.
-        chain: what follows them.
-        golden_chain: of the self-test.
-        golden_residuals: of the self-test.
+        sources: sources in the order of the residuals.
+        chain: chain after the sources.
+        golden_chain: data of the chain's self-test.
+        golden_residuals: data of the residuals' self-test.
     """
 
     title: str

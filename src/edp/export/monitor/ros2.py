@@ -31,7 +31,7 @@ def write_monitor_ros2(parts: MonitorParts, name: str, folder: Path) -> list[Pat
 
     Args:
         parts: its numbers.
-        name: of the monitor; the package is ``NAME_ros``.
+        name: name of the monitor; the package is ``NAME_ros``.
         folder: made when absent.
 
     Raises:

@@ -30,8 +30,8 @@ class SourceCode(ABC):
     Args:
         own: prefix of its names within the monitor.
         reads: inputs of the monitor that it is fed, in its order.
-        middle: what stands in for each of them before it was ever there, shape (reads,).
-        residuals: how many it has.
+        middle: substitute for each input that was never received, shape (reads,).
+        residuals: number of residuals.
     """
 
     model: Model | None = None
@@ -83,7 +83,7 @@ class NetworkCode(SourceCode):
     """A virtual sensor or a look-ahead network.
 
     Args:
-        part: what it is.
+        part: network.
         own: prefix of its names within the monitor.
         model: C prefix of its network.
     """
@@ -201,7 +201,7 @@ class TwinCode(SourceCode):
     """A twin with free ports; see `TwinPart`.
 
     Args:
-        part: what it is.
+        part: twin.
         own: prefix of its names within the monitor.
         model: C prefix of its plant.
     """
@@ -358,7 +358,7 @@ def source_code(part: SourcePart, index: int, name: str, columns: Mapping[str, i
     Args:
         part: the source.
         index: its number among the sources.
-        name: of the monitor.
+        name: name of the monitor.
         columns: place of each input of the monitor by its name.
 
     Raises:

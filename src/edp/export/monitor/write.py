@@ -50,7 +50,7 @@ class MonitorFiles:
     Attributes:
         name: C prefix.
         parts: its numbers.
-        sources: of its residuals, as C.
+        sources: sources of its residuals, as C.
     """
 
     name: str

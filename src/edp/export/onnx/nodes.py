@@ -186,9 +186,9 @@ class Nodes:
         """Return the finished, checked file.
 
         Args:
-            name: of the graph.
+            name: name of the graph.
             inputs: shapes by name.
-            outputs: by name, the value that is given out and its shape.
+            outputs: value and shape of each output, by name.
             notes: kept in the file as metadata.
 
         Raises:

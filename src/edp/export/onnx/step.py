@@ -30,8 +30,8 @@ class State:
     """A state of the step graph.
 
     Attributes:
-        name: of the graph's input; the output has `LAST` behind it.
-        layer: that remembers it, and its slot there; empty for `SPOILT`.
+        name: name of the graph's input; the output has the suffix `LAST`.
+        layer: layer and slot of the state; empty for `SPOILT`.
         start: values after a reset, a matrix.
     """
 
@@ -93,7 +93,7 @@ def step_model(graph: Graph, targets: int, name: str, notes: Mapping[str, str], 
     Args:
         graph: the layers.
         targets: numbers of each horizon.
-        name: of the ONNX graph.
+        name: name of the ONNX graph.
         notes: kept in the file.
         opset: one of `OPSETS`.
 

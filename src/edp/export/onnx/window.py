@@ -59,7 +59,7 @@ class Window:
     """Writes the layers of a graph over a window.
 
     Args:
-        nodes: where to.
+        nodes: receiver of the nodes.
         graph: the layers.
     """
 

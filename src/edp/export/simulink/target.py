@@ -29,7 +29,7 @@ class SimulinkTarget:
     """MATLAB and Simulink: S-function and C Caller around the C code; of float32 runs ``.m`` code and ONNX window too.
 
     Attributes:
-        opset: of the ONNX window; 11 goes with importers of R2021b, see `OnnxTarget`.
+        opset: opset of the ONNX window; 11 for importers of R2021b, see `OnnxTarget`.
         window: whether the ONNX window is written; it needs the package onnx.
     """
 

@@ -77,7 +77,7 @@ class Adaptation:
         rate_hz: ticks per second.
         horizons: ticks ahead, at least 1.
         columns: input that measures each target ``(J,)``.
-        offset: of the inputs ``(I,)``, SI units.
+        offset: offset of the inputs ``(I,)``, SI units.
         scale: standard width of the inputs ``(I,)``, SI units.
         directions: Q ``(r, I)``.
         middle: value of each target when nothing moves ``(J,)``, SI units.

@@ -30,7 +30,7 @@ class RlsState:
     """Learned state of an adaptation, to be stored over a restart.
 
     Attributes:
-        digest: of the adaptation that it belongs to.
+        digest: hash of the adaptation of this state.
         theta: coefficients ``(H, J, n)``.
     """
 
@@ -113,7 +113,7 @@ class RlsCorrector:
         """Learn from predictions that are now due, and correct a prediction.
 
         Args:
-            inputs: of this tick ``(I,)``, SI units.
+            inputs: inputs of this sample ``(I,)``, SI units.
             prediction: the network's from them ``(H, J)``, SI units.
             fresh: whether they are this tick's own, and the prediction rests on a whole window.
             learn: False freezes what was learned; it is judged all the same.

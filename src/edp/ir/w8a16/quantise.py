@@ -35,7 +35,7 @@ class Formats:
     """Fractional bits of values, chosen on data.
 
     Attributes:
-        fracs: by value of the float graph, and of slots that have a format of their own as ``layer/slot``.
+        fracs: fractional bits by value of the float graph; slots with their own format are named ``layer/slot``.
         weights: 8-bit weights by matrix; those that are left out are rounded to the nearest.
     """
 
@@ -111,7 +111,7 @@ def quantise(graph: Graph, chosen: Formats, moments: Mapping[str, NDArray[np.flo
     Args:
         graph: the float network.
         chosen: formats of its values, and known weights.
-        moments: of what each matrix is multiplied by (see `WeightRounding`), for weights that are not known.
+        moments: moments of the inputs of each matrix (see `WeightRounding`), for weights without given values.
 
     Raises:
         ExportError: a kind of layer that has no integer form, sums that would not fit in 32 bits, or formats of

@@ -15,7 +15,7 @@ class Integers(Interpreter):
 
     Args:
         graph: the layers.
-        streams: how many.
+        streams: number of streams.
     """
 
     def __init__(self, graph: Graph, streams: int = 1) -> None:

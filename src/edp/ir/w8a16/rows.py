@@ -29,7 +29,7 @@ def rows(
         weight: first dimensions as `bias`, the others are summed over.
         bias: one for each output.
         formats: fractional bits of the input and of the output.
-        rounding: of the weights.
+        rounding: rounding of the weights.
 
     Raises:
         ExportError: a sum that might not fit in 32 bits.

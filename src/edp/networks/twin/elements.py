@@ -37,14 +37,14 @@ class ElementsBox:
     """Elements of a small physical system; without any, a mass for each velocity and a lag for each pressure.
 
     Attributes:
-        tanks: in the order of the flow.
-        masses: with their drives.
+        tanks: tanks in the order of the flow.
+        masses: masses with their drives.
         lags: pressures that follow commands.
-        steps: of the solver in a tick.
+        steps: number of solver steps per sample.
         prefix_ticks: measured ticks before a free run.
-        starts: from how many starting values the fit begins.
+        starts: number of starting points of the fit.
         rounds: Gauss-Newton steps of each start at most.
-        length_s: of the free runs that are fitted; 0: whole recordings, in runs of at most 4,096 ticks.
+        length_s: length of the fitted free runs, s; 0 for whole recordings, in runs of at most 4,096 samples.
 
     Raises:
         ConfigError: a value out of range.

@@ -36,10 +36,10 @@ class ForecastLine:
     """A prediction along a recording, each value at the tick for which it was made; arrays have shape (ticks,).
 
     Attributes:
-        name: of what is predicted, in words.
-        unit: of all values.
+        name: name of the predicted channel, in words.
+        unit: unit of all values.
         predicted: NaN where there is none.
-        measured: what then happened.
+        measured: measured values.
         lower: bounds of the interval; None without one, `upper` likewise.
         upper: see `lower`.
     """
@@ -57,14 +57,14 @@ class Scene:
     """Recording as the side view shows it, at `FRAMES_PER_S`; each array has shape (frame, columns).
 
     Attributes:
-        name: of the recording.
-        machine: whose geometry is drawn.
+        name: name of the recording.
+        machine: machine whose geometry is drawn.
         start_s: time of the first frame in the recording.
-        angles: of boom, arm and bucket, rad.
-        velocity: of the cylinders, mm/s.
+        angles: angles of boom, arm and bucket, rad.
+        velocity: velocities of the cylinders, mm/s.
         pressure: head and rod of boom, arm and bucket, bar; no columns where the recording has none.
         ground: heights above the boom foot, m; no columns without soil.
-        ground_x: where they are, m before the boom foot.
+        ground_x: positions of the ground points, m before the boom foot.
         readings: further values by name, with their unit.
         forecasts: lines of predictions, at the frames.
     """
@@ -91,10 +91,10 @@ def scene_of(
     """Return the scene of a recording for a page or a film.
 
     Args:
-        recording: with joint angles (`JointAngle_1..3`) or strokes (`CylStroke_1..3`).
+        recording: recording with joint angles (`JointAngle_1..3`) or strokes (`CylStroke_1..3`).
         machine: name or file of the machine; default: the one the recording was simulated with.
         start_s: first second shown.
-        seconds: how many; default: to the end, at most `LONGEST_S`.
+        seconds: length, s; by default to the end, at most `LONGEST_S`.
         forecasts: along the recording, to be drawn beside what then happened.
 
     Raises:

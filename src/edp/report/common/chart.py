@@ -49,7 +49,7 @@ class ChartAxis:
     """One axis of a panel.
 
     Attributes:
-        title: with its unit.
+        title: title with the unit.
         titled_by: choice whose option is the title in a picture, where nobody can choose.
         kind: ``names`` has one position for each name, in the order in which the marks name them.
         limits: both ends, None for those of the data.
@@ -82,7 +82,7 @@ class Mark:
     """Element of a panel.
 
     Attributes:
-        name: in the legend; marks of one name share an entry, and an empty name has none.
+        name: name in the legend; marks with one name share an entry, and an empty name has none.
         group: marks that the reader hides together; empty for those of the same name.
         when: option by choice for which it is shown; a choice that is not named does not matter.
         second: whether it belongs to the second vertical axis.
@@ -107,11 +107,11 @@ class DataSeries(Mark):
     Attributes:
         x, y: positions; None or NaN breaks the line.
         low, high: ends of a horizontal interval at each point; empty for none.
-        colour: of line and symbols.
-        width: of the line in pixels; 0 for none.
-        dash: of the line.
+        colour: colour of line and symbols.
+        width: width of the line in pixels; 0 for no line.
+        dash: dash pattern of the line.
         step: ``after`` keeps a value up to the next position, ``middle`` to the middle between both.
-        symbol, size: of the points, in pixels; empty for none.
+        symbol, size: symbol of the points, and its size in pixels; empty for no symbols.
         edge: colour of a frame around the symbols; empty for none.
         opacity: 0 to 1.
         filled: whether the area to zero is tinted.
@@ -151,9 +151,9 @@ class Bars(Mark):
     """Bars from zero.
 
     Attributes:
-        positions: where they stand: names or numbers.
-        values: how far they reach.
-        colours: of each bar.
+        positions: positions: names or numbers.
+        values: lengths of the bars.
+        colours: colour of each bar.
         horizontal: whether they lie.
         low, high: ends of an interval at each bar; empty for none.
         valued: whether the value stands at the end of each bar.
@@ -177,11 +177,11 @@ class Cells(Mark):
     Attributes:
         x, y: positions of columns and rows: names or numbers.
         values: ``(row, column)``, which colours show; NaN stays white.
-        shown: the same in the reader's unit, for `hover` as ``{label}``; None where `values` are.
+        shown: values in the reader's unit, for `hover` as ``{label}``; None for `values`.
         scale: colours from the lowest to the highest.
         ends: values of the first and last colour.
-        unit: above the bar of colours.
-        ticks: of that bar; none leaves them to the renderer.
+        unit: unit above the colour bar.
+        ticks: ticks of the colour bar; empty to leave them to the renderer.
         written: whether each cell holds its value.
         gap: whether a white hairline parts the cells.
         barred: whether the bar of colours stands beside; panels of one scale need one.
@@ -244,8 +244,8 @@ class Control:
     """A choice above a figure.
 
     Attributes:
-        key: by which marks name it (`Mark.when`).
-        label: beside the selector.
+        key: key by which marks refer to it (`Mark.when`).
+        label: label of the selector.
         options: key and text of each; the first is shown first.
         keeps_zoom: whether another option keeps the axes where the reader left them.
         alone: whether a single option is shown, too.
@@ -263,17 +263,17 @@ class Chart:
     """A figure: panels, row by row, and the choices that a reader has.
 
     Attributes:
-        name: on a page.
+        name: name on a page.
         panels: all of them.
         file: name of its pictures, with ``{key}`` for the option of a choice; empty writes none.
-        title: of a picture, with the texts of options in the same way; a page has headings of its own.
+        title: title of a picture, with the texts of options in the same way; a page has its own headings.
         columns: panels beside each other.
-        choices: of the reader; a picture is made for each combination.
+        choices: choices of the reader; a picture is drawn for each combination.
         across: choice whose options a picture shows side by side instead.
-        height: on a page, pixels.
+        height: height on a page, pixels.
         inches: width and height of a picture; with `across` those of one option.
-        legend: where it stands.
-        shares: of the height that the rows, or of the width that the columns take, where they differ.
+        legend: position of the legend.
+        shares: fractions of the height per row, or of the width per column, if they differ.
         together: whether panels share their horizontal axis, and the pointer shows all series at a position.
     """
 

@@ -106,13 +106,13 @@ class Page:
     """A page of results.
 
     Attributes:
-        title: what the page is about, such as the name of a run.
+        title: subject of the page, such as the name of a run.
         kind: kind of page, in words, for the title of the window.
         about: further facts above the headline.
         headline: the result in a sentence.
         verdict: sentences below the headline.
         tiles: value, unit and meaning of each key figure.
-        sections: in order; those without content are left out.
+        sections: sections in order; empty ones are omitted.
         provenance: label and text of each line of the last section; none without lines.
         footer: a sentence at the end.
         styles: files with its style.

@@ -36,7 +36,7 @@ class RunDifference:
         low, high: 95 % interval of it; None where nothing could be paired.
         p: two-sided, adjusted after Holm for the runs compared; None in the same cases.
         over: ``recordings`` or ``blocks``, what was paired.
-        count: how many of them.
+        count: number of recordings.
         better: recordings on which this run has less error.
     """
 
@@ -69,7 +69,7 @@ class Comparison:
         runs: two or more, of one kind.
         recordings: test recordings of all of them, by name.
         measures: errors that all of them have, the first one of the headline.
-        remarks: what a reader must know: recordings left out, other data, settings that differ.
+        remarks: remarks on omitted recordings, other data and different settings.
     """
 
     runs: tuple[ComparedRun, ...]

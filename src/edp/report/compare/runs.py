@@ -37,8 +37,8 @@ class Measure:
     Attributes:
         output: name of a target or channel, or `MEAN` where all targets have one unit.
         ahead_s: seconds ahead, or after the start of a free run.
-        unit: of the error.
-        what: what is measured, in words.
+        unit: unit of the error.
+        what: description of the measure.
     """
 
     output: str
@@ -61,19 +61,19 @@ class ComparedRun:
     """One run.
 
     Attributes:
-        name: how the comparison calls it.
-        folder: where it is.
+        name: name in the comparison.
+        folder: folder of the run.
         kind: `LOOK_AHEAD` or `FREE`.
-        label: of its model.
-        errors: by measure, of each test recording.
-        curves: by output of a free run, seconds and error.
+        label: label of its model.
+        errors: error of each test recording, by measure.
+        curves: seconds and error of a free run, by output.
         history: an entry an epoch; empty where it has none.
         costs: size and work by words; what is not known is left out.
-        digest: of its data; empty where it is not said.
-        predictions: by recording ``truth`` ``(time, target)`` and ``network`` ``(time, horizon, target)``, SI.
+        digest: hash of its data; empty if unknown.
+        predictions: by recording, ``truth`` ``(time, target)`` and ``network`` ``(time, horizon, target)``, SI units.
         targets: outputs in the order of these arrays, with the factor to the report's unit.
         horizons: samples ahead in the order of these arrays.
-        rate_hz: of the data; None where it is not said.
+        rate_hz: sample rate of the data; None if unknown.
         skip: first ticks of each recording that are not scored.
     """
 

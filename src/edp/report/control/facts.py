@@ -21,9 +21,9 @@ class ControlFacts:
     """Loops of one controller on one task.
 
     Attributes:
-        title: of the page.
-        content: of ``results.json``.
-        recordings: of the loops, in their order: see `edp.control.loop.LoopResult`.
+        title: title of the page.
+        content: content of ``results.json``.
+        recordings: recordings of the loops, in order: see `edp.control.loop.LoopResult`.
         solve_us: times of the controller's steps, microseconds, in the order of the recordings.
         scene: side view of the first loop.
         provenance: name and text of where it comes from.

@@ -32,9 +32,9 @@ def build_coverage_page(coverage: Coverage, title: str, quality: DataQuality | N
     """Return the page of a data set's coverage.
 
     Args:
-        coverage: what the data set covers.
+        coverage: coverage of the data set.
         title: name of the data set.
-        quality: how good its recordings are.
+        quality: quality of its recordings.
     """
     charts = {chart.name: chart for chart in coverage_charts(coverage)}
     constant = f"Constant, and left out: {', '.join(coverage.constant)}."

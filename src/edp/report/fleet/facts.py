@@ -30,15 +30,15 @@ class FleetRow:
     """A machine.
 
     Attributes:
-        name: of it.
-        minutes: of its recordings.
+        name: name of the machine.
+        minutes: total length of its recordings, min.
         mae: mean absolute error over outputs and ticks, report units.
         skill: share of the error of persistence that the network takes away.
         drift: error of the second half over that of the first; None where the recordings are too short to tell.
         drifts: whether that is more than chance.
-        changes: that a monitor told of; None without one.
+        changes: changes reported by a monitor; None without one.
         own: whether the network is its own.
-        why: what stands out, the most telling first.
+        why: conspicuous properties, the most important first.
     """
 
     name: str
@@ -57,8 +57,8 @@ class FleetFacts:
     """A fleet.
 
     Attributes:
-        title: of the page.
-        unit: of errors.
+        title: title of the page.
+        unit: unit of errors.
         ahead_ms: time that is looked ahead.
         rows: machines, the worst first.
         failed: machines that could not be judged, and why.

@@ -70,11 +70,11 @@ class MachineErrors:
 
     Attributes:
         mae: mean absolute error over outputs and samples, report units.
-        by_target: the same for each output.
+        by_target: errors of each output.
         persistence: error of taking the present value.
         recordings: error of each recording.
         drift: None where the recordings are too short to tell.
-        inputs: by name.
+        inputs: inputs by name.
         own: whether the network is the machine's own.
         alarms: None without a monitor.
     """
@@ -137,14 +137,14 @@ class FleetReport:
 
     Attributes:
         edp: version that evaluated them.
-        network: of the fleet.
+        network: network of the fleet.
         store: path of the store.
         deltas: folder of deltas; None without them.
         monitor: folder of a monitor; None without one.
         horizon: samples that are predicted ahead.
         rate_hz: samples per second.
         targets: outputs.
-        machines: in the order of the store.
+        machines: machines in the order of the store.
     """
 
     edp: str = __version__

@@ -34,9 +34,9 @@ class AlarmFacts:
 
     Attributes:
         recording: its name.
-        raised_s: when it was raised and `since_s` when the change began by its estimate, s from the start.
-        detector: which raised it.
-        statistic: that passed `limit`.
+        raised_s: time of the alarm; `since_s` is the estimated start of the change, s from the start.
+        detector: detector of the alarm.
+        statistic: statistic that exceeded `limit`.
         evidence: summaries of residuals and how far they are off since then, in standard deviations of healthy
             blocks, the largest first.
         causes: the most likely first; empty without a dictionary.
@@ -67,15 +67,15 @@ class MonitorFacts:
     """A run of a monitor over logs.
 
     Attributes:
-        title: of the page.
+        title: title of the page.
         traces: statistics and levels of all recordings.
-        alarms: in the order in which they were raised.
+        alarms: alarms in order of time.
         promise: the sentence of the calibration.
         confusions: faults of the dictionary that cannot be told apart; empty without one.
-        classes: how many faults the dictionary has; 0 without one.
+        classes: number of faults in the dictionary; 0 without one.
         provenance: name and text of where it comes from.
-        remarks: by what is to be said of recordings, beside their alarms, names of these.
-        unseen: which changes silence does not exclude.
+        remarks: names of recordings by remark, in addition to their alarms.
+        unseen: changes that the absence of alarms does not exclude.
     """
 
     title: str

@@ -35,7 +35,7 @@ class BandLine:
     Attributes:
         channel: the target.
         predicted: float ``(time,)`` at the tick that it speaks of; NaN where nothing was said.
-        measured: the same; None where it was not recorded.
+        measured: measured values; None if not recorded.
         lower, upper: bounds of an interval; None where there is none.
     """
 

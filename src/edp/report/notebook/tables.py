@@ -38,7 +38,7 @@ def text_of(table: Table, width: int = TERMINAL) -> str:
     Headings are broken at spaces; columns that do not fit beside the others follow below, behind the names again.
 
     Args:
-        table: what is shown.
+        table: table to print.
         width: characters of a line; only a single column that is wider goes beyond it.
     """
     bodies = list(zip(*table.texts(), strict=True)) or [()] * len(table.columns)

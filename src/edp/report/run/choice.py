@@ -47,8 +47,8 @@ class Skill:
     Attributes:
         against: the simple model.
         promise: cross-validated.
-        interval: of the promise.
-        test: on the test recordings; empty before an evaluation.
+        interval: interval of the expected skill.
+        test: skill on the test recordings; empty before an evaluation.
     """
 
     against: str
@@ -82,12 +82,12 @@ class AutoChoice(ResultFile):
         excess: mean logarithm of each candidate's error over the least.
         doubt: standard error of `excess`.
         sentence: the choice in words.
-        candidates: by name.
+        candidates: candidates by name.
         persistence: errors of the present value on left-out data.
-        interval: of the errors of the chosen candidate; None in files of earlier versions, as `skill`.
+        interval: interval of the errors of the chosen candidate; None in files of earlier versions, like `skill`.
         failed: messages of candidates that diverged.
-        key: of the run.
-        notes: what a reader must know.
+        key: key of the run.
+        notes: remarks for the reader.
         results: errors on the test recordings by name of a model; empty before an evaluation.
     """
 
@@ -132,7 +132,7 @@ def note_test_result(folder: Path, scores: ScoresFile, floor: ModelScores | None
 
     Args:
         folder: the run folder.
-        scores: of the kept model and of each baseline.
+        scores: scores of the chosen model and of each baseline.
         floor: scores of the linear candidate on the same samples; None if the run has none.
 
     Raises:

@@ -51,8 +51,8 @@ class HistoryRow:
 
     Attributes:
         epoch, update: number of the epoch, or of the update.
-        seconds: of training so far.
-        train_loss, validation_loss, validation_mae: of a network; `validation` is the loss of a twin.
+        seconds: training time so far, s.
+        train_loss, validation_loss, validation_mae: values of a network; `validation` is the loss of a twin.
         learning_rate: base rate.
         best: whether these weights were kept.
     """

@@ -44,7 +44,7 @@ def describe_evaluation(scores: ScoresFile, provenance: Provenance | None) -> st
 
     Args:
         scores: the content of ``scores.json``.
-        provenance: of the run; None where it is unknown what trained.
+        provenance: provenance of the run; None if the training data are unknown.
     """
     judged = list(scores.models[NETWORK].recordings) if NETWORK in scores.models else []
     if not judged:

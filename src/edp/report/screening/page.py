@@ -41,9 +41,9 @@ def build_screening_page(
     Args:
         screening: the screening.
         title: name of the data set.
-        quality: how good its recordings are.
+        quality: quality of its recordings.
         trials: errors of a network on several feature sets.
-        notes: what a reader must know of how the data were read.
+        notes: remarks on how the data were read.
     """
     charts = {chart.name: chart for chart in screening_charts(screening)}
     hours = screening.samples / screening.rate_hz / 3600
@@ -180,7 +180,7 @@ def write_screening_pictures(screening: ScreeningResult, folder: str | Path) -> 
 
     Args:
         screening: the screening.
-        folder: where to write; it is made.
+        folder: output folder, which is created.
 
     Returns:
         the files, in order.

@@ -35,9 +35,9 @@ class MatrixView:
 
     Attributes:
         measure: key of `MEASURES`.
-        title: in words.
-        unit: of the entries, empty for a correlation.
-        names: of rows and columns.
+        title: title in words.
+        unit: unit of the entries, empty for a correlation.
+        names: names of rows and columns.
         values: shape ``(channel, channel)``; NaN is left white.
         top: largest magnitude of the colours.
         signed: whether colours run from -top to top.
@@ -90,10 +90,10 @@ class LagRangeView:
     Attributes:
         group: kind of signal.
         low, high: smallest and largest best lag, None where none is certain.
-        median: of them.
+        median: median of the best lags.
         leads: share of these channels that lead.
-        certain: how many they are.
-        curves: how many channels there are.
+        certain: number of channels with a certain lag.
+        curves: number of channels.
     """
 
     group: str

@@ -110,7 +110,7 @@ def build_study_page(study: StudyFile, tables: Mapping[str, Table]) -> Page:
 
     Args:
         study: the study.
-        tables: what `study_tables` returns.
+        tables: result of `study_tables`.
     """
     charts = {chart.name: chart for chart in study_charts(study)}
     get, is_sound, second = tables.get, study.mode == "sound", study.sessions.second

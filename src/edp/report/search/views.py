@@ -39,11 +39,11 @@ class ArmView:
     """An arm of phase 0.
 
     Attributes:
-        backbone, features: of the arm.
+        backbone, features: backbone and features of the arm.
         chosen: whether its feature set goes on.
-        scores: of each run by seed.
+        scores: score of each run by seed.
         composite: its spread.
-        mae: that of the mean absolute error.
+        mae: score of the mean absolute error.
     """
 
     backbone: str
@@ -78,10 +78,10 @@ class PointView:
 
     Attributes:
         group: phase and, in phase 1, backbone.
-        score: at the horizon.
-        costs: by name of `COSTS`, those that are known.
-        label: what it is.
-        picked: what it was chosen for; empty for most.
+        score: score at the horizon.
+        costs: known costs by name in `COSTS`.
+        label: description of the network.
+        picked: criterion for which it was chosen; empty for most.
     """
 
     group: str
@@ -164,7 +164,7 @@ class EffectView:
         low, high: interval; None where there is none.
         p, adjusted: one-sided p-values; None where there is none.
         good: whether it passed.
-        remark: in a word or two.
+        remark: remark in a word or two.
     """
 
     module: str
@@ -182,11 +182,11 @@ class Forest:
     """The modules of one phase.
 
     Attributes:
-        key: for selectors and files.
-        title: in words.
-        short: for a selector.
+        key: key for selectors and files.
+        title: title in words.
+        short: short title for a selector.
         axis: title of the horizontal axis.
-        effects: of the modules, the best first.
+        effects: effects of the modules, the best first.
         gate: effect that the practical gate asks for; None for no gate.
     """
 
@@ -278,12 +278,12 @@ class PhaseTrack:
     """Trainings of one phase in order of request; those on test sessions are separate.
 
     Attributes:
-        name, heading: of the track.
+        name, heading: name and heading of the track.
         places: numbers of its trainings in the study, from 1.
         scores: NaN where one was pruned or failed.
-        labels: what each was.
+        labels: description of each training.
         best: lowest score of the phase so far.
-        pruned: those of the places whose training was ended at a rung.
+        pruned: places whose training was ended at a rung.
     """
 
     name: str

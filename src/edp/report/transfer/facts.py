@@ -31,9 +31,9 @@ class Transfer:
     """Content of ``transfer.json`` and of the excerpts in the same folder.
 
     Attributes:
-        content: of the file.
+        content: content of the file.
         shown: truth and predictions of excerpts by ``NAME/truth`` and ``NAME/METHOD``, ``(time, horizon, target)``, SI.
-        folder: where they lie.
+        folder: folder of the files.
     """
 
     content: TransferFile

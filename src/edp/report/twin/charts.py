@@ -145,9 +145,9 @@ def write_rollout_plots(rollout: Recording, suffix: str, start_s: float, folder:
     Args:
         rollout: measured channels, answers under the same names with `suffix` behind, and the ends of their intervals
             with ``_low`` and ``_high`` behind that, where there are some.
-        suffix: of the names of answers.
+        suffix: suffix of the names of outputs.
         start_s: time of the log at the first row.
-        folder: where to write; it is made.
+        folder: output folder, which is created.
 
     Returns:
         the files, in order.

@@ -49,10 +49,10 @@ class FreeRunFacts:
     """Content of ``free_run.json`` and of the runs in the same folder.
 
     Attributes:
-        title: of the page.
-        content: of the file.
+        title: title of the page.
+        content: content of the file.
         shown: ``seconds``, ``half_width`` where known, and ``NAME/answers``, ``NAME/truth`` ``(tick, answer)``, SI.
-        provenance: of the twin; empty where it is not at hand.
+        provenance: provenance of the twin; empty if unknown.
         candidates: formulations that it was chosen among, see `read_candidates`; empty where it was not chosen.
         steps: responses to steps of its commands, see `read_steps`; None where they are not at hand.
     """
@@ -190,7 +190,7 @@ def ground_line(provenance: Provenance) -> str:
     """State the law of the ground and the error that it explains; empty for a twin of free air.
 
     Args:
-        provenance: of the run; what is not as `edp twin` wrote it is passed over.
+        provenance: provenance of the run; entries in another form are ignored.
     """
     facts = provenance.more.get("ground")
     if not isinstance(facts, Mapping):

@@ -17,8 +17,8 @@ def build_twin_report(run_folder: str | Path, output: str | Path | None = None, 
 
     Args:
         run_folder: folder of `edp twin`, or one in it that `edp evaluate` wrote.
-        output: where to write; ``report.html`` in the folder by default.
-        title: of the page; the folder's name by default.
+        output: path of the page; ``report.html`` in the folder by default.
+        title: title of the page; the folder name by default.
 
     Returns:
         The file written.

@@ -86,7 +86,7 @@ def code_version(whole: bool = False) -> str:
     """Version of the package and blake2b of its source and tables, without what decides no result.
 
     Args:
-        whole: with all of it: a unit of work may call any part.
+        whole: whether to include all of the source: a unit of work may call any part.
     """
     state = hashlib.blake2b(digest_size=16)
     root = Path(__file__).parents[2]
@@ -110,9 +110,9 @@ class TrainingIdentity:
     Attributes:
         job: the function that trains, as ``package.module:name``.
         config: settings of network, task and training.
-        split: which recordings train, validate and are scored.
-        seed: of everything that is drawn.
-        epochs: to train; a rung of a race is a training of its own.
+        split: recordings for training, validation and scores.
+        seed: seed of all random numbers.
+        epochs: number of epochs; a rung of a race is a separate training.
         code: see `code_version`.
         data: hash of the recordings.
         environment: versions, machine and threads (`edp.storage.runs.environment`).
@@ -147,11 +147,11 @@ class Record:
     """Record of one training.
 
     Attributes:
-        identity: what decided it.
-        status: how it ended.
+        identity: settings that determined the result.
+        status: final status.
         result: plain values with finite numbers, where it is done.
-        message: what went wrong, else empty.
-        measured: what differs from repeat to repeat: seconds, memory, worker, attempts.
+        message: error message, otherwise empty.
+        measured: quantities that differ between repetitions: seconds, memory, worker, attempts.
     """
 
     identity: TrainingIdentity

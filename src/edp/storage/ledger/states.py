@@ -24,7 +24,7 @@ class WithState:
 
     Attributes:
         result: plain values, as of any training.
-        state: to go on from; not part of the record.
+        state: state to continue from; not part of the record.
     """
 
     result: Mapping[str, Any]

@@ -120,7 +120,7 @@ class Ledger:
         folder: made when absent.
 
     Attributes:
-        damaged: what was set apart on opening; these trainings count as not done.
+        damaged: records set aside at opening; these trainings count as not done.
 
     Raises:
         BusyError: another process coordinates here; exit code 75.
@@ -257,7 +257,7 @@ class Ledger:
         """Record the use of held-out recordings; a repeated opening after a stop counts once.
 
         Args:
-            name: of the sealed test set.
+            name: name of the sealed test set.
             judged: keys of what is judged on it.
             why: a sentence for the report.
             again: allow a further opening for other models; it is recorded and weakens what the set can show.

@@ -129,7 +129,7 @@ class Foundation:
     """A network to begin with, as ``auto.foundation`` names it.
 
     Attributes:
-        path: as the settings have it.
+        path: path as stated in the settings.
         source: the network and the settings of its run.
     """
 
@@ -161,7 +161,7 @@ class Foundation:
         """Refuse recordings without the channels, or of another rate, than the network's.
 
         Raises:
-            DataError: which channels of which recordings, and what to do.
+            DataError: channels are missing or rates differ; the message names channels, recordings and advice.
         """
         check_channels(recordings, self.source.bundle.task)
 
@@ -197,7 +197,7 @@ class Foundation:
         Args:
             rows: ticks to train on.
             affordable: updates that the budget allows.
-            seed: of all random choices.
+            seed: seed of all random choices.
             threads: CPU threads.
         """
         rounds = FinetuneSpec().rounds
@@ -254,12 +254,12 @@ class Amount:
         rows: ticks of the training and validation parts.
         shortest: ticks of their shortest stretch.
         usual: ticks of most of their stretches; 0 for those of the shortest one.
-        trial: of the recurrent network, which decides how the budget is divided.
+        trial: result of the recurrent network's trial, which decides how the budget is divided.
         features: features of a tick.
         outputs: horizons times targets.
         horizon: the largest one, in ticks.
         minutes: processor time.
-        seed: of all random choices.
+        seed: seed of all random choices.
         threads: CPU threads.
         foundation: a pretrained network to begin with; None for none.
         changes: whether changes are predicted, of which zero is none.
@@ -312,7 +312,7 @@ class Candidate:
     """A kind of model.
 
     Attributes:
-        label: how sentences call it.
+        label: name in sentences.
         plan: returns the network and its training; None where it does not suit the data.
     """
 
@@ -385,8 +385,8 @@ class TreePlan:
 
     Attributes:
         rounds: trees of each model; 0 where there is no time for enough of them.
-        models: of each output.
-        rows: that each tree is grown on.
+        models: number of models of each output.
+        rows: number of rows per tree.
         folds: parts that they leave out.
     """
 

@@ -64,7 +64,7 @@ class Promise:
         so both are uncertain, a short test more than a long one. A test that is another situation is not foreseen.
 
         Args:
-            rows: of the test.
+            rows: number of test rows.
         """
         groups = np.array_split(np.arange(len(self.rows)), min(GROUPS, len(self.rows)))
         part = self._group_blocks(groups)
@@ -178,7 +178,7 @@ def choose(promises: Mapping[str, Promise]) -> PortfolioChoice:
     with an outlier does not decide alone, as it would in the error over all blocks.
 
     Args:
-        promises: by name, the simplest first; blocks of the shorter ones are the last of the longer ones.
+        promises: expected errors by name, the simplest first; the blocks of shorter ones are the last of longer ones.
     """
     count = min(len(promise.rows) for promise in promises.values())
     errors = {name: np.sqrt(promise.squared[-count:]) for name, promise in promises.items()}

@@ -50,7 +50,7 @@ def fit_to_channels(settings: AutoSettings, names: Sequence[str], where: str) ->
     """Return settings with a task on the channels of the recordings, and the changes in sentences.
 
     Args:
-        settings: of the run.
+        settings: settings of the run.
         names: channels of the recordings.
         where: they come from.
 

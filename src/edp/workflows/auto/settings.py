@@ -37,7 +37,7 @@ class Portfolio:
         candidates: names of registered candidates, the simplest first; none takes all of them.
         foundation: run folder or bundle of a pretrained network, which is trained on as one more candidate; empty for
             none.
-        seed: of all random choices.
+        seed: seed of all random choices.
         threads: CPU threads of a training; another count gives other bits.
     """
 
@@ -100,7 +100,7 @@ def auto_settings(table: Mapping[str, object], where: str) -> AutoSettings:
     """Return the settings of a table.
 
     Raises:
-        ConfigError: as `load_auto`.
+        ConfigError: see `load_auto`.
     """
     present = [part for part in CHOSEN if part in table]
     if present:

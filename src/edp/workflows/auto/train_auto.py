@@ -81,7 +81,7 @@ def train_auto(
     """Train every candidate that suits the data, choose, and write the winner's run folder.
 
     Args:
-        source: where the recordings are.
+        source: source of the recordings.
         settings: task, split, budget, judge.
         out: run folder; a finished one of the same settings and data is read, not made again.
         progress: receiver of the progress; its units are models.
@@ -170,12 +170,12 @@ def _make_choice_file(
     """Return the content of ``auto.json`` without its key.
 
     Args:
-        choice: which candidate is kept.
+        choice: chosen candidate.
         trained: all that were trained, by name.
         failed: messages of those that diverged.
         data: prepared series.
-        settings: of the run.
-        amount: what there was to learn from.
+        settings: settings of the run.
+        amount: amount of data and time.
     """
     candidates = {
         name: AutoCandidate(

@@ -52,12 +52,12 @@ class CandidateTraining:
     """The training of one candidate, ready for another process.
 
     Attributes:
-        name: of the candidate.
+        name: name of the candidate.
         experiment: its settings.
         data: prepared series.
-        folder: of its checkpoints.
-        blocks: on which it is judged; the last `judged` of them are of the validation part.
-        judged: how many.
+        folder: folder of its checkpoints.
+        blocks: blocks for the evaluation; the last `judged` of them belong to the validation part.
+        judged: number of blocks of the validation part.
         foundation: a network to begin with; None where it begins at random.
         trial: a short training that tells whether a long one is worth its time.
     """
@@ -270,8 +270,8 @@ class TrainedPortfolio:
     """Every candidate, trained.
 
     Attributes:
-        outcomes: by name, the simplest first; a training that diverged is its message.
-        amount: how the budget was divided in the end.
+        outcomes: outcomes by name, the simplest first; a diverged training is represented by its message.
+        amount: final division of the budget.
         notes: sentences for a person.
     """
 
@@ -296,8 +296,8 @@ def train_portfolio(
     Args:
         settings: task, budget, which candidates.
         data: prepared series.
-        amount: what there is to learn from.
-        folder: of the run; checkpoints lie in it.
+        amount: amount of data and time.
+        folder: folder of the run, with the checkpoints.
         workers: who trains; nodes see the run folder under the same path.
         progress: receiver of the progress; its units are models.
 

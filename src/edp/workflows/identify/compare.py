@@ -26,7 +26,7 @@ class FrontChannels:
 
     Attributes:
         sides: columns of the commands that extend and retract each spool ``(6, 2)``; -1: none.
-        full: what a full command of each spool is.
+        full: full command of each spool.
         columns: answers of velocity, stroke, head and rod pressure of each cylinder ``(3, 4)``.
         lines: answers of the pumps' pressures ``(2,)``; -1: not measured.
         rate_hz: ticks per second.

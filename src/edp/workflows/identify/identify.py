@@ -77,9 +77,9 @@ class Identified:
 
     Attributes:
         machine: identified, as its file has it.
-        rows: of each number.
-        scores: of the identified machine, the guess, the grey box and the static map on held-out recordings.
-        notes: what a reader must know.
+        rows: row of each parameter.
+        scores: scores of the identified machine, the guess, the grey box and the static map on held-out recordings.
+        notes: remarks for the reader.
     """
 
     machine: Machine

@@ -18,7 +18,7 @@ class Arm:
     such as ``model.backbone.units``.
 
     Attributes:
-        tables: those of a settings file of an experiment.
+        tables: tables of a settings file of an experiment.
     """
 
     tables: Mapping[str, Any] = field(default_factory=dict)

@@ -30,13 +30,13 @@ class SearchContext:
     Attributes:
         spec: the settings of the search.
         base: settings of the network and its training from which everything starts.
-        source: where the recordings are, plain.
+        source: source of the recordings, as plain values.
         development: names of the sessions that train and judge in all phases.
         test: names of the sessions set apart.
-        channels: of the recordings.
-        unit: of the scores, for sentences.
+        channels: channels of the recordings.
+        unit: unit of the scores, for sentences.
         second: names of the sessions of the second test set; none without phase 6.
-        decided: what earlier phases decided, by name.
+        decided: decisions of earlier phases, by name.
     """
 
     spec: SearchSpec
@@ -101,7 +101,7 @@ class SearchContext:
         Trainings of several epochs are validated by the sessions that judge them, as in the thesis.
 
         Args:
-            arm: what to train.
+            arm: arm to train.
             runs: their numbers, from 0.
             seed: number of the seed within a run.
         """
@@ -171,7 +171,7 @@ def set_apart(
 
     Args:
         sessions: names in order.
-        families: what kind of session each is, so that tests hold all kinds; may be empty.
+        families: type of each session, so that tests contain all types; may be empty.
         spec: share and seed.
 
     Raises:

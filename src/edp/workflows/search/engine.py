@@ -39,7 +39,7 @@ def run_phases(
     to the same decisions again, with the same orders.
 
     Args:
-        context: what the phases stand on.
+        context: data of all phases.
         do: has orders done.
         until: the last phase to run; None for all.
         on_decision: called with each decision.
@@ -108,10 +108,10 @@ class Dispatcher:
     """Executor of the trainings that a phase requests.
 
     Attributes:
-        ledger: of the study.
+        ledger: ledger of the study.
         executor: does what the ledger does not hold.
         data: hash of the recordings.
-        threads: of each training; the pool pins as many.
+        threads: number of threads of each training; the pool pins as many.
         seconds: cap on the time of a training.
         memory_mb: cap on its memory.
         on_batch: called with the requests of a batch by key before any of them is done.

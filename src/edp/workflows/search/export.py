@@ -18,8 +18,8 @@ def export_study(folder: str | Path, path: str | Path | None = None) -> tuple[Pa
     """Write the studies of phases 1, 4 and 5 as a journal of Optuna: ``optuna-dashboard FILE`` shows them.
 
     Args:
-        folder: of the study.
-        path: of the journal; default ``optuna.journal`` in the folder. Another file there is replaced.
+        folder: folder of the study.
+        path: path of the journal; by default ``optuna.journal`` in the folder. An existing file is replaced.
 
     Returns:
         The file, and the names of the studies in it.

@@ -20,9 +20,9 @@ def job_of(
     """Return the job of a request.
 
     Args:
-        order: what to train.
+        order: training to run.
         data: hash of the recordings that it names; where they lie is no part of the key.
-        threads: of the training, whatever its settings say; the pool pins as many.
+        threads: number of threads, regardless of the settings; the pool pins as many.
         seconds: cap on its time.
         memory_mb: cap on the memory of its process.
 
@@ -66,7 +66,7 @@ def train(identity: TrainingIdentity, where: Mapping[str, Any]) -> object:
     Where the file of a state cannot be read any more, it is trained from the beginning.
 
     Raises:
-        EdpError: as `edp.workflows.search.trainings.train_part`.
+        EdpError: see `edp.workflows.search.trainings.train_part`.
     """
     plain = {**identity.config, **identity.split, "seed": identity.seed, "source": where["source"]}
     part = train_part if identity.config.get("recipe") is None else make_smaller

@@ -24,7 +24,7 @@ class Module:
     """One optional part of a network.
 
     Attributes:
-        title: what the thesis calls it; a block beyond the thesis bears its name.
+        title: name in the thesis; a block beyond the thesis has its own name.
         change: settings laid over those of the baseline.
         block: a block that is appended to the baseline's; None for none.
         options: values to search where the module is on, by the place of the setting: keys joined by points, or
@@ -160,9 +160,9 @@ def add_modules(
     """Return an arm with these modules added in the order of the registry, so that equal sets give equal arms.
 
     Args:
-        arm: with all settings of an experiment.
+        arm: arm with all settings of an experiment.
         names: registered modules and toggles.
-        channels: of the recordings, for the feature set ``all``.
+        channels: channels of the recordings, for the feature set ``all``.
         options: values of `options_of` for some of the modules; those that a module has anyway change nothing.
         shape: gives the result its widths, before the options.
 
@@ -192,9 +192,9 @@ def options_of(arm: Arm, name: str, shape: Shape | None = None) -> dict[str, Cho
     """Return the options of an active module that may vary, as dimensions ``module.option``.
 
     Args:
-        arm: to which the module would be added; what it would have there is one of the values.
-        name: of the module, or of a toggle, which has none.
-        shape: as in `add_modules`.
+        arm: arm to which the module would be added; its present value is among the options.
+        name: name of the module, or of a toggle, which has no options.
+        shape: see `add_modules`.
     """
     options = {key: tuple(option.values) for key, option in _options(arm, name, shape).items()}
     return {key: Choice(values) for key, values in options.items() if len(values) > 1}
@@ -292,8 +292,8 @@ def fitting(arm: Arm, channels: Sequence[str] = (), among: Sequence[str] = ()) -
     """Modules that this network can have, in the order of the registry, and does not have already.
 
     Args:
-        arm: with the network.
-        channels: of the recordings, for the feature set ``all``.
+        arm: arm with the network.
+        channels: channels of the recordings, for the feature set ``all``.
         among: names of those that are asked about; empty for all.
     """
     free = (name for name in MODULES if (not among or name in among) and _add_modules(arm, {name}) != arm)

@@ -32,9 +32,9 @@ def freeze_split(folder: Path, context: SearchContext, digests: Mapping[str, str
     """Return the sessions of a search by their content, for every later command.
 
     Args:
-        folder: of the study.
-        context: with the sessions set apart.
-        digests: of all sessions by name.
+        folder: folder of the study.
+        context: context with the sessions set apart.
+        digests: hashes of all sessions by name.
     """
     parts = (context.test, context.second, context.validation, context.training)
     test, second, validation, train = (
@@ -53,11 +53,11 @@ def write_networks(
     """Write the networks judged on the second sealed test set as runs, after the decision of phase 6.
 
     Args:
-        folder: of the study.
-        source: where the recordings are.
-        context: with the decisions.
-        split: of the runs.
-        outcomes: of the trainings that were evaluated there.
+        folder: folder of the study.
+        source: source of the recordings.
+        context: context with the decisions.
+        split: split of the runs.
+        outcomes: outcomes of the trainings evaluated there.
 
     Returns:
         Folder of each run; none before phase 6 has decided. Without one of its own the chosen network is the teacher.

@@ -68,12 +68,12 @@ class SearchResult:
     """Results of a search so far.
 
     Attributes:
-        folder: of the study.
-        context: with the decisions.
+        folder: folder of the study.
+        context: context with the decisions.
         state: ``finished``, or ``stopped`` where not all phases were to run.
         digest: hash over the results of all trainings.
         trained: trainings of this sitting.
-        source: where the sessions are; a data-set file in the study where the logs had to be divided.
+        source: source of the sessions; a data-set file in the study if the logs were divided.
         teacher: settings of the winner as an experiment file; None before phase 4.
         networks: runs that phase 6 left: the teacher, and the network that was chosen; none before.
     """
@@ -99,9 +99,9 @@ def run_search(
     """Search, or continue a stopped search.
 
     Args:
-        source: where the recordings are; each is a session.
-        plan: what is searched.
-        folder: of the study: ``ledger``, ``study.json`` and, at the end, ``teacher.toml`` and ``networks``.
+        source: source of the recordings; each recording is a session.
+        plan: plan of the search.
+        folder: folder of the study: ``ledger``, ``study.json`` and, at the end, ``teacher.toml`` and ``networks``.
         resources: who does the trainings.
         until: name of the last phase to run.
         progress: receiver of the progress: stages are phases, units are trainings, notes are what was decided.

@@ -181,9 +181,9 @@ class CompressionSpec:
 
     Attributes:
         on: whether it is made; without it no second test set is set apart.
-        budget: what the controller grants: a table, or the path of a budget file.
+        budget: limits of the controller: a table, or the path of a budget file.
         units: widths to make; none given, they are planned from the budget.
-        shares: of the widest that fits; each plans a width.
+        shares: fractions of the widest network that fits; each gives one width.
         formats: number formats to judge in; none given, all.
         updates: training steps of each smaller network; 0 for as many as the teacher has, `SearchSpec.final_updates`.
 
@@ -222,7 +222,7 @@ class SearchSpec:
         epochs: of every training, thesis: after each the sessions that judge validate it, the schedule takes notice,
             and the best one counts. 1 is one long epoch that chooses nothing.
         patience: epochs without a better validation before a training ends early; 0 never.
-        horizon: at which scores are taken, one of the task's.
+        horizon: horizon of the scores, one of the task's.
         test_share: share of the sessions that are set apart as test before anything else.
         test: names of the sessions to set apart, instead of a share that is drawn.
         second_share: share of the sessions that are set apart beside them, as second test set, for phase 6 alone.
@@ -236,11 +236,11 @@ class SearchSpec:
         space: dimensions and ranges of phase 1.
         elastic: reach of the window around the baseline in later phases.
         deferred: further dimensions of phases 4 and 5.
-        modules: which are screened (`edp.workflows.search.modules.MODULES`); empty for all that fit the network.
+        modules: modules to screen (`edp.workflows.search.modules.MODULES`); empty for all that fit the network.
         toggles: parts of the training that may be on or off in phases 4 and 5, beside the modules.
         widths: ``equal``: every level has as many channels as units, and the head is left as it is; ``halved``: as in
             the thesis (`edp.workflows.search.space.halved`).
-        sampler: how questions are chosen.
+        sampler: sampler of the trials.
         rungs: shares of the steps at which a question of phases 1, 4 and 5 is judged before its end; none without any.
         pruner: which questions end at a rung: ``none``, or ``median``: those worse than the median of the questions of
             earlier batches, once five of them were trained to the end (Optuna's median rule with its defaults).

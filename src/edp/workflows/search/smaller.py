@@ -47,7 +47,7 @@ class Recipe:
         updates: training steps of a smaller network over all epochs, 0 for passes over the data; one that is trained
             on with rounded numbers has a third.
         formats: number formats in which it is judged.
-        budget: what the controller grants.
+        budget: limits of the controller.
         validation: sessions on which networks are compared; none of them trains.
         units: width; None for the teacher itself.
         pruned: begin with what pruning leaves of the teacher.
@@ -114,7 +114,7 @@ def make_smaller(order: TrainingRequest, start: bytes | None = None) -> TrainedP
     """Make the network of an order with a recipe, and evaluate it.
 
     Args:
-        order: with a recipe.
+        order: request with a recipe.
         start: the state of one of the orders of `before`; it saves time and changes nothing else.
 
     Returns:
@@ -163,9 +163,9 @@ class _StateBench(Bench):
 
     Args:
         updates: training steps of a smaller network (`Recipe.updates`).
-        experiment: of the teacher.
-        data: to train on.
-        weights: of the networks that are there already; those that are trained now are added.
+        experiment: experiment of the teacher.
+        data: training data.
+        weights: weights of existing networks; new ones are added.
     """
 
     def __init__(self, updates: int, experiment: Experiment, data: Prepared, weights: dict[str, Weights]) -> None:

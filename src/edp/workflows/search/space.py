@@ -47,7 +47,7 @@ class Real:
 
         Args:
             value: the middle.
-            reach: to both sides.
+            reach: distance to both sides.
             beyond: whether it may leave the range, as in the thesis; what is not logarithmic then stays in [0, 1].
         """
         # Reach is in decades for logarithmic ranges, as in the thesis.
@@ -235,9 +235,9 @@ def elastic(space: Space, baseline: Candidate, reach: Mapping[str, float] = ELAS
     """Return the window around a baseline for the tuning of candidates in phase 2; other dimensions are unchanged.
 
     Args:
-        space: of phase 1.
+        space: space of phase 1.
         baseline: its values.
-        reach: to both sides, by dimension.
+        reach: distance to both sides, by dimension.
         beyond: whether the window may leave the space, as in thesis 3.3.3.
 
     Raises:
@@ -257,7 +257,7 @@ def check(space: Space, candidate: Candidate) -> None:
     """Refuse a candidate that lacks a dimension of the space or lies outside it.
 
     Raises:
-        ConfigError: with the value and the range.
+        ConfigError: a dimension is missing or out of range; the message states value and range.
     """
     for name, dimension in space.items():
         if name not in candidate:

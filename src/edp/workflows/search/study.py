@@ -37,13 +37,13 @@ class Trial:
     """A question of a study, from asking to its score.
 
     Attributes:
-        number: from 0 in the order of asking.
-        values: of the dimensions of the space.
+        number: index in the order of asking, from 0.
+        values: values of the dimensions of the space.
         modules: switches that are on, such as modules; `options`: values of their options.
-        arm: what it stands for.
+        arm: arm of the trial.
         costs: analytic costs of its network, by name; none if its values make no network.
         requests: whole trainings, one a run; none if it is not trained for its costs.
-        outcomes: of the last part of each.
+        outcomes: outcomes of the last part of each training.
         rungs: means over runs at steps before the end.
         pruned: whether it was ended at the last rung.
         score: mean over its runs; None if it was not trained, was pruned, or failed.
@@ -109,10 +109,10 @@ class Study:
     Attributes:
         space: dimensions and their ranges.
         root: seed of the whole sequence.
-        sampler: how questions are chosen.
+        sampler: sampler of the trials.
         flags: switches that may be on or off.
         barred: sets of switches that cannot be on together: of each the later one in `flags` is switched off.
-        objectives: how many values are reported.
+        objectives: number of reported values.
         pruner: ``none``, or ``median``, which says of a reported trial whether it is worse than the median of those
             that were reported before, at the same step; only with one objective.
         bounds: number of costs that must not exceed zero; a trial that exceeds may be reported by its costs alone,
@@ -158,9 +158,9 @@ class Study:
         """Ask this next as a warm start; the sampler chooses missing values.
 
         Args:
-            values: of some or all dimensions.
+            values: values of some or all dimensions.
             flags: switches that are on, the others being off; None leaves them all to the sampler.
-            options: of switches that are on.
+            options: options of active switches.
 
         Raises:
             ConfigError: a value outside the space, or an unknown dimension, switch or option.
@@ -238,8 +238,8 @@ class Study:
         """Report the answer of a question in any order; answers count in the order of numbers.
 
         Args:
-            number: of the trial.
-            values: of the objectives; None where the training failed, diverged or was not done.
+            number: number of the trial.
+            values: values of the objectives; None if the training failed, diverged or was not run.
             costs: each at most 0 where its bound is kept.
             pruned: it was ended after its last report; it has no values.
 
@@ -318,10 +318,10 @@ class FinishedStudy:
     """A study that is over, for a viewer.
 
     Attributes:
-        name: of the study.
+        name: name of the study.
         space: dimensions and their ranges.
         modules: switches.
-        trials: in the order of asking.
+        trials: trials in the order of asking.
         objectives: names of what was made small: the score, and a cost if there are two.
     """
 

@@ -32,9 +32,9 @@ class StudyLog:
     that is done in parts is one row; one whose next part is not asked for with the others of its batch was pruned.
 
     Args:
-        folder: of the study.
-        study: what does not change: mode, preset, data, spec, sessions.
-        context: of the search, before any decision.
+        folder: folder of the study.
+        study: constant entries: mode, preset, data, spec, sessions.
+        context: context of the search, before any decision.
 
     Attributes:
         trained: trainings of this sitting.
@@ -218,7 +218,7 @@ class StudyStatus:
     """Recorded state of a study, and its present worker.
 
     Attributes:
-        study: with its true state.
+        study: study with its true state.
         holder: process that coordinates it; None for nobody.
         running: trainings under way.
     """
@@ -236,7 +236,7 @@ def look_at(folder: str | Path) -> StudyStatus:
     """Return the recorded state of a study, and its present worker.
 
     Raises:
-        StorageError: as `edp.evaluation.study.read_study`.
+        StorageError: see `edp.evaluation.study.read_study`.
     """
     study = read_study(folder)
     ledger = Path(folder, "ledger")

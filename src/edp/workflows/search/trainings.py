@@ -40,14 +40,14 @@ class TrainingRequest:
 
     Attributes:
         settings: the whole experiment as plain tables (`edp.workflows.search.arms.Arm`); its split is not used.
-        source: what `DataSource.to_plain` gave.
+        source: result of `DataSource.to_plain`.
         train: names of the sessions that train.
         judged: names of the sessions that judge; none of them trains, and with one epoch none chooses anything.
         seed: root of every random choice of the training.
         updates: training steps over all epochs; 0 with several epochs makes each of them one pass over the data.
         until: the step after which this part of the training ends and is judged, or with several epochs the epoch;
             None for the end. A part goes on to the same bits as a training without a stop.
-        stops: where earlier parts may have ended; they decide nothing, and are not part of a key.
+        stops: possible ends of earlier parts; they affect no result and are not part of a key.
         epochs: one for a training without an early stop, so that no session that judges has a say.
         patience: epochs without a better validation score before an early stop; 0 never.
         validation: names of the sessions that validate after each of several epochs; they may be those that judge, as
@@ -125,10 +125,10 @@ class Outcome:
     """Outcome of a request.
 
     Attributes:
-        order: what was to be trained.
+        order: request of the training.
         status: ``done``, or how it ended.
-        result: of `TrainedPart`, where it is done.
-        message: what went wrong.
+        result: result of `TrainedPart`, if it is complete.
+        message: error message.
     """
 
     order: TrainingRequest
@@ -159,7 +159,7 @@ class TrainedPart:
     Attributes:
         result: for JSON. ``sessions``: for each judging session its scores at each horizon, report units, mean over
             targets; ``scores``: their means over sessions; ``parameters``, ``macs_tick``, and more where it applies.
-        state: from which the next part continues; None at the end.
+        state: state from which the next part continues; None at the end.
     """
 
     result: dict[str, object]
@@ -170,7 +170,7 @@ def train_part(order: TrainingRequest, start: bytes | None = None) -> TrainedPar
     """Train and judge a request, which may be a part of a training.
 
     Args:
-        order: what to train.
+        order: training to run.
         start: state of an earlier part; it saves the time to come there, and changes nothing else.
 
     Raises:

@@ -70,10 +70,10 @@ class TwinCandidate:
     """A formulation that was tried.
 
     Attributes:
-        label: how sentences and tables call it.
+        label: name in sentences and tables.
         seconds: processor time.
         trial: None where it could not be fitted, or was given up.
-        error: of free runs in what each of its fits left out, over that of the static map; None without a trial.
+        error: free-run error on the data left out by each fit, relative to the static map; None without a trial.
         why: why there is no trial.
         chosen: whether it is kept.
     """
@@ -106,7 +106,7 @@ class TwinChoice:
     """A choice among formulations.
 
     Attributes:
-        fit: what every fit needs; its training and validation part are divided anew.
+        fit: common inputs of all fits; training and validation part are divided again.
         auto: the settings of the choice.
         run: folder and key; trainings that were stopped go on.
     """
@@ -119,7 +119,7 @@ class TwinChoice:
         """Return the simplest of the candidates that are as good as the best, and all of them.
 
         Raises:
-            ConfigError: none can be fitted to these recordings.
+            ConfigError: no formulation can be fitted to these recordings.
         """
         tried: list[TwinCandidate] = []
         for name in self.auto.tried:
@@ -270,7 +270,7 @@ class TwinChoice:
         """Fit for each fold, up to where it has more than `most` times the error of a rival.
 
         Args:
-            label: how sentences call it.
+            label: name in sentences.
             spec: its options.
             fitted: fits for some of the folds, in order.
             rival: the best one so far, None: there is none.

@@ -38,7 +38,7 @@ class BaseTwin:
     """Trained twin as a start.
 
     Attributes:
-        folder: of its run.
+        folder: folder of its run.
         bundle: the twin.
         digest: hash of its header, which holds those of its numbers.
     """
@@ -147,7 +147,7 @@ class ContinuedTwin:
     """Twin under further training; free runs of the validation part select the number of updates, possibly zero.
 
     Attributes:
-        fit: what every fit of the run needs.
+        fit: common inputs of all fits of the run.
         start: the twin to begin with.
         run: folder and key; trainings that were stopped go on.
     """

@@ -47,7 +47,7 @@ class TwinFit:
     """Common inputs of all fits of a run.
 
     Attributes:
-        channels: of the twin.
+        channels: channels of the twin.
         scales: fitted to the training part.
         data: prepared series.
         experiment: the settings.

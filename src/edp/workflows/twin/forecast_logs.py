@@ -54,8 +54,8 @@ class ForecastLogs:
     Attributes:
         files: a log each.
         channels: names of the forecasts.
-        gain: of the observer.
-        scores: by horizon as text.
+        gain: gain of the observer.
+        scores: scores by horizon as text.
     """
 
     files: tuple[Path, ...]
@@ -83,9 +83,9 @@ def forecast_logs(
         horizons: ticks ahead.
         out: folder of the new logs (Parquet), which are there all together or not at all; it must not hold anything
             yet.
-        answers: what is forecast; empty: the velocities.
-        gain: of the observer; None: chosen on logs from which the twin learned, where these are among them, else on
-            the first ones.
+        answers: outputs to predict; empty for the velocities.
+        gain: gain of the observer; None to choose it on the training logs of the twin, if they are among these,
+            otherwise on the first logs.
         progress: receiver of the progress; its units are logs.
 
     Raises:

@@ -87,7 +87,7 @@ def _base(start: str | Path | None) -> tuple[BaseTwin, str]:
     """Return the start twin, and the machine of its linkage.
 
     Raises:
-        EdpError: none is named, or it can carry no ground.
+        EdpError: no twin is named, or it cannot have a ground.
     """
     if start is None:
         raise ConfigError(

@@ -25,8 +25,8 @@ def paced(training: FreeRunSpec, rate_hz: float, block: int) -> FreeRunSpec:
     of a league's own, all validated by one stretch, 0.66 (median of five; `docs/results.md`).
 
     Args:
-        training: of the settings.
-        rate_hz: of the recordings.
+        training: training settings.
+        rate_hz: sample rate of the recordings.
         block: ticks that a fold leaves out; the longest free run takes half of it at most.
     """
     usual = FreeRunSpec()

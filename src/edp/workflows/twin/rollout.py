@@ -40,7 +40,7 @@ class Rollout:
         recording: commands, measured channels, and the twin's answers under names that end in `FREE`, with their
             intervals under `LOW` and `HIGH`; row by row at the same time.
         scores: see `edp.evaluation.free_run.free_run_scores`.
-        start_s: of the free run in the log.
+        start_s: start of the free run in the log, s.
         coverage: share that the intervals are meant to hold; None without intervals.
         calibrated_s: length of a free run up to which they are calibrated; beyond it they stay as wide.
         beyond: commands of the free run beyond those that taught the twin, see `edp.evaluation.beyond`.

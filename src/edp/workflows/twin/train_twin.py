@@ -51,7 +51,7 @@ class TrainedTwin:
 
     Attributes:
         bundle: the twin on disk.
-        scores: of the twin and of every floor, by label: see `edp.evaluation.free_run.free_run_scores`.
+        scores: scores of the twin and of every reference, by label: see `edp.evaluation.free_run.free_run_scores`.
         resumed: whether it was finished before, and only read.
     """
 
@@ -73,7 +73,7 @@ def train_twin(
     choice ``candidates.json``. A finished one is read, a stopped one goes on.
 
     Args:
-        source: where the recordings are.
+        source: source of the recordings.
         experiment: the settings.
         out: run folder.
         progress: receiver of what begins; the units of a training are updates.

@@ -136,8 +136,8 @@ class InputSource:
 
     Attributes:
         kind: ``position``, ``velocity`` or ``effort`` of a joint, ``pressure`` of a sensor, or ``constant``.
-        name: of the joint or sensor.
-        value: of a constant.
+        name: name of the joint or sensor.
+        value: value of a constant.
     """
 
     kind: str
@@ -185,9 +185,9 @@ class Tick:
     """Result of a joint message.
 
     Attributes:
-        status: of the C code, None where no tick was made of it.
+        status: status of the C code; None if the message gave no sample.
         valid: the prediction rests on this tick's inputs and on a whole window, at the network's rate.
-        why: where it is not valid, a reason.
+        why: reason why the result is not valid.
         missed: ticks that were missed before this one.
         step_us: time of the C code, microseconds.
     """
@@ -210,7 +210,7 @@ class Assembler:
 
     Attributes:
         core: the network.
-        sources: of its inputs.
+        sources: sources of its inputs.
         rejected: messages that no tick was made of: late, twice, or at a wrong rate.
     """
 

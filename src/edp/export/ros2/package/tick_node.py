@@ -21,8 +21,8 @@ class TickNode(Node):
     """A node that assembles a tick at each message of joints; see README.md for topics and parameters.
 
     Args:
-        name: of the node.
-        core: what is told of each tick.
+        name: name of the node.
+        core: receiver of each sample.
 
     Raises:
         ValueError: the parameter `rate_hz` is another rate than that of the core.

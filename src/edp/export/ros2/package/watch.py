@@ -48,7 +48,7 @@ class MonitorReport:
     Attributes:
         core: the monitor.
         raised: stamp of the last alarm, s; NaN before any.
-        alarms: that were seen.
+        alarms: alarms so far.
     """
 
     core: MonitorCore
@@ -70,7 +70,7 @@ class MonitorReport:
 
         Args:
             tick: the last one.
-            stamp: of it, s.
+            stamp: time stamp, s.
             fresh: whether it came since the last report.
         """
         values = {name: f"{value:.6g}" for name, value in self.core.outputs.items()}

@@ -27,20 +27,21 @@ class GreyFitSpec:
     Attributes:
         lengths_s: lengths of the free runs, stage after stage.
         rounds: rounds of each stage; every one draws other stretches.
-        starts: from how many starts the first stage is fitted; the one with the least validation error goes on.
+        starts: number of starting points of the first stage; the one with the least validation error is used.
         steps: Gauss-Newton steps in a round.
         lanes: free runs of a round at most.
-        ticks: of all free runs of a round together, about.
+        ticks: approximate total number of samples of the free runs in a round.
         memory: share of what a round knows that counts in the next one, beside its own stretches.
-        final_rounds: behind all stages, each one step on free runs of the longest length; 0: none.
-        final_ticks: of all free runs of such a round together, about.
+        final_rounds: number of rounds after all stages, each with one step on free runs of the longest length; 0 for
+            none.
+        final_ticks: approximate total number of samples of the free runs in a final round.
         final_memory: share of what such a round knows that counts in the next one; less where the training part has
             fewer ticks than would count then.
-        stroke_weight: of an error of a stroke in its deviations, beside those of velocities and pressures.
-        delta: where the Huber loss turns from a square to a line, in weighted deviations.
+        stroke_weight: weight of a standardised stroke error relative to velocities and pressures.
+        delta: weighted error above which the Huber loss is linear, in standard deviations.
         validate_every: rounds from one validation to the next.
         validation_s: length of a free run of the validation.
-        validation_runs: how many there are.
+        validation_runs: number of validation runs.
 
     Raises:
         ConfigError: a value out of range, or stages that do not fit one another.

@@ -37,7 +37,7 @@ class GroundContact(ABC):
         Args:
             strokes: before it, of each actuator, m.
             free: velocities after it without any ground, m/s.
-            slopes: of these by a force against each actuator ``(actuator, actuator)``, m/s by N.
+            slopes: derivatives of the velocities by a force against each actuator ``(actuator, actuator)``, m/s per N.
         """
 
     @abstractmethod
@@ -49,7 +49,7 @@ class GroundLaw(ABC):
     """Ground law with its parameters.
 
     Attributes:
-        numbers: of the law, SI units.
+        numbers: parameters of the law, SI units.
         deviations: standard errors of these; an infinite one says that the logs do not tell.
     """
 
@@ -62,7 +62,7 @@ class GroundLaw(ABC):
         """Return the law fitted to logs.
 
         Args:
-            twin: with a known linkage.
+            twin: twin with a known linkage.
             logs: strokes, velocities and estimated forces against each actuator, ``(tick, actuator)`` each, SI units.
             machine: name or file of the machine, which says where the surface is.
 
@@ -114,7 +114,7 @@ class GroundedRunner(TwinRunner):
 
     Args:
         twin: a grey box with a known linkage.
-        law: of the ground.
+        law: law of the ground.
 
     Raises:
         ConfigError: the twin has no load that forces could act on, or no linkage.

@@ -44,7 +44,7 @@ def tip_at(linkage: Array, bucket_m: float, strokes: Array, tip: Array, slopes: 
     """Place of the tip in the frame of the boom foot, and its slopes by the strokes.
 
     Args:
-        linkage: of `parameter_index`.
+        linkage: linkage of `parameter_index`.
         bucket_m: length of the last body, m.
         strokes: ``(actuator,)``, m.
         tip: written ``(2,)``, m.
@@ -139,8 +139,8 @@ def hold(
         front: linkage and length of the bucket, as `tip_at` reads them.
         strokes: before the tick ``(actuator,)``, m.
         free: velocities after it without any ground ``(actuator,)``, m/s.
-        slopes: of these by a force against each ``(actuator, actuator)``, m/s by N.
-        numbers: of the law ``(NUMBERS,)``.
+        slopes: derivatives of the velocities by a force against each actuator ``(actuator, actuator)``, m/s per N.
+        numbers: parameters of the law ``(NUMBERS,)``.
         memory: profile, which is cut, and x of the tip before ``(1,)``.
         forces: written ``(actuator,)``, N.
     """
@@ -185,7 +185,7 @@ def follow(
     """Compute depth and speed of the tip along a log, and the cylinder forces of each law parameter.
 
     Args:
-        front: as in `hold`.
+        front: geometry, see `hold`.
         strokes: ``(tick, actuator)``, m.
         velocities: ``(tick, actuator)``, m/s.
         profile: cut along the log.

@@ -59,7 +59,7 @@ class DragContact(GroundContact):
 
     Args:
         front: linkage and length of the bucket.
-        numbers: of the law.
+        numbers: parameters of the law.
         profile: heights of the ground, level.
     """
 
@@ -85,8 +85,8 @@ class DragLaw(GroundLaw):
     Attributes:
         numbers: ``(contact.NUMBERS,)``, as `contact` orders them.
         deviations: their standard errors.
-        bucket_m: from the bucket's pin to the edge.
-        surface_m: of level ground in the frame of the boom foot.
+        bucket_m: distance from the bucket's pin to the edge, m.
+        surface_m: height of level ground in the frame of the boom foot, m.
     """
 
     numbers: Array

@@ -26,7 +26,7 @@ class PhaseSpec(Protocol):
     """Phase: a pure function of the context and of the outcomes of its requests, without side effects.
 
     Attributes:
-        title: for progress and reports.
+        title: title for progress and reports.
     """
 
     title: str
@@ -49,9 +49,9 @@ class Quest:
     """A study with what its trials mean.
 
     Attributes:
-        study: which asks.
-        arm: what a trial stands for.
-        trials: how many.
+        study: study of the trials.
+        arm: function that gives the arm of a trial.
+        trials: number of trials.
     """
 
     study: Study
@@ -67,8 +67,8 @@ def answer_all(
     A trial whose costs exceed the limits, or whose network cannot be, is reported so and not trained.
 
     Args:
-        context: of the search.
-        quests: that are asked.
+        context: context of the search.
+        quests: quests to answer.
         stops: steps at which trainings of a batch are judged and may end early. All of a batch are judged by what was
             reported of earlier batches, in the order of their numbers, so that who trained them has no say.
     """

@@ -31,12 +31,12 @@ def ask_together(
     """Ask about active modules, rates inside the window and deferred options, with warm starts first.
 
     Args:
-        context: with the baseline of phase 1.
-        name: of the phase.
+        context: context with the baseline of phase 1.
+        name: name of the phase.
         modules: and toggles that may be on.
-        trials: how many questions, the warm starts among them.
-        starts: what to begin with.
-        options: what is varied of a module where it is on.
+        trials: number of trials, including the warm starts.
+        starts: warm starts.
+        options: options of each module that vary while it is active.
     """
     base, _, window = baseline_of(context)
     # Pairs that contradict each other are barred, so that no question is wasted on them.
