@@ -14,7 +14,7 @@ from edp.export.c.model import make_model
 from edp.export.c.target import CTarget
 from edp.export.golden import random_inputs
 from edp.ir.rls import Adaptation, AdaptationSpec, RlsCorrector, RlsStatus
-from edp.ir.rls.constants import CLIP, FEATURE_LIMIT, MAX_ERROR
+from edp.ir.rls.constants import CLIP, FEATURE_LIMIT, MOST_ERROR
 from edp.networks.input_range import usual_range
 
 HERE = Path(__file__).parent
@@ -163,7 +163,7 @@ def test_an_adversary_does_not_break_its_bounds_in_a_day(c, driven):
 def test_constants_of_the_runtime_are_those_of_the_reference():
     text = (HERE.parents[1] / "src/edp/export/c/runtime/edp_adaptation.h").read_text()
     found = dict(re.findall(r"#define EDP_ADAPT_(\w+) ([\d.]+)f", text))
-    wanted = {"FEATURE_LIMIT": FEATURE_LIMIT, "CLIP": CLIP, "MAX_ERROR": MAX_ERROR}
+    wanted = {"FEATURE_LIMIT": FEATURE_LIMIT, "CLIP": CLIP, "MOST_ERROR": MOST_ERROR}
     assert {name: float(value) for name, value in found.items()} == wanted
 
 

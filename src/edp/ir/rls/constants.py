@@ -19,7 +19,7 @@ FEATURE_LIMIT = 6.0
 """Standard widths at which inputs and features are cut off."""
 CLIP = 3.0
 """Units beyond which an innovation teaches no more."""
-MAX_ERROR = 20.0
+MOST_ERROR = 20.0
 """Units beyond which an error counts no more when the correction is judged."""
 BOUND = 4.0
 """Coefficients are held within so many prior spreads."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from edp.errors import ConfigError
-from edp.ir.rls.constants import CLIP, FEATURE_LIMIT, MAX_ERROR, Adaptation, Array
+from edp.ir.rls.constants import CLIP, FEATURE_LIMIT, MOST_ERROR, Adaptation, Array
 
 
 class RlsStatus(IntEnum):
@@ -199,7 +199,7 @@ class RlsCorrector:
 
     def _judge(self, h: int, error: Array, correction: Array, learn: bool) -> None:
         """Compare the running errors without and with the correction; take it back, or let it out again."""
-        constants, most = self._numbers, np.float32(MAX_ERROR)
+        constants, most = self._numbers, np.float32(MOST_ERROR)
         for running, of in ((self._plain[h], error), (self._corrected[h], error - correction)):
             # A cap on single errors: one spike must not decide between correction and none.
             running += constants["rate"] * (np.minimum(np.abs(of), most) - running)
