@@ -130,7 +130,7 @@ def simulated(folder: Path, of: tuple[str, str], minutes: float, recordings: int
     materials = {of[1]: 1.0} if of[1] else {}
     order = SimulationOrder(machine=of[0], minutes=minutes, recordings=recordings, seed=seed, materials=materials)
     simulate_data_set(folder, order, workers=IN_PROCESS)
-    return DataSource.of(folder)
+    return DataSource.from_path(folder)
 
 
 def trained(folder: Path, source: DataSource, size: Size, seed: int) -> Bundle:
@@ -379,7 +379,7 @@ def main(bench: Bench) -> object:
     check_followers(bench, found.mae, attainable)
     adversary = check_costs_and_attacks(bench, bundle, tests["before"], size.ticks)
     return {
-        "form": form, "mae": found.mae, "each": found.each, "factors": found.factors, "options": law.to_plain(),
+        "form": form, "mae": found.mae, "each": found.each, "factors": found.factors, "options": law.to_dict(),
         "follower on a Cortex-M7": cost, "trained after the change": attainable, "adversary": adversary,
     }  # fmt: skip
 

@@ -99,7 +99,9 @@ def train_set(entry: dict[str, Any], seed: int, changes: Sequence[str], distille
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
         settings = load_auto(EXAMPLES / entry["settings"], [f"auto.seed={seed}", *changes])
-        facts = train_auto(DataSource.of(EXAMPLES / entry["data"]), settings, Path(folder) / "run").choice.to_table()
+        facts = train_auto(
+            DataSource.from_path(EXAMPLES / entry["data"]), settings, Path(folder) / "run"
+        ).choice.to_table()
         seconds = round(time.perf_counter() - began, 1)
         scores = read_json(evaluate(Path(folder) / "run", baselines=tuple(BASELINES)) / "scores.json")
         choice = read_json(Path(folder) / "run" / "auto.json")

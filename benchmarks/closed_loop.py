@@ -122,7 +122,7 @@ def wider_dead_band(folder: Path) -> Path:
         for name in ("dead_band_extend", "dead_band_retract")
     }
     path = folder / "wider.toml"
-    path.write_text(tomli_w.dumps(MACHINE_FILE.plain(replace(machine, valves=replace(valves, **bands)))))
+    path.write_text(tomli_w.dumps(MACHINE_FILE.to_dict(replace(machine, valves=replace(valves, **bands)))))
     return path
 
 

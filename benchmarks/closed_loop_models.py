@@ -144,7 +144,7 @@ class Models:
 
     def _simulated(self, name: str, order: SimulationOrder) -> DataSource:
         simulate_data_set(self.folder / name, order, workers=IN_PROCESS)
-        return DataSource.of(self.folder / name)
+        return DataSource.from_path(self.folder / name)
 
     def _twin(self, source: DataSource, name: str, settings: Sequence[str], start: Path | None = None) -> Path:
         experiment = load_twin_experiment(None, (*settings, *JUDGED))

@@ -183,7 +183,7 @@ def main(bench: Bench) -> object:
     objects: dict[int, list[dict[str, int]]] = {horizon: [] for horizon in horizons}
     for seed in range(bench.seed, bench.seed + seeds):
         for horizon in horizons:
-            found = one(DataSource.of(data), horizon, seed, folder, arguments)
+            found = one(DataSource.from_path(data), horizon, seed, folder, arguments)
             searches[horizon].append(found)
             chosen = folder / f"k{horizon}_seed{seed}" / "chosen_w8a16"
             objects[horizon].append(compiled(found.best, chosen) if found.best else {})

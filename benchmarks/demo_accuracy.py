@@ -23,7 +23,7 @@ def run(folder: Path, data: Path, horizon: int, seed: int, quick: bool) -> dict[
     changes = [f"task.horizons=[{horizon}]", f"training.seed={seed}", f"split.seed={seed}"]
     changes += ["training.epochs=4", "training.updates=60"] if quick else []
     out = folder / f"run_k{horizon}"
-    train(DataSource.of(data), load_experiment(None, "quick", changes), out)
+    train(DataSource.from_path(data), load_experiment(None, "quick", changes), out)
     evaluate(out, baselines=BASELINES[:2] if quick else BASELINES)
     models = read_json(out / "scores.json")["models"]
     return {

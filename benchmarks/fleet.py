@@ -100,7 +100,7 @@ class Fleet:
         logs = self.logs("many", self.order(self.size.minutes, self.size.recordings))
         updates = 10 if self.quick else 100
         experiment = self.experiment("training.epochs=1", f"training.updates={updates}")
-        train(DataSource.of(logs), experiment, self.work / "run")
+        train(DataSource.from_path(logs), experiment, self.work / "run")
         return self.work / "run"
 
 
@@ -217,7 +217,7 @@ def commands(fleet: Fleet) -> dict[str, Command]:
         fleet.logs(name, order)
 
     def source(name: str) -> DataSource:
-        return DataSource.of(fleet.work / name)
+        return DataSource.from_path(fleet.work / name)
 
     if fleet.quick:  # starting processes takes longest: two commands stand for all
         return {
@@ -315,7 +315,7 @@ def trained(fleet: Fleet, name: str, order: SimulationOrder) -> Path:
     lengths = (f"training.epochs={epochs}", f"training.updates={max(1, fleet.size.updates // epochs)}")
     experiment = fleet.experiment('split.kind="machines"', *lengths)
     out = fleet.work / "runs" / name
-    train(DataSource.of(fleet.logs(name, order)), experiment, out)
+    train(DataSource.from_path(fleet.logs(name, order)), experiment, out)
     return out
 
 
@@ -324,7 +324,7 @@ def deltas(fleet: Fleet) -> dict[str, Any]:
     orders = fleet_orders(fleet)
     base = trained(fleet, "fleet", orders["fleet"])
     store = fleet.work / "unseen_store"
-    DataSource.of(fleet.logs("unseen", orders["unseen"])).store(store)
+    DataSource.from_path(fleet.logs("unseen", orders["unseen"])).store(store)
     found: dict[str, Any] = {"parameters": sum(p.numel() for p in load_bundle(base).predictor.parameters())}
     spec = FinetuneSpec(rounds=3 if fleet.quick else 10)
     content = finetune_fleet(Workers(), base, store, PersonalOrder(method="full", spec=spec), fleet.work / "own")

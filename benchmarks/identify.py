@@ -89,7 +89,7 @@ def one_machine(given: Any, name: str) -> dict[str, Any]:
         write_bytes(folder / f"{name}_measured.toml", machine_text(measured(truth), [], {}).encode())
         began = time.process_time()
         result = identify(
-            DataSource.of(source),
+            DataSource.from_path(source),
             folder / f"{name}_found.toml",
             str(folder / f"{name}_measured.toml"),
             load_twin_experiment(None, ["twin.kind=greybox", *changes]),
@@ -108,7 +108,7 @@ def measured(truth: Machine) -> Machine:
 
 def compared(truth: Machine, guess: Machine, result: Identified) -> dict[str, Any]:
     """Errors of each number as shares of the truth, of the joints' inertia and gravity, and the scores."""
-    true = {number.label: number.of(truth) for number in MACHINE_NUMBERS}
+    true = {number.label: number.read(truth) for number in MACHINE_NUMBERS}
     # No log tells pump flow and power from the volumetric efficiency, which is the guess's.
     share = truth.pumps.volumetric_efficiency / guess.pumps.volumetric_efficiency
     true |= {label: true[label] * share for label in ("pumps.max_flow", "pumps.power_limit")}
@@ -131,7 +131,7 @@ def compared(truth: Machine, guess: Machine, result: Identified) -> dict[str, An
 def joint_errors(truth: Machine, other: Machine) -> list[tuple[float, float]]:
     """Error of inertia and of gravity torque of each joint, root mean square over poses as a share of the truth's."""
     strokes = np.random.default_rng(0).uniform(0.1, 0.9, (200, 3)) * np.array(truth.cylinders.stroke)
-    poses = Poses.of(truth, strokes)
+    poses = Poses.from_strokes(truth, strokes)
     by_torque, by_inertia = load_by_base(poses, truth.bodies.length, truth.gravity)
     values = []
     for machine in (truth, other):

@@ -60,7 +60,7 @@ class Waves(LiveSource):
         self.longest_s = self.cpu_s = 0.0
 
     @classmethod
-    def of(cls, options: SourceOptions, needs: Needs) -> Waves:
+    def from_options(cls, options: SourceOptions, needs: Needs) -> Waves:
         """An endless one."""
         return cls(None, True)
 

@@ -243,7 +243,7 @@ def _one_fit(job: _FitJob) -> dict[str, Any]:
     chosen, others = ([parts[i] for i in some] for some in (order[:count], order[count:][:MEASURED_SESSIONS]))
     spec, old = plan.experiment.chain, monitor.chain
     result = fit_from_blocks(spec, old.summaries, chosen, monitor.rate_hz, old.settle, plan.fit_hours)
-    own = MonitorOfBlocks.of(monitor, result.chain)
+    own = MonitorOfBlocks.from_chain(monitor, result.chain)
     count = sum(len(own.run(part)) for part in others)  # type: ignore[arg-type]
     measured = sum(len(part.summaries) for part in others) * monitor.block_s / 3600.0
     return {

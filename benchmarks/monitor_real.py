@@ -257,7 +257,7 @@ def short_settings(rate_hz: float) -> tuple[str, ...]:
 
 def set_results(name: str, seed: int) -> dict[str, Any]:
     """Shares found of one set, by detector, kind and size, and false alarms."""
-    recordings = DataSource.of(EXAMPLES / f"{name}.toml").read()
+    recordings = DataSource.from_path(EXAMPLES / f"{name}.toml").read()
     healthy, test = divided(recordings)
     rate_hz = recordings[0].rate_hz
     hours = sum(part.duration_s for part in healthy) / 3600.0

@@ -122,7 +122,7 @@ class MonitorOfBlocks(Monitor):
         yield from self.chain.run(recording.summaries, recording.points, self.chain.initial_state())[0]
 
     @staticmethod
-    def of(monitor: Monitor, chain: MonitorChain | None = None) -> MonitorOfBlocks:
+    def from_chain(monitor: Monitor, chain: MonitorChain | None = None) -> MonitorOfBlocks:
         """Of a monitor, with another chain where one is given."""
         source = monitor.chain if chain is None else chain
         own = ChainOfBlocks(**{field.name: getattr(source, field.name) for field in fields(MonitorChain)})
@@ -197,7 +197,7 @@ def _watch(job: _WatchJob) -> list[MonitorAlarm]:
         return []
     if job.columns:
         part = replace(part, summaries=part.summaries[:, job.columns])
-    return list(MonitorOfBlocks.of(monitor_of(job.monitor)).run(part))  # type: ignore[arg-type]
+    return list(MonitorOfBlocks.from_chain(monitor_of(job.monitor)).run(part))  # type: ignore[arg-type]
 
 
 def watched(

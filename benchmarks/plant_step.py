@@ -91,7 +91,7 @@ def twin(channels: TwinChannels, seed: int) -> Bundle:
     """The default twin, untrained."""
     one = {name: np.ones(shape, np.float32) for name, shape in TwinScales.shapes(channels).items()}
     offsets = {name: 0.0 * one[name] for name in ("command_offset", "answer_offset")}
-    scales = TwinScales.of(one | offsets | {"low": -10.0 * one["low"], "high": 10.0 * one["high"]})
+    scales = TwinScales.from_arrays(one | offsets | {"low": -10.0 * one["low"], "high": 10.0 * one["high"]})
     spec = Recurrent(units=UNITS)
     return plant_bundle(TwinBundle(spec, spec.start(channels, scales, [], seed)))
 

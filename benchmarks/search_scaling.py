@@ -60,7 +60,7 @@ def opening(folder: Path, count: int, repeats: int) -> tuple[list[float], list[f
 
 
 def orders(data: Path, count: int, updates: int, first_seed: int) -> list[Job]:
-    source = DataSource.of(data)
+    source = DataSource.from_path(data)
     recordings = source.read()
     digest = digest_of(sorted(recording.digest for recording in recordings))
     names = [recording.name for recording in recordings]
@@ -68,7 +68,7 @@ def orders(data: Path, count: int, updates: int, first_seed: int) -> list[Job]:
     for number in range(count):
         judged = (names[number % len(names)],)
         train = tuple(name for name in names if name not in judged)
-        order = TrainingRequest(SETTINGS, source.to_plain(), train, judged, first_seed + number, updates)
+        order = TrainingRequest(SETTINGS, source.to_dict(), train, judged, first_seed + number, updates)
         found.append(job_of(order, digest))
     return found
 

@@ -263,7 +263,9 @@ def facts_of(signals: Signals, machine: str, seed: int) -> list[Fact]:
 def scenarios(machine: str, minutes: float, seed: int) -> tuple[Scenario, ...]:
     """M22: the default data set, in free air. C14: its example, in free air and in soil."""
     example = None if machine == "M22" else SCENARIOS / "c14_soil.toml"
-    return SimulationOrder.of(example, minutes=minutes, recordings=max(7, round(minutes)), seed=seed).scenarios()
+    return SimulationOrder.from_scenario(
+        example, minutes=minutes, recordings=max(7, round(minutes)), seed=seed
+    ).scenarios()
 
 
 def show(title: str, facts: Sequence[Fact]) -> None:

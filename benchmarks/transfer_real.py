@@ -61,14 +61,14 @@ QUICK_SETS = SETS[:1]
 
 def transferred(regimes: Regimes, work: Path, quick: bool, seed: int) -> dict[str, Any]:
     """Train on the first recording, fine-tune on the second; the content of ``transfer.json``."""
-    first, second = DataSource.of(EXAMPLES / regimes.data).read()
+    first, second = DataSource.from_path(EXAMPLES / regimes.data).read()
     for name, recording in (("source", first), ("target", second)):
         write_recording(recording, make_folder(work / name) / f"{recording.name}.parquet")
     changes = [f"training.seed={seed}", "training.threads=1", *CHANGES, *(["training.epochs=2"] if quick else [])]
     experiment = load_experiment(EXAMPLES / regimes.settings, OWN_NETWORK, changes)
-    train(DataSource.of(work / "source"), experiment, work / "run")
+    train(DataSource.from_path(work / "source"), experiment, work / "run")
     specs = [replace(SPEC, rounds=2)] if quick else [replace(SPEC, rate=rate) for rate in RATES]
-    logs = DataSource.of(work / "target")
+    logs = DataSource.from_path(work / "target")
     tried = {work / f"tuned_{number}": FinetuneRequest(spec=spec, method=OURS) for number, spec in enumerate(specs)}
     for folder, order in tried.items():
         finetune(work / "run", logs, order, folder)

@@ -84,7 +84,7 @@ def main(bench: Bench) -> object:
     experiment = load_twin_experiment(None, RECURRENT)
     minutes, count = (10.0, 8) if quick else (arguments.minutes, round(arguments.minutes / 3))
     simulate_data_set(bench.data, SimulationOrder(minutes=minutes, recordings=count, seed=bench.seed + 1))
-    channels, data = prepare_twin(DataSource.of(bench.data), experiment)
+    channels, data = prepare_twin(DataSource.from_path(bench.data), experiment)
     parts = channels, fit_scales(channels, data.train), data
     whole = set(only) == set(FITTED)
     closed = (*experiment.judge.floors, "n4sid") if whole else ("static",) if not arguments.many else ()

@@ -83,8 +83,8 @@ def main(bench: Bench) -> object:
     limits = {k: float(row[-1]) for k, row in zip(limit["horizons"], limit["commands_unknown"]["mae"], strict=True)}
     twin = bench.part("twin", lambda: forecasts(logs, ahead, work / "grey", seed, quick))
     settings, settings_ahead = experiment(seed, quick), experiment(seed, quick, ahead=True)
-    plain = prepare_data(DataSource.of(logs), settings)
-    extended = prepare_data(DataSource.of(ahead), settings_ahead)
+    plain = prepare_data(DataSource.from_path(logs), settings)
+    extended = prepare_data(DataSource.from_path(ahead), settings_ahead)
     if [s.name for s in plain.test] != [s.name for s in extended.test] or sorted(twin["test"]) != sorted(
         s.name for s in plain.test
     ):
@@ -145,14 +145,14 @@ def smaller(settings: Experiment) -> Experiment:
 def forecasts(logs: Path, ahead: Path, grey: Path, seed: int, quick: bool) -> dict[str, Any]:
     """Fit the grey box, write the logs anew; processor seconds of both, and the recordings that no fit saw."""
     settings = load_twin_experiment(None, ("twin.kind=greybox",))
-    channels, data = prepare_twin(DataSource.of(logs), settings)
+    channels, data = prepare_twin(DataSource.from_path(logs), settings)
     spec = QUICK_FIT if quick else GreyFitSpec(ticks=5000, starts=1)
     twin, seconds = fitted_linkage((channels, fit_scales(channels, data.train), data), seed, spec)
     names = {part: [s.name for s in getattr(data, part)] for part in ("train", "validation", "test")}
     save_twin(TwinBundle(twin.spec, twin, Provenance(data=DataOrigin(names=names))), grey)
     began = time.process_time()
     # The choice of a gain alone would take a quarter of the short form's minute.
-    written = forecast_logs(grey, DataSource.of(logs), HORIZONS, ahead, gain=0.3 if quick else None)
+    written = forecast_logs(grey, DataSource.from_path(logs), HORIZONS, ahead, gain=0.3 if quick else None)
     return {
         "fit_s": seconds,
         "forecast_s": time.process_time() - began,

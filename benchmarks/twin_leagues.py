@@ -222,7 +222,7 @@ class Judged:
     minutes: float
 
     @staticmethod
-    def of(source: DataSource, which: LeagueSet, minutes: float) -> Judged:
+    def from_run(source: DataSource, which: LeagueSet, minutes: float) -> Judged:
         """From the two recordings of a set."""
         estimation, test = (machine(recording, which) for recording in source.read())
         channels = twin_channels(estimation)
@@ -359,8 +359,8 @@ def main(bench: Bench) -> object:
         name = Path(entry["data"]).stem
         if given.only is not None and name not in given.only:
             continue
-        judged = Judged.of(
-            DataSource.of(EXAMPLES / entry["data"]), SETS[entry["data"]], minutes_of(given.minutes, name)
+        judged = Judged.from_run(
+            DataSource.from_path(EXAMPLES / entry["data"]), SETS[entry["data"]], minutes_of(given.minutes, name)
         )
         factor = 1000.0 if entry["unit"] == "mm" else 1.0
         found = summary(judged, seeds, factor, given.quick, work, name)

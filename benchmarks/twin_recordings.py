@@ -125,7 +125,7 @@ def public_sets(seed: int, quick: bool) -> dict[str, dict[str, Any]]:
     for name, which in SETS.items():
         if quick and name not in QUICK_SETS:
             continue
-        recordings = [machine(recording, which) for recording in DataSource.of(EXAMPLES / f"{name}.toml").read()]
+        recordings = [machine(recording, which) for recording in DataSource.from_path(EXAMPLES / f"{name}.toml").read()]
         experiment = replace(experiment_of(seed, quick, which.prefix_ticks), split=SPLIT)
         experiment = replace(experiment, channels=TwinChannelSettings(commands=which.commands))
         found[name] = measure(*cut_recordings(recordings, experiment), experiment)

@@ -9,7 +9,7 @@ from edp.workflows.search.runner import Resources, run_search
 
 def main(data: str, study: str, *changes: str) -> None:
     plan = load_plan(preset="quick", overrides=changes)
-    found = run_search(DataSource.of(data), plan, study, Resources(count=2))
+    found = run_search(DataSource.from_path(data), plan, study, Resources(count=2))
     for decision in found.context.decided.values():
         print(decision.phase, *decision.sentences, sep="\n  ")
     print("settings of the winner:", found.teacher)

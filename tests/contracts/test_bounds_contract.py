@@ -279,7 +279,7 @@ def test_changes_of_a_scenario(name):
     for value in SLIPS:
         if value not in TAKEN.get(("ScenarioFile", name), set()):
             with pytest.raises(ConfigError):
-                SimulationOrder.of(None, print, [f"{name}={value}"])
+                SimulationOrder.from_scenario(None, print, [f"{name}={value}"])
 
 
 def test_trees_share_the_parts_of_networks():

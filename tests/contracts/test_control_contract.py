@@ -116,5 +116,5 @@ def test_its_gains_are_options_with_room_to_vary(name):
 @pytest.mark.parametrize("task", TASKS)
 def test_settings_come_back_from_what_a_run_folder_keeps(name, task):
     experiment = load_control_experiment(None, (), {"task": {"kind": task}, "controller": {"kind": name}})
-    plain = CONTROL_SETTINGS.plain(experiment)
+    plain = CONTROL_SETTINGS.to_dict(experiment)
     assert CONTROL_SETTINGS.build(ControlExperiment, plain, "of a test") == experiment

@@ -12,7 +12,7 @@ from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError
 from edp.networks.backbones import CommitteeSpec, TcnSpec
 from edp.networks.heads import LinearHead, MlpHead
-from edp.networks.plain import task_from_plain, task_to_plain
+from edp.networks.plain import task_from_dict, task_to_dict
 from edp.networks.predictor import ModelSpec
 from edp.testing.networks import small_network
 from edp.testing.streaming import check_network
@@ -94,7 +94,7 @@ def test_entries_stay_in_their_order():
 
 def test_a_task_with_spans_survives_the_header_of_a_bundle():
     task = task_of(entries())
-    assert task_from_plain(task_to_plain(task)) == task
+    assert task_from_dict(task_to_dict(task)) == task
 
 
 @pytest.mark.parametrize(

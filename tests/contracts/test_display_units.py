@@ -96,9 +96,9 @@ def oil() -> Recording:
 
 
 def test_the_live_view_shows_degrees_celsius_in_what_is_measured_and_predicted():
-    trace, forecast = LiveTrace.of(OIL), Forecast("Oil", "degC", 1.0, 5, 1, measured=0)
+    trace, forecast = LiveTrace.from_channel(OIL), Forecast("Oil", "degC", 1.0, 5, 1, measured=0)
     assert (trace.unit, trace.offset, forecast.offset) == ("degC", -273.15, -273.15)
-    plain = LiveLayout("t", "s", 100.0, 2, [trace], [forecast]).to_plain()
+    plain = LiveLayout("t", "s", 100.0, 2, [trace], [forecast]).to_dict()
     assert plain["forecasts"][0]["offset"] == plain["traces"][0]["offset"] == -273.15
 
 

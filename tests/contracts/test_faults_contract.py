@@ -93,7 +93,7 @@ def test_places_units_and_ladder_are_sound(name):
     assert list(kind.ladder) == sorted(set(kind.ladder))
     for fault in ladder([name], everywhere=True):
         assert parse_fault(fault_text(fault)) == fault
-        assert FaultSpec(**fault.plain()) == fault
+        assert FaultSpec(**fault.to_dict()) == fault
     if isinstance(kind, SensorFault):
         assert tuple(kind.channels) == (kind.sites or ("",))
         assert len(set(kind.channels.values())) == len(kind.channels)
@@ -246,7 +246,7 @@ def test_a_simulation_goes_on_from_a_snapshot(material, tmp_path):
     pieces.restore(moment)
     np.testing.assert_array_equal(pieces.run(267), rest)
     assert pieces.recording().digest == whole.digest
-    again = Simulation.of(Snapshot.load(moment.save(tmp_path / "moment.npz")))
+    again = Simulation.from_snapshot(Snapshot.load(moment.save(tmp_path / "moment.npz")))
     again.run(267)
     assert again.recording().digest == whole.digest
     assert again.recording().meta == whole.meta

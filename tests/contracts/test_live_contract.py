@@ -103,7 +103,7 @@ def hostile_ros2(monkeypatch) -> LiveRun:
     modules["rclpy"].create_node = lambda name: node
     modules["rclpy.qos"].qos_profile_sensor_data = 5
     modules["sensor_msgs.msg"].JointState = modules["sensor_msgs.msg"].FluidPressure = object
-    source = SOURCES["ros2"].of(SourceOptions("ros2"), Needs(CHANNELS, 100.0))
+    source = SOURCES["ros2"].from_options(SourceOptions("ros2"), Needs(CHANNELS, 100.0))
     live_run = run_of(source)
 
     def spin_once(node, timeout_sec):
@@ -123,7 +123,9 @@ def hostile_ros2(monkeypatch) -> LiveRun:
 
 
 def hostile_environment(name: str, value: str, monkeypatch) -> LiveRun:
-    source = SOURCES[name].of(SourceOptions(value, settings={"controller": "pi"} if name == "loop" else {}), Needs())
+    source = SOURCES[name].from_options(
+        SourceOptions(value, settings={"controller": "pi"} if name == "loop" else {}), Needs()
+    )
     live_run, take, numbers = run_of(source), LiveRun.take, [n for n in NUMBERS if not isinstance(n, int)]
 
     def hostile(self, row, *more, **options):
@@ -201,7 +203,7 @@ class Broken(LiveSource):
         self.channels, self.rate_hz, self.text = CHANNELS, 100.0, "broken"
 
     @classmethod
-    def of(cls, options: SourceOptions, needs: Needs) -> LiveSource:
+    def from_options(cls, options: SourceOptions, needs: Needs) -> LiveSource:
         return cls()
 
     def run(self, sink) -> None:

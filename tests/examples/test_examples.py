@@ -61,7 +61,7 @@ SMALL = (
 def loader_of(path: Path) -> Callable[[Path], object]:
     table = tomllib.loads(path.read_text(encoding="utf-8"))
     if path.parent.name == "scenarios":
-        return SimulationOrder.of
+        return SimulationOrder.from_scenario
     if "search" in table:
         return load_plan
     return load_data_set if "recordings" in table else load_signal_map if "channels" in table else load_experiment
@@ -73,7 +73,7 @@ def test_there_are_examples():
         load_signal_map,
         load_data_set,
         load_experiment,
-        SimulationOrder.of,
+        SimulationOrder.from_scenario,
         load_plan,
     }
 
@@ -180,7 +180,7 @@ def test_page_of_twins_names_every_key_and_its_default(title):
     spec = TWIN_TABLES[title]()
     assert [name for name, _ in rows] == [entry.name for entry in dataclasses.fields(spec)]
     for name, text in rows:
-        plain = TWIN_SETTINGS.plain(getattr(spec, name), name)
+        plain = TWIN_SETTINGS.to_dict(getattr(spec, name), name)
         assert tomllib.loads(f"value = {text}")["value"] == plain, name
 
 

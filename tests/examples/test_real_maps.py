@@ -76,7 +76,7 @@ def test_sets_share_one_preset():
 def test_an_unset_variable_is_named(monkeypatch):
     monkeypatch.delenv("EDP_SHARED_DATA", raising=False)
     with pytest.raises(ConfigError, match=r"EDP_SHARED_DATA.*is not set"):
-        DataSource.of(REAL / "faster.toml").read()
+        DataSource.from_path(REAL / "faster.toml").read()
 
 
 @pytest.mark.parametrize("name", ["auto_preset", "transfer_real", "twin_leagues", "twin_recordings"])
@@ -151,7 +151,7 @@ def test_real_recordings_train_through_their_maps(tmp_path, monkeypatch):
     text = "uEst,uVal,yEst,yVal\n" + "\n".join(",".join(f"{v:.6g}" for v in row) for row in table)
     (tmp_path / "cascaded_tanks/dataBenchmark.csv").write_text(text)
     monkeypatch.setenv("EDP_SHARED_DATA", str(tmp_path))
-    data = DataSource.of(REAL / "tanks.toml")
+    data = DataSource.from_path(REAL / "tanks.toml")
     changes = ["training.epochs=1", "training.updates=2"]
     train(data, load_experiment(REAL / "tanks_freerun_settings.toml", "small", changes), tmp_path / "free")
     assert np.isfinite(rmse(tmp_path / "free", "network", 0))

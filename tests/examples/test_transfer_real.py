@@ -54,7 +54,7 @@ def test_a_network_of_the_first_part_is_trained_on_with_the_second(bench, tmp_pa
     assert set(found["methods"]) == {bench.OURS, *bench.RIVALS}
     # The two parts are of one log and share no row.
     parts = [read_recording(next((tmp_path / name).glob("*.parquet"))) for name in ("source", "target")]
-    whole = DataSource.of(bench.EXAMPLES / regimes.data).read()
+    whole = DataSource.from_path(bench.EXAMPLES / regimes.data).read()
     assert [part.samples for part in parts] == [recording.samples for recording in whole]
     for part, recording in zip(parts, whole, strict=True):
         np.testing.assert_allclose(part.values, recording.values, rtol=1e-6)

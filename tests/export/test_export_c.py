@@ -172,7 +172,7 @@ def test_what_cannot_be_written_is_refused_by_name(bundle_of, tmp_path):
 
     graph = Graph(1, (Strange(name="odd.one", inputs=("input",)),), {"prediction": "odd.one"})
     with pytest.raises(ExportError, match=r"layer 'odd\.one' is a Strange, .* these have: Gather"):
-        Calls(graph, plan(graph)).of(graph.layers[0])
+        Calls(graph, plan(graph)).translate(graph.layers[0])
     for name in ("Arm", "2arm", "for", "edp_arm", "a-b", "", "a" * 40):
         with pytest.raises(ExportError, match="--name"):
             CTarget().write(bundle_of("lstm"), name, tmp_path)

@@ -141,4 +141,4 @@ def test_what_has_no_tangent_is_refused(bundle_of, tmp_path):
 
     graph = Graph(1, (Strange(name="odd.one", inputs=("input",)),), {"prediction": "odd.one"})
     with pytest.raises(ExportError, match=r"layer 'odd\.one' is a Strange, .* no tangent .* these have: Gather"):
-        Tangents(graph, plan(graph), plan(graph)).of(graph.layers[0])
+        Tangents(graph, plan(graph), plan(graph)).translate(graph.layers[0])

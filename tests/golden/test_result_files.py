@@ -39,7 +39,7 @@ TWIN = (
 def write_logs(folder):
     for seed in range(6):
         write_recording(sample_actuators(seed=seed), folder / f"log_{seed}.parquet")
-    return DataSource.of(folder)
+    return DataSource.from_path(folder)
 
 
 def write_runs(folder):

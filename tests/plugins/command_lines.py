@@ -125,8 +125,8 @@ def world(top: Path) -> None:
     """Lay out good and bad places below a folder: everything that an argument or option of a path may name."""
     for number in range(4):
         short_log(top / "logs" / f"log{number}.csv", number)
-    DataSource.of(top / "logs").store(top / "store")
-    train(DataSource.of(top / "logs"), load_experiment(preset="quick", overrides=SMALL), top / "run")
+    DataSource.from_path(top / "logs").store(top / "store")
+    train(DataSource.from_path(top / "logs"), load_experiment(preset="quick", overrides=SMALL), top / "run")
     evaluate(top / "run", baselines=["persistence"])
     add_to_registry(top / "registry", top / "run", "first")
     (top / "empty").mkdir()

@@ -201,7 +201,7 @@ def test_options_out_of_range_are_refused(options):
 
 def test_plain_values_and_arrays_give_the_same_adaptation():
     held = law((2, 5))
-    again = Adaptation.from_plain(held.to_plain(), held.arrays())
+    again = Adaptation.from_dict(held.to_dict(), held.arrays())
     assert again.digest == held.digest
     assert replace(held, rate_hz=50.0).digest != held.digest
 

@@ -20,7 +20,7 @@ from edp.networks.heads import HEADS
 from edp.networks.initial import INITIAL_STATES
 from edp.networks.outputs import OUTPUTS
 from edp.networks.physics import PHYSICS
-from edp.networks.plain import model_from_plain, model_to_plain
+from edp.networks.plain import model_from_dict, model_to_dict
 from edp.networks.predictor import ModelSpec, build_model
 
 FEATURES = FeatureSet("three", ("CylVels_1", "CylVels_2", "lever"))
@@ -78,7 +78,7 @@ def check(parts, recurrence, task):
         refusals.append(str(error))
         return
     built.append(spec)
-    assert model_from_plain(model_to_plain(spec)) == spec
+    assert model_from_dict(model_to_dict(spec)) == spec
     x = torch.randn(1, 4, len(task.inputs))
     with torch.no_grad():
         found, _ = predictor.predict(x, predictor.initial_state(1, x))

@@ -27,7 +27,7 @@ def store(tmp_path_factory):
     for name in ("a", "b"):
         values = np.random.default_rng(0).normal(size=(50, 2)).astype(np.float32)
         write_recording(Recording(name, channels, values, 10.0), folder / "logs" / f"{name}.parquet")
-    assert not DataSource.of(folder / "logs").store(folder / "store").refused
+    assert not DataSource.from_path(folder / "logs").store(folder / "store").refused
     return folder / "store"
 
 

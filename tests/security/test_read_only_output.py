@@ -54,4 +54,4 @@ def test_a_missing_run_is_not_made(tmp_path):
 def test_a_screening_that_cannot_be_written_reads_no_log(tmp_path, monkeypatch):
     monkeypatch.setattr(edp.storage.writing, "_temporary", full)
     with pytest.raises(StorageError, match="Read-only file system"):
-        select_features(DataSource.of(tmp_path / "no_logs"), tmp_path / "screen")
+        select_features(DataSource.from_path(tmp_path / "no_logs"), tmp_path / "screen")

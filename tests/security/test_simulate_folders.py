@@ -112,7 +112,7 @@ def test_a_hostile_manifest_is_one_message(tmp_path, content):
 )
 def test_numbers_beyond_all_use_are_one_message(values):
     with pytest.raises(ConfigError, match=next(iter(values))):
-        SimulationOrder.of(**values)
+        SimulationOrder.from_scenario(**values)
 
 
 @pytest.mark.parametrize(

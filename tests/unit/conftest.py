@@ -109,4 +109,4 @@ def write_sessions(folder: Path, count: int) -> DataSource:
         channels = (Channel("lever", Kind.GENERIC), Channel("speed", Kind.VELOCITY))
         values = np.column_stack([lever, speed]).astype(np.float32)
         write_recording(Recording(f"s{number}", channels, values, 100.0), folder / f"s{number}.parquet")
-    return DataSource.of(folder)
+    return DataSource.from_path(folder)

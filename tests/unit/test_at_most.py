@@ -35,13 +35,13 @@ def store(tmp_path_factory):
             Recording(f"run{number}", CHANNELS, values.astype(np.float32), HZ, source="test"),
             folder / "logs" / f"run{number}.parquet",
         )
-    DataSource.of(folder / "logs").store(folder / "store")
+    DataSource.from_path(folder / "logs").store(folder / "store")
     return folder / "store"
 
 
 @pytest.fixture(scope="module")
 def run(store):
-    train(DataSource.of(store), load_experiment(None, "quick", list(HALVED)), store.parent / "run")
+    train(DataSource.from_path(store), load_experiment(None, "quick", list(HALVED)), store.parent / "run")
     return store.parent / "run"
 
 
@@ -57,15 +57,15 @@ def test_an_inspection_says_that_it_looked_at_a_part_of_the_data(store):
     source = DataSource(store, at_most_h=0.2)
     ours = source.inspect()
     (note,) = [finding for finding in ours.findings if "--at-most" in finding.advice]
-    stretches = draw_recordings(DataSource.of(store).read(), 0.2)
+    stretches = draw_recordings(DataSource.from_path(store).read(), 0.2)
     assert note.what.startswith(f"looked at 0.2 of 0.6278 h: {len(stretches)} evenly spread")
     assert not DataSource(store, at_most_h=5.0).inspect().findings
 
 
 def test_what_was_drawn_is_in_the_facts_that_read_the_same_data_again(store):
     source = DataSource(store, at_most_h=0.2)
-    assert DataSource.from_plain(source.to_plain()) == DataSource(store.resolve(), at_most_h=0.2)
-    assert "at_most_h" not in DataSource.of(store).to_plain()
+    assert DataSource.from_dict(source.to_dict()) == DataSource(store.resolve(), at_most_h=0.2)
+    assert "at_most_h" not in DataSource.from_path(store).to_dict()
 
 
 @pytest.mark.parametrize("hours", [0.0, -1.0, float("nan"), float("inf")])
@@ -94,7 +94,7 @@ def test_an_evaluation_judges_on_stretches_and_says_so(run):
 
 def test_other_recordings_are_drawn_before_they_are_read(run, store):
     bundle, _, _, data = read_trained_run(run)
-    others = DataSource.of(store).read()
+    others = DataSource.from_path(store).read()
     judged, drawn = judged_data(bundle, data, others, 0.2)
     assert drawn is not None
     assert drawn.stretches == len(judged.test)

@@ -45,7 +45,7 @@ def write(folder, y=None, ticks=900, seed=0, u=None):
     (folder / "map.toml").write_text(
         'time = "time"\n[channels.u]\ncolumn = "u"\nkind = "generic"\n[channels.y]\ncolumn = "y"\nkind = "generic"\n'
     )
-    return DataSource.of(folder / "log.csv", folder / "map.toml")
+    return DataSource.from_path(folder / "log.csv", folder / "map.toml")
 
 
 @pytest.fixture(scope="module")
@@ -173,7 +173,7 @@ def test_recordings_are_divided_by_time_where_whole_ones_are_no_parts(tmp_path, 
         write(tmp_path / "logs", ticks=ticks, seed=number)
         (tmp_path / "logs" / "log.csv").rename(tmp_path / "logs" / f"{number}.csv")
     (tmp_path / "logs" / "map.toml").rename(tmp_path / "map.toml")
-    source = DataSource.of(tmp_path / "logs", tmp_path / "map.toml")
+    source = DataSource.from_path(tmp_path / "logs", tmp_path / "map.toml")
     settings = [*SET[:3], "auto.candidates=['linear']", "judge.baselines=[]"]
     train_auto(source, load_auto(None, settings), tmp_path / "run")
     _, experiment, _, data = read_trained_run(tmp_path / "run")

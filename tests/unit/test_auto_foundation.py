@@ -36,7 +36,7 @@ def logs(folder: Path, gain: float, ticks: int = 3000, names: tuple[str, str] = 
     np.savetxt(folder / "log.csv", table, "%.6f", ",", header=",".join(("time", *names)), comments="")
     entries = [f'[channels.{name}]\ncolumn = "{name}"\nkind = "generic"' for name in names]
     (folder / "map.toml").write_text('time = "time"\n' + "\n".join(entries))
-    return DataSource.of(folder / "log.csv", folder / "map.toml")
+    return DataSource.from_path(folder / "log.csv", folder / "map.toml")
 
 
 @pytest.fixture(scope="module")

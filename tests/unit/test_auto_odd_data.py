@@ -264,7 +264,7 @@ def write(folder: Path, oddity: Oddity) -> DataSource:
     (folder / "map.toml").write_text("\n".join(entries) + "\n")
     mended = {"gaps": "cut"} if oddity.lost else {"nan": "hold"} if oddity.missing else None
     repair = None if mended is None else build(Repair, mended, "test")
-    return DataSource.of(folder / "logs", folder / "map.toml", repair)
+    return DataSource.from_path(folder / "logs", folder / "map.toml", repair)
 
 
 def check(source: DataSource, settings: Sequence[str], factor: float, folder: Path, path: Path | None = None) -> None:
@@ -333,4 +333,6 @@ def test_it_keeps_up_on_measured_recordings(name, settings, factor, tmp_path, mo
     if not SHARED.is_dir():
         pytest.skip("no folder of measured recordings; EDP_SHARED_DATA names it")
     monkeypatch.setenv("EDP_SHARED_DATA", str(SHARED))
-    check(DataSource.of(REAL / f"{name}.toml"), settings, factor, tmp_path / "run", REAL / f"{name}_settings.toml")
+    check(
+        DataSource.from_path(REAL / f"{name}.toml"), settings, factor, tmp_path / "run", REAL / f"{name}_settings.toml"
+    )

@@ -38,7 +38,7 @@ def prepared(kinds=(Kind.VELOCITY,), channels=None, repeats=20, targets=("v",)) 
 
 
 def found_of(data: Prepared, ticks: int):
-    ((target, found),) = Situations(data).of(data.test[0], 1, ticks)
+    ((target, found),) = Situations(data).find_masks(data.test[0], 1, ticks)
     assert target == 0
     return found
 

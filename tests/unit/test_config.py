@@ -20,7 +20,7 @@ from edp.errors import ConfigError, DataError
 from edp.logs.repair import Repair
 from edp.logs.source import DataSetSettings, load_data_set, load_signal_map
 from edp.networks.heads import GluHead, MlpHead
-from edp.networks.plain import model_from_plain, model_to_plain
+from edp.networks.plain import model_from_dict, model_to_dict
 from edp.networks.predictor import ModelSpec
 from edp.signals import Kind
 
@@ -90,9 +90,9 @@ def test_a_head_without_a_kind_is_the_usual_one():
     assert load_experiment(overrides=["model.head=glu"]).model.head == GluHead()
     with pytest.raises(ConfigError, match=r"model.head.kind: unknown head 'glue'.*did you mean 'glu'"):
         load_experiment(overrides=["model.head=glue"])
-    plain = model_to_plain(ModelSpec(head=old))
+    plain = model_to_dict(ModelSpec(head=old))
     del plain["head"]["kind"]  # as bundles were written before heads had kinds
-    assert model_from_plain(plain).head == old
+    assert model_from_dict(plain).head == old
 
 
 def test_files_lie_over_the_preset_and_overrides_over_the_file(tmp_path):

@@ -123,7 +123,7 @@ def test_a_bundle_without_its_run_is_refused(run, tmp_path):
 
 
 def test_other_recordings_can_be_learned_on(run, lever_sessions, tmp_path):
-    source = DataSource.of(lever_sessions.path)
+    source = DataSource.from_path(lever_sessions.path)
     bundle = distil(
         run, DistilRequest(spec=DistilSpec(units=4), changes=("training.epochs=1",)), tmp_path / "other", source
     )

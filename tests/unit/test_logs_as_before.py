@@ -26,7 +26,7 @@ def log(path, names="t,v boom,other"):
 
 @pytest.fixture
 def reader(tmp_path):
-    return DataSource(log(tmp_path / "old" / "a.csv").parent, MAP, REPAIR).to_plain()
+    return DataSource(log(tmp_path / "old" / "a.csv").parent, MAP, REPAIR).to_dict()
 
 
 def test_a_log_with_the_columns_of_the_map_has_it_with_its_repairs(reader, tmp_path):
@@ -63,7 +63,7 @@ def test_what_cannot_be_looked_at_is_told_when_it_is_read(reader, tmp_path):
     assert read_as_before(DataSource(log(tmp_path / "new.csv")), gone).signal_map is None
     # A map of constants alone knows no log.
     still = SignalMap((ChannelMap("a", "", "1", Kind.GENERIC, 1.0),), others=True)
-    constants = DataSource(tmp_path / "old", still).to_plain()
+    constants = DataSource(tmp_path / "old", still).to_dict()
     assert read_as_before(DataSource(tmp_path / "new.csv"), constants).signal_map is None
 
 
@@ -78,7 +78,7 @@ def test_of_a_data_set_the_map_that_all_its_logs_have(tmp_path, maps):
         log(tmp_path / f"{i}.csv")
         entries.append(f'{{ path = "{i}.csv", map = "{name}" }}')
     (tmp_path / "data.toml").write_text(f"recordings = [{', '.join(entries)}]\n")
-    reader = DataSource(tmp_path / "data.toml").to_plain()
+    reader = DataSource(tmp_path / "data.toml").to_dict()
     source = read_as_before(DataSource(log(tmp_path / "new.csv")), reader)
     assert (source.signal_map is None) == (len(maps) > 1)
     assert os.fspath(source.path).endswith("new.csv")

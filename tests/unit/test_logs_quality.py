@@ -260,7 +260,7 @@ def test_data_set_tells_repeats_and_a_channel_in_two_units(tmp_path):
         if entry.name == "b":
             write_recording(replace(entry, values=values[500:9000].copy()), tmp_path / "again.csv")
     told = NotedProgress()
-    quality = DataSource.of(tmp_path).inspect(told)
+    quality = DataSource.from_path(tmp_path).inspect(told)
     assert told.stages == [("log", 4)]
     texts = [finding.what for finding in quality.findings]
     assert any("repeats 85 s of 'again'" in text or "repeats 85 s of 'b'" in text for text in texts)

@@ -56,7 +56,7 @@ def task_of(features=SCATTERED, targets=("d", "b"), derived=(), horizons=(1, 7))
 def logs(tmp_path):
     for number in range(6):
         write_recording(recording(f"run{number}", number, 450 + number), tmp_path / "logs" / f"run{number}.parquet")
-    DataSource.of(tmp_path / "logs").store(tmp_path / "store")
+    DataSource.from_path(tmp_path / "logs").store(tmp_path / "store")
     return tmp_path / "logs"
 
 
@@ -154,7 +154,7 @@ def test_a_missing_value_in_a_store_is_refused_by_channel_and_row(tmp_path):
     one = recording("run0", 0)
     one.values[123, 4] = np.nan
     write_recording(one, tmp_path / "run0.parquet")
-    DataSource.of(tmp_path / "run0.parquet").store(tmp_path / "store")
+    DataSource.from_path(tmp_path / "run0.parquet").store(tmp_path / "store")
     # The build refuses it, as every command refuses the log.
     with pytest.raises(DataError, match=r"holds no recording; 1 log\(s\) were refused"):
         read_store(tmp_path / "store")
@@ -378,10 +378,10 @@ def test_a_disk_that_fills_while_a_store_is_built_loses_nothing(logs, tmp_path, 
 
     monkeypatch.setattr(building, "_store_log", full)
     with pytest.raises(StorageError, match=r"No space left on device; free space"):
-        DataSource.of(logs).store(tmp_path / "new")
+        DataSource.from_path(logs).store(tmp_path / "new")
     monkeypatch.setattr(building, "_store_log", real)
     reached = NotedProgress()
-    DataSource.of(logs).store(tmp_path / "new", progress=reached)
+    DataSource.from_path(logs).store(tmp_path / "new", progress=reached)
     assert reached.steps[0] == 3
     assert [one.digest for one in read_store(tmp_path / "new")] == [one.digest for one in read_data_set(logs)]
 

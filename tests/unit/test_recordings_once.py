@@ -32,7 +32,7 @@ def read(monkeypatch):
 
 
 def test_a_log_is_read_once_and_a_changed_one_again(read, tmp_path):
-    source = DataSource.of(written(tmp_path / "a.parquet", 1.0))
+    source = DataSource.from_path(written(tmp_path / "a.parquet", 1.0))
     first = source.read()[0]
     first.values[:] = 7.0
     assert (source.read()[0].values == 0.0).all()
@@ -40,13 +40,13 @@ def test_a_log_is_read_once_and_a_changed_one_again(read, tmp_path):
     written(tmp_path / "a.parquet", 2.0)
     source.read()
     assert len(read) == 2
-    DataSource.of(written(tmp_path / "b.parquet", 2.0)).read()
+    DataSource.from_path(written(tmp_path / "b.parquet", 2.0)).read()
     assert len(read) == 3
 
 
 def test_tests_about_reading_read_each_time(read, tmp_path, monkeypatch):
     monkeypatch.setattr(recordings, "_on", [False])
-    source = DataSource.of(written(tmp_path / "a.parquet", 1.0))
+    source = DataSource.from_path(written(tmp_path / "a.parquet", 1.0))
     source.read()
     source.read()
     assert len(read) == 2

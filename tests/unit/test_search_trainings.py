@@ -35,7 +35,7 @@ def source(lever_sessions):
 @pytest.fixture(scope="module")
 def order(source):
     settings = Arm.from_experiment(load_experiment(None, "quick", CHANGES)).tables
-    return TrainingRequest(settings, source.to_plain(), ("s0", "s1", "s2"), ("s3", "s4"), seed=1, updates=12)
+    return TrainingRequest(settings, source.to_dict(), ("s0", "s1", "s2"), ("s3", "s4"), seed=1, updates=12)
 
 
 @pytest.fixture(scope="module")

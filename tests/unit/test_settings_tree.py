@@ -57,4 +57,4 @@ def test_plain_values_come_back_as_they_were_built():
     table = {"on": True, "rates": [1, 2.5], "pair": [0, 2], "rows": [[1, 2]], "shares": {"a": 1}, "inner": {"count": 3}}
     built = TREE.build(Outer, table, "'a.toml'")
     assert built == Outer(True, (1.0, 2.5), (0.0, 2.0), ((1.0, 2.0),), {"a": 1.0}, Inner(3))
-    assert TREE.build(Outer, TREE.plain(built), "'a.toml'") == built
+    assert TREE.build(Outer, TREE.to_dict(built), "'a.toml'") == built

@@ -11,7 +11,7 @@ from edp.jobs import IN_PROCESS
 from edp.sim import DEFAULT_MIX, DataSetSpec, Scenario, plan_data_set, read_scenario_file, simulate_many
 from edp.sim.data_set import SimulationOrder, bytes_needed, simulate_data_set
 from edp.sim.predictability import LimitSpec
-from edp.sim.scenario import plain
+from edp.sim.scenario import scenario_to_dict
 from edp.sim.scenario_file import limit_settings
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples" / "scenarios").glob("*.toml"))
@@ -26,7 +26,7 @@ def written(tmp_path, text):
 @pytest.mark.long
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_examples_are_valid(path):
-    order = SimulationOrder.of(path)
+    order = SimulationOrder.from_scenario(path)
     plan = order.scenarios()
     assert len(plan) == order.recordings
     assert {s.excitation for s in plan} == {name for name, share in order.mix.items() if share > 0}
@@ -34,7 +34,7 @@ def test_examples_are_valid(path):
 
 def test_the_default_example_is_the_default():
     default = next(path for path in EXAMPLES if path.stem == "m22")
-    assert SimulationOrder.of(default) == SimulationOrder()
+    assert SimulationOrder.from_scenario(default) == SimulationOrder()
     assert SimulationOrder().mix == DEFAULT_MIX
 
 
@@ -64,7 +64,7 @@ def test_every_key_arrives_and_options_go_first(tmp_path):
         layout = "simulink"
         """,
     )
-    order = SimulationOrder.of(path, minutes=6.0, seed=None)
+    order = SimulationOrder.from_scenario(path, minutes=6.0, seed=None)
     assert (order.minutes, order.seed, order.suffix, order.layout) == (6.0, 3, ".mat", "simulink")
     plan = order.scenarios()
     assert [s.excitation for s in plan].count("dig") == 6
@@ -73,7 +73,7 @@ def test_every_key_arrives_and_options_go_first(tmp_path):
     first = plan[0]
     assert (first.rate_hz, first.step_s, first.start_strokes, first.duration_s) == (200.0, 0.0005, (0.4, 0.6), 45.0)
     assert first.load().sensors.can_loss == 0.01
-    assert Scenario(**plain(first)) == first
+    assert Scenario(**scenario_to_dict(first)) == first
     assert {s.name for s in plan if s.material} <= {f"c14_{i:03d}_dig_clay" for i in range(8)}
 
 
@@ -119,7 +119,7 @@ def test_every_key_arrives_and_options_go_first(tmp_path):
 )
 def test_bad_files_are_refused_with_file_key_value_and_bound(tmp_path, text, message):
     with pytest.raises(ConfigError, match=message) as caught:
-        SimulationOrder.of(written(tmp_path, text))
+        SimulationOrder.from_scenario(written(tmp_path, text))
     assert "set.toml" in str(caught.value)
 
 
@@ -142,19 +142,19 @@ truth = "apart"
 
 def test_another_format_leaves_out_the_layout_of_the_file_and_says_so(tmp_path):
     path, notes = written(tmp_path, SOIL), []
-    order = SimulationOrder.of(path, notes.append, suffix=".parquet")
+    order = SimulationOrder.from_scenario(path, notes.append, suffix=".parquet")
     assert (order.suffix, order.layout, order.truth) == (".parquet", "", "apart")
     assert len(notes) == 1
     assert "layout 'speedgoat' is one of MAT files, and format parquet was asked for" in notes[0]
-    assert SimulationOrder.of(path, notes.append, suffix=".mat").layout == "speedgoat"
+    assert SimulationOrder.from_scenario(path, notes.append, suffix=".mat").layout == "speedgoat"
     assert len(notes) == 1
     with pytest.raises(ConfigError, match=r"layout 'simulink' is one of MAT files, not of '.parquet'; ask for mat"):
-        SimulationOrder.of(path, suffix=".parquet", layout="simulink")
+        SimulationOrder.from_scenario(path, suffix=".parquet", layout="simulink")
 
 
 @pytest.mark.processes
 def test_a_family_takes_the_place_of_the_file_s_machine_and_the_rest_stays(tmp_path):
-    order = SimulationOrder.of(written(tmp_path, SOIL), family=2, masses=(12.0, 20.0))
+    order = SimulationOrder.from_scenario(written(tmp_path, SOIL), family=2, masses=(12.0, 20.0))
     plan = order.scenarios()
     assert {s.machine for s in plan} == {"family-3-0-12-20", "family-3-1-12-20"}
     assert {s.excitation for s in plan} == {"dig", "grading"}
@@ -168,20 +168,20 @@ def test_a_family_takes_the_place_of_the_file_s_machine_and_the_rest_stays(tmp_p
 
 def test_a_machine_takes_the_place_of_the_file_s_family(tmp_path):
     path, notes = written(tmp_path, "family = 3\nmasses = [10, 20]"), []
-    assert SimulationOrder.of(path).masses == (10.0, 20.0)
-    order = SimulationOrder.of(path, notes.append, machine="C14")
+    assert SimulationOrder.from_scenario(path).masses == (10.0, 20.0)
+    order = SimulationOrder.from_scenario(path, notes.append, machine="C14")
     assert (order.family, order.machine) == (0, "C14")
     assert "family of 3 machines, and machine C14 was asked for" in notes[0]
-    assert SimulationOrder.of(path, family=0).scenarios()[0].machine == "M22"
+    assert SimulationOrder.from_scenario(path, family=0).scenarios()[0].machine == "M22"
     with pytest.raises(ConfigError, match="machine = C14 and family = 2: a family takes the machine's place"):
-        SimulationOrder.of(machine="C14", family=2)
+        SimulationOrder.from_scenario(machine="C14", family=2)
 
 
 def test_soils_of_the_command_line_take_the_place_of_the_file_s(tmp_path):
     own = tmp_path / "peat.toml"
     known = resources.files("edp.sim").joinpath("materials").joinpath("clay.toml").read_text()
     own.write_text(known.replace('name = "clay"', 'name = "peat"'))
-    order = SimulationOrder.of(written(tmp_path, SOIL), materials={str(own): 1.0, "air": 1.0})
+    order = SimulationOrder.from_scenario(written(tmp_path, SOIL), materials={str(own): 1.0, "air": 1.0})
     assert {s.material for s in order.scenarios()} == {str(own), ""}
     plan = plan_data_set("M22", 1.0, 2, seed=0, mix={"dig": 1}, materials={"gravel": 1})
     assert {s.material for s in plan} == {"gravel"}
@@ -193,7 +193,7 @@ def test_an_absent_file_is_refused(tmp_path):
 
 
 def test_a_data_set_longer_than_the_disk_is_refused_before_the_first_step(tmp_path, monkeypatch):
-    order = SimulationOrder.of(minutes=1e6, recordings=50)
+    order = SimulationOrder.from_scenario(minutes=1e6, recordings=50)
     monkeypatch.setattr(edp.sim.data_set.shutil, "disk_usage", lambda folder: type("Usage", (), {"free": 10**9}))
     with pytest.raises(StorageError, match=r"minutes: 1e\+06 min as .parquet need about .* GB free; simulate at most"):
         simulate_data_set(tmp_path / "set", order)
@@ -201,7 +201,7 @@ def test_a_data_set_longer_than_the_disk_is_refused_before_the_first_step(tmp_pa
 
 
 def test_room_is_estimated_from_above(tmp_path):
-    order = SimulationOrder.of(minutes=0.5, recordings=1, suffix=".csv")
+    order = SimulationOrder.from_scenario(minutes=0.5, recordings=1, suffix=".csv")
     (path,) = simulate_data_set(tmp_path, order, workers=IN_PROCESS)
     assert 0.5 < path.stat().st_size / bytes_needed(order.scenarios(), ".csv") < 1.0
 
@@ -222,11 +222,13 @@ def test_the_limit_and_single_keys_can_be_changed(tmp_path):
     path = written(tmp_path, 'machine = "C14"\nrecordings = 8\n[limit]\nmoments = 60\nhorizons = [1, 10]\n')
     assert limit_settings(path, ["limit.branches=8"]) == LimitSpec(horizons=(1, 10), moments=60, branches=8)
     assert limit_settings(None, ()) == LimitSpec()
-    order = SimulationOrder.of(path, None, ["family=3", "masses=[12,20]", "files.layout=speedgoat", "files.format=mat"])
+    order = SimulationOrder.from_scenario(
+        path, None, ["family=3", "masses=[12,20]", "files.layout=speedgoat", "files.format=mat"]
+    )
     assert (order.family, order.masses, order.layout, order.suffix) == (3, (12.0, 20.0), "speedgoat", ".mat")
     # What the command line asks for by an option goes before single keys.
-    assert SimulationOrder.of(path, None, ["minutes=7", "recordings=2"], minutes=5.0).minutes == 5.0
+    assert SimulationOrder.from_scenario(path, None, ["minutes=7", "recordings=2"], minutes=5.0).minutes == 5.0
     with pytest.raises(ConfigError, match="unknown key 'recording'; did you mean 'recordings'"):
-        SimulationOrder.of(path, None, ["recording=3"])
+        SimulationOrder.from_scenario(path, None, ["recording=3"])
     with pytest.raises(ConfigError, match="branches = 5 must be even"):
         limit_settings(path, ["limit.branches=5"])

@@ -27,7 +27,7 @@ def test_running_in_pieces_and_going_on_from_a_snapshot_give_the_same_bits(famil
     pieces.restore(moment)
     np.testing.assert_array_equal(pieces.run(867), rest)
 
-    again = Simulation.of(Snapshot.load(moment.save(tmp_path / "moment.npz")))
+    again = Simulation.from_snapshot(Snapshot.load(moment.save(tmp_path / "moment.npz")))
     again.run(867)
     assert again.recording().digest == whole.digest
     assert again.recording().meta == whole.meta

@@ -13,7 +13,7 @@ from edp.data.series import Series
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError
 from edp.evaluation.judge import JudgeSpec, baseline_task, judge
-from edp.networks.plain import task_from_plain, task_to_plain
+from edp.networks.plain import task_from_dict, task_to_dict
 from edp.networks.predictor import build_model
 from edp.networks.stream import Stream
 from edp.signals import Channel, Kind
@@ -116,10 +116,10 @@ def test_features_are_scaled_as_in_the_first_ticks(free, predictor):
 
 
 def test_a_task_survives_the_header_of_a_bundle():
-    assert task_from_plain(task_to_plain(TASK)) == TASK
-    plain = task_to_plain(TASK)
+    assert task_from_dict(task_to_dict(TASK)) == TASK
+    plain = task_to_dict(TASK)
     del plain["features"]["starting"], plain["features"]["starting_ticks"]  # of a bundle from before
-    assert task_from_plain(plain).features.starting == ()
+    assert task_from_dict(plain).features.starting == ()
 
 
 def test_baselines_do_not_see_the_start_and_it_is_not_scored(free, predictor):

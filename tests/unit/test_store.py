@@ -41,7 +41,7 @@ def logs(tmp_path):
 
 
 def build(logs, folder, **options):
-    return DataSource.of(logs).store(folder, **options)
+    return DataSource.from_path(logs).store(folder, **options)
 
 
 def assert_same(ours, theirs):
@@ -58,7 +58,7 @@ def test_a_store_gives_the_recordings_of_its_logs(logs, tmp_path):
     assert_same(read_store(tmp_path / "store"), read_data_set(logs))
     assert index == read_index(tmp_path / "store")
     assert index.hours() == pytest.approx(sum(one.duration_s for one in read_data_set(logs)) / 3600)
-    assert_same(DataSource.of(tmp_path / "store").read(), read_data_set(logs))
+    assert_same(DataSource.from_path(tmp_path / "store").read(), read_data_set(logs))
 
 
 def test_what_is_prepared_from_a_store_has_the_digest_of_its_logs(logs, tmp_path):
@@ -200,7 +200,7 @@ def test_a_build_that_was_stopped_goes_on(logs, tmp_path, monkeypatch, after):
         build(logs, tmp_path / "store", progress=NotedProgress(stop))
     assert is_store(tmp_path / "store")
     with pytest.raises(DataError, match=r"is half built: .* give the same `edp store build` again"):
-        DataSource.of(tmp_path / "store").read()
+        DataSource.from_path(tmp_path / "store").read()
     reached = NotedProgress()
     build(logs, tmp_path / "store", progress=reached)
     assert reached.steps[0] == after
@@ -214,12 +214,12 @@ def test_maps_and_repairs_are_those_of_the_build(tmp_path):
         'time = "t"\n[channels.P]\ncolumn = "x"\nunit = "bar"\nkind = "pressure"\n[channels.Y]\ncolumn = "y"\n'
         'kind = "generic"\n'
     )
-    source = DataSource.of(path, tmp_path / "map.toml", Repair(nan="hold"))
+    source = DataSource.from_path(path, tmp_path / "map.toml", Repair(nan="hold"))
     source.store(tmp_path / "store")
     assert_same(read_store(tmp_path / "store"), source.read())
     assert read_store(tmp_path / "store")[0].meta["repairs"]
     for given in (
-        DataSource.of(tmp_path / "store", tmp_path / "map.toml"),
+        DataSource.from_path(tmp_path / "store", tmp_path / "map.toml"),
         DataSource(tmp_path / "store", None, Repair()),
     ):
         with pytest.raises(ConfigError, match=r"came with the store .* give them to `edp store build`"):
@@ -231,7 +231,7 @@ def test_rows_names_and_machines_of_a_data_set_file_are_kept(logs, tmp_path):
         '[[recordings]]\npath = "logs/run0.parquet"\nrows = [10, 90]\nname = "first"\nmachine = "M7"\n'
         '[[recordings]]\npath = "logs/run0.parquet"\nrows = [100, 190]\nname = "second"\n'
     )
-    source = DataSource.of(tmp_path / "set.toml")
+    source = DataSource.from_path(tmp_path / "set.toml")
     source.store(tmp_path / "store")
     assert_same(read_store(tmp_path / "store"), source.read())
     assert read_store(tmp_path / "store")[0].meta["machine"] == "M7"
@@ -297,7 +297,7 @@ def test_a_copied_store_needs_nothing_of_where_it_was(logs, tmp_path):
 
 def test_a_store_can_be_inspected(logs, tmp_path):
     build(logs, tmp_path / "store")
-    quality = DataSource.of(tmp_path / "store").inspect()
+    quality = DataSource.from_path(tmp_path / "store").inspect()
     assert [report.name for report in quality.reports] == [f"run{i}" for i in range(5)]
     assert quality.reports[0].samples == 300
 
@@ -318,5 +318,5 @@ def test_a_store_is_read_from_python_and_screened(logs, tmp_path):
 
     build(logs, tmp_path / "store")
     assert_same(list(edp.read(tmp_path / "store")), read_data_set(logs))
-    source = DataSource.of(tmp_path / "store")
+    source = DataSource.from_path(tmp_path / "store")
     assert_same(_read(source, source.inspect())[0], read_data_set(logs))

@@ -77,49 +77,49 @@ def test_addresses_are_told_from_paths(path, address):
 
 
 def test_a_store_is_built_from_logs_in_a_bucket(server, top, tmp_path):
-    index = DataSource.of("s3://fleet/logs").store(tmp_path / "store")
+    index = DataSource.from_path("s3://fleet/logs").store(tmp_path / "store")
     assert_same(read_store(tmp_path / "store"), read_data_set(top / "fleet" / "logs"))
     assert [entry.log for entry in index.recordings] == [f"s3://fleet/logs/run{i}.parquet" for i in range(4)]
     assert index.refused == ()
     # Logs that are in the store are listed, and not read again.
     before = len(server.requests)
-    DataSource.of("s3://fleet/logs").store(tmp_path / "store")
+    DataSource.from_path("s3://fleet/logs").store(tmp_path / "store")
     assert not any(".parquet" in path for method, path, _ in server.requests[before:] if method == "GET")
 
 
 def test_a_store_in_a_bucket_is_copied_once_and_read(server, top, tmp_path):
-    DataSource.of(top / "fleet" / "logs").store(top / "fleet" / "stores" / "first")
-    source = DataSource.of("s3://fleet/stores/first")
+    DataSource.from_path(top / "fleet" / "logs").store(top / "fleet" / "stores" / "first")
+    source = DataSource.from_path("s3://fleet/stores/first")
     assert source.stored
     assert_same(source.read(), read_data_set(top / "fleet" / "logs"))
     assert all(one.on_disk for one in source.read())
     before = len(server.requests)
-    again = DataSource.from_plain(source.to_plain())
-    assert source.to_plain()["path"] == "s3://fleet/stores/first"
+    again = DataSource.from_dict(source.to_dict())
+    assert source.to_dict()["path"] == "s3://fleet/stores/first"
     assert_same(again.read(), read_data_set(top / "fleet" / "logs"))
     assert not any(".f32" in path for _, path, _ in server.requests[before:])
 
 
 def test_a_store_that_was_added_to_is_copied_anew(server, top):
     store = top / "fleet" / "store"
-    DataSource.of(top / "fleet" / "logs" / "run0.parquet").store(store)
-    assert len(DataSource.of("s3://fleet/store").read()) == 1
-    DataSource.of(top / "fleet" / "logs").store(store)
-    assert_same(DataSource.of("s3://fleet/store").read(), read_data_set(top / "fleet" / "logs"))
+    DataSource.from_path(top / "fleet" / "logs" / "run0.parquet").store(store)
+    assert len(DataSource.from_path("s3://fleet/store").read()) == 1
+    DataSource.from_path(top / "fleet" / "logs").store(store)
+    assert_same(DataSource.from_path("s3://fleet/store").read(), read_data_set(top / "fleet" / "logs"))
 
 
 def test_samples_that_are_not_what_the_index_says_are_refused_and_copied_again(server, top):
-    DataSource.of(top / "fleet" / "logs").store(top / "fleet" / "store")
+    DataSource.from_path(top / "fleet" / "logs").store(top / "fleet" / "store")
     server.mode = "cut"
     with pytest.raises(DataError, match="have other samples than their hash"):
-        DataSource.of("s3://fleet/store").read()
+        DataSource.from_path("s3://fleet/store").read()
     server.mode = "ok"
-    assert_same(DataSource.of("s3://fleet/store").read(), read_data_set(top / "fleet" / "logs"))
+    assert_same(DataSource.from_path("s3://fleet/store").read(), read_data_set(top / "fleet" / "logs"))
 
 
 def test_a_copy_that_was_stopped_goes_on(server, top, monkeypatch):
     monkeypatch.setattr("edp.logs.store.building.BATCH_LOG_BYTES", 1)
-    DataSource.of(top / "fleet" / "logs").store(top / "fleet" / "store")
+    DataSource.from_path(top / "fleet" / "logs").store(top / "fleet" / "store")
     real, copies = BucketReader.copy, []
 
     def stop(self, file, target):
@@ -130,10 +130,10 @@ def test_a_copy_that_was_stopped_goes_on(server, top, monkeypatch):
 
     monkeypatch.setattr(BucketReader, "copy", stop)
     with pytest.raises(KeyboardInterrupt):
-        DataSource.of("s3://fleet/store").read()
+        DataSource.from_path("s3://fleet/store").read()
     monkeypatch.setattr(BucketReader, "copy", real)
     before = len(server.requests)
-    assert_same(DataSource.of("s3://fleet/store").read(), read_data_set(top / "fleet" / "logs"))
+    assert_same(DataSource.from_path("s3://fleet/store").read(), read_data_set(top / "fleet" / "logs"))
     fetched = {path for method, path, _ in server.requests[before:] if method == "GET" and ".f32" in path}
     assert len(fetched) == 2
 
@@ -145,17 +145,17 @@ def test_a_bucket_that_refuses_a_missing_key_and_no_logs_are_said_in_words(serve
         ("s3://fleet/logs/notes.pdf", r"1 object\(s\), none with the ending of a log"),
     ):
         with pytest.raises((DataError, StorageError), match=message):
-            DataSource.of(address).store(tmp_path / "store")
+            DataSource.from_path(address).store(tmp_path / "store")
     server.mode = "refuse"
     with pytest.raises(StorageError, match=r"the bucket refuses to be read .* set AWS_ACCESS_KEY_ID"):
-        DataSource.of("s3://fleet/logs").store(tmp_path / "store")
+        DataSource.from_path("s3://fleet/logs").store(tmp_path / "store")
 
 
 def test_an_endpoint_that_hangs_is_left_after_a_bounded_time(server, tmp_path, monkeypatch):
     monkeypatch.setattr(buckets, "STEP_S", 0.5)
     server.mode, server.hang_s = "hang", 2.0
     with pytest.raises(StorageError, match=r"did not answer within 0.5 s"):
-        DataSource.of("s3://fleet/logs").store(tmp_path / "store")
+        DataSource.from_path("s3://fleet/logs").store(tmp_path / "store")
     assert not (tmp_path / "store" / "store.json").exists()
 
 
@@ -168,27 +168,27 @@ def test_a_log_that_cannot_be_copied_is_refused_and_tried_again(server, top, tmp
         return real(self, file, target)
 
     monkeypatch.setattr(BucketReader, "copy", fail)
-    index = DataSource.of("s3://fleet/logs").store(tmp_path / "store")
+    index = DataSource.from_path("s3://fleet/logs").store(tmp_path / "store")
     assert [one.log for one in index.refused] == ["s3://fleet/logs/run2.parquet"]
     monkeypatch.setattr(BucketReader, "copy", real)
-    assert DataSource.of("s3://fleet/logs").store(tmp_path / "store").refused == ()
+    assert DataSource.from_path("s3://fleet/logs").store(tmp_path / "store").refused == ()
     assert_same(read_store(tmp_path / "store"), read_data_set(top / "fleet" / "logs"))
 
 
 def test_a_disk_without_room_is_refused_before_the_copy(server, top, monkeypatch):
-    DataSource.of(top / "fleet" / "logs").store(top / "fleet" / "store")
+    DataSource.from_path(top / "fleet" / "logs").store(top / "fleet" / "store")
     usage = shutil.disk_usage("/")
     monkeypatch.setattr(buckets.shutil, "disk_usage", lambda folder: usage._replace(free=10))
     with pytest.raises(StorageError, match=r"choose another disk \(EDP_CACHE"):
-        DataSource.of("s3://fleet/store").read()
+        DataSource.from_path("s3://fleet/store").read()
     assert not list(cache_folder().rglob("*.f32"))
 
 
 def test_what_a_bucket_is_not_for_is_refused(server, top, tmp_path):
     with pytest.raises(ConfigError, match=r"holds logs and no store; read them once with `edp store build s3://fleet"):
-        DataSource.of("s3://fleet/logs").read()
+        DataSource.from_path("s3://fleet/logs").read()
     with pytest.raises(ConfigError, match=r"a store is built on this machine"):
-        DataSource.of(top / "fleet" / "logs").store("s3://fleet/store")
+        DataSource.from_path(top / "fleet" / "logs").store("s3://fleet/store")
     with pytest.raises(ConfigError, match=r"holds credentials or options"):
         BucketReader("s3://key:secret@fleet/logs")
     with pytest.raises(ConfigError, match=r"set AZURE_STORAGE_ACCOUNT"):
@@ -199,7 +199,7 @@ def test_a_data_set_file_names_logs_in_buckets(server, top, tmp_path):
     (tmp_path / "set.toml").write_text(
         '[[recordings]]\npath = "s3://fleet/logs/run1.parquet"\nrows = [10, 90]\nname = "first"\nmachine = "M7"\n'
     )
-    DataSource.of(tmp_path / "set.toml").store(tmp_path / "store")
+    DataSource.from_path(tmp_path / "set.toml").store(tmp_path / "store")
     (one,) = read_store(tmp_path / "store")
     np.testing.assert_array_equal(one.values, read_data_set(top / "fleet" / "logs")[1].values[10:90])
     assert (one.name, one.meta["machine"]) == ("first", "M7")
@@ -218,7 +218,7 @@ def test_another_server_of_the_protocol_gives_the_same(top, tmp_path, server, mo
             for path in sorted((top / "fleet").rglob("*.parquet")):
                 _put(f"{endpoint}/fleet/{path.relative_to(top / 'fleet').as_posix()}", path.read_bytes())
             monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
-            DataSource.of("s3://fleet/logs").store(tmp_path / "store")
+            DataSource.from_path("s3://fleet/logs").store(tmp_path / "store")
             assert_same(read_store(tmp_path / "store"), read_data_set(top / "fleet" / "logs"))
         finally:
             process.kill()

@@ -65,29 +65,29 @@ def test_a_store_is_built_from_logs_and_read_from_a_bucket(server, top, tmp_path
     monkeypatch.setattr(buckets, "PIECE_BYTES", 1000)  # several pieces of each object
     expected = [read_data_set(top / "fleet" / "logs" / name) for name in ("machine0", "machine1")]
     expected = by_name([one for part in expected for one in part])
-    source = DataSource.of(f"{server.bucket}/logs")
+    source = DataSource.from_path(f"{server.bucket}/logs")
     assert source.store(tmp_path / "store").refused == ()
     assert_same(by_name(read_store(tmp_path / "store")), expected)
     source.store(top / "fleet" / "stores" / "first")
-    stored = DataSource.of(f"{server.bucket}/stores/first")
+    stored = DataSource.from_path(f"{server.bucket}/stores/first")
     assert stored.stored
     assert_same(by_name(stored.read()), expected)
 
 
 @pytest.mark.processes
 def test_samples_that_are_not_what_the_index_says_are_refused(server, top):
-    DataSource.of(top / "fleet" / "logs" / "machine0").store(top / "fleet" / "store")
+    DataSource.from_path(top / "fleet" / "logs" / "machine0").store(top / "fleet" / "store")
     server.mode = "cut"
     with pytest.raises(DataError, match="have other samples than their hash"):
-        DataSource.of(f"{server.bucket}/store").read()
+        DataSource.from_path(f"{server.bucket}/store").read()
 
 
 def test_refusals_and_missing_keys_are_said_in_words(server, tmp_path):
     with pytest.raises(DataError, match="/nothing' does not exist"):
-        DataSource.of(f"{server.bucket}/nothing").store(tmp_path / "store")
+        DataSource.from_path(f"{server.bucket}/nothing").store(tmp_path / "store")
     server.mode = "refuse"
     with pytest.raises(StorageError, match=r"the bucket refuses to be read .* set (GOOGLE|AZURE)"):
-        DataSource.of(f"{server.bucket}/logs").store(tmp_path / "store")
+        DataSource.from_path(f"{server.bucket}/logs").store(tmp_path / "store")
     assert not (tmp_path / "store" / "store.json").exists()
 
 

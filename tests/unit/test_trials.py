@@ -69,7 +69,7 @@ def source(tmp_path_factory):
         write_recording(drive(f"drive_{i}", i), folder / "logs" / f"drive_{i}.parquet")
     kinds = {"v": "velocity", "u": "ratio", "p": "pressure", "noise": "generic", "more": "generic"}
     (folder / "map.toml").write_text("".join(f'[channels.{name}]\nkind = "{kind}"\n' for name, kind in kinds.items()))
-    return DataSource.of(folder / "logs", folder / "map.toml")
+    return DataSource.from_path(folder / "logs", folder / "map.toml")
 
 
 @pytest.fixture(scope="module")

@@ -105,9 +105,9 @@ def test_numbers_stay_as_they_are_where_the_map_says_generic_or_the_unit_has_no_
 def test_models_of_earlier_versions_read_logs_as_they_were_trained():
     signal_map = SignalMap((ChannelMap("Load", "F", unit="kN"), ChannelMap("CylVels_1", "v", unit="mm/s")))
     source = DataSource(Path("log.csv"), signal_map)
-    again = DataSource.from_plain(source.to_plain()).signal_map
+    again = DataSource.from_dict(source.to_dict()).signal_map
     assert [channel_from_entry(entry).kind for entry in again.channels] == [Kind.FORCE, Kind.VELOCITY]
-    before = DataSource.from_plain({"path": "log.csv", "map": plain_tree(signal_map)}).signal_map
+    before = DataSource.from_dict({"path": "log.csv", "map": plain_tree(signal_map)}).signal_map
     assert [channel_from_entry(entry).kind for entry in before.channels] == [Kind.GENERIC, Kind.VELOCITY]
 
 

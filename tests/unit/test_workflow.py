@@ -77,7 +77,7 @@ def experiment():
 
 
 def source_of(logs):
-    return DataSource.of(logs, logs.parent / "map.toml")
+    return DataSource.from_path(logs, logs.parent / "map.toml")
 
 
 def listed(logs, *entries, head='map = "map.toml"\n'):
@@ -88,7 +88,7 @@ def listed(logs, *entries, head='map = "map.toml"\n'):
 
 def test_a_data_set_file_says_which_machine_a_log_is_of(logs):
     entries = [f'path = "{path.name}"\nmachine = "Digger {i}"' for i, path in enumerate(sorted(logs.glob("*.csv"))[:2])]
-    found = DataSource.of(
+    found = DataSource.from_path(
         listed(logs, *[entry.replace('path = "', f'path = "{logs.name}/') for entry in entries])
     ).read()
     assert [recording.meta["machine"] for recording in found] == ["Digger 0", "Digger 1"]
@@ -100,7 +100,7 @@ def test_a_run_holds_all_that_repeats_it(logs, tmp_path):
     parts = [facts["data"][part]["names"] for part in ("train", "validation", "test")]
     assert sorted(name for names in parts for name in names) == ["drive_0", "drive_1", "drive_2", "drive_3"]
     assert facts["environment"]["torch"] == str(torch.__version__)
-    again = DataSource.from_plain(facts["data"]["reader"])
+    again = DataSource.from_dict(facts["data"]["reader"])
     kept = load_experiment(tmp_path / "run" / "config.toml", "standard")
     assert prepare_data(again, kept).digest == facts["data"]["digest"]
     held = load_bundle(tmp_path / "run")
@@ -247,7 +247,7 @@ def test_evaluation_on_other_recordings_leaves_the_run_as_it_was(logs, tmp_path)
     header = (tmp_path / "run" / "bundle" / "bundle.json").read_bytes()
     other = tmp_path / "other.csv"
     write_recording(drive("other", 9), other)
-    folder = evaluate(tmp_path / "run", DataSource.of(other, tmp_path / "map.toml"))
+    folder = evaluate(tmp_path / "run", DataSource.from_path(other, tmp_path / "map.toml"))
     assert folder == tmp_path / "run" / "on_other"
     assert (folder / "predictions.safetensors").is_file()
     assert not (tmp_path / "run" / "scores.json").exists()
@@ -271,7 +271,7 @@ def test_a_bundle_is_judged_without_a_run_folder(logs, tmp_path):
 def test_data_set_files_give_parts_names_and_maps(logs):
     own = 'path = "logs/drive_1.csv"\nname = "second"\n[recordings.map.channels.u]\nkind = "ratio"\nunit = "%"'
     path = listed(logs, 'path = "logs/drive_0.csv"\nrows = [20, 70]', own)
-    first, second = DataSource.of(path).read()
+    first, second = DataSource.from_path(path).read()
     assert (first.name, first.samples, first.channel_names) == ("drive_0", 50, ("v", "u"))
     assert (second.name, second.channel_names) == ("second", ("u",))
     np.testing.assert_allclose(100 * second.column("u"), drive("", 1).column("u"), rtol=1e-6)
@@ -280,11 +280,11 @@ def test_data_set_files_give_parts_names_and_maps(logs):
 def test_names_and_rates_of_data_set_files_must_agree(logs):
     path = listed(logs, 'path = "logs/drive_0.csv"', 'path = "logs/drive_0.csv"')
     with pytest.raises(DataError, match="drive_0 occur twice"):
-        DataSource.of(path).read()
+        DataSource.from_path(path).read()
     write_recording(drive("slow", 5, rate_hz=50.0), logs / "slow.csv")
     path = listed(logs, 'path = "logs/drive_0.csv"', 'path = "logs/slow.csv"')
     with pytest.raises(DataError, match=r"mixed rates.*100 Hz.*50 Hz.*rate_hz"):
-        DataSource.of(path).read()
+        DataSource.from_path(path).read()
 
 
 def test_repairs_of_the_call_replace_those_of_the_file(logs):
@@ -294,11 +294,11 @@ def test_repairs_of_the_call_replace_those_of_the_file(logs):
     log.write_text("\n".join(lines) + "\n")
     path = listed(logs, 'path = "logs/drive_0.csv"')
     with pytest.raises(DataError, match="missing or infinite"):
-        DataSource.of(path).read()
-    (mended,) = DataSource.of(path, repair=Repair(nan="hold")).read()
+        DataSource.from_path(path).read()
+    (mended,) = DataSource.from_path(path, repair=Repair(nan="hold")).read()
     assert np.isfinite(mended.values).all()
     held = listed(logs, 'path = "logs/drive_0.csv"', head='map = "map.toml"\nrepair = { nan = "hold" }\n')
-    assert DataSource.of(held).read()[0].digest == mended.digest
+    assert DataSource.from_path(held).read()[0].digest == mended.digest
 
 
 @pytest.mark.parametrize(("layout", "variable"), [("simulink", "logsout"), ("speedgoat", "data")])
@@ -306,7 +306,7 @@ def test_simulated_data_sets_in_layouts_of_others_read_back_without_truth(tmp_pa
     order = SimulationOrder(minutes=0.1, recordings=1, seed=1, suffix=".mat", layout=layout)
     (path,) = simulate_data_set(tmp_path, order, IN_PROCESS)
     assert {"CylVels_1", "BmUp"} <= set(open_log(path, SignalMap(variable=variable)).signals)
-    (read,) = DataSource.of(tmp_path).read()
+    (read,) = DataSource.from_path(tmp_path).read()
     assert (read.channel_names, read.rate_hz) == (tuple(TABLE_A1), 100.0)
     with pytest.raises(StorageError, match="another simulated data set"):
         simulate_data_set(tmp_path, replace(order, layout="struct"), IN_PROCESS)

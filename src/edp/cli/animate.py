@@ -62,7 +62,7 @@ def animate(
         raise ConfigError(f"--out {target}: an animation ends in one of {endings}, not in '{target.suffix}'")
     if film and run is not None:
         raise ConfigError(f"--out {target}: predictions of a run are drawn on a page (.html), not in a film")
-    recording = read_with_truth(DataSource.of(log, signal_map))
+    recording = read_with_truth(DataSource.from_path(log, signal_map))
     # The scene first: a log that cannot be drawn is refused before a model works through it.
     scene = scene_of(recording, machine, start, seconds)
     if run is not None:

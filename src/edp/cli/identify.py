@@ -52,7 +52,7 @@ def identify(
         experiment = load_twin_experiment(config, changes if config else ["twin.kind=greybox", *changes])
     with show_progress("identify", as_json) as progress:
         result = run_identify(source_of(data, signal_map, repair), file, machine, experiment, run, progress)
-    numbers = [row.plain() for row in result.rows]
+    numbers = [row.to_dict() for row in result.rows]
     verdict = machine_verdict(result.scores)
     facts = {
         "machine": str(file), "numbers": numbers, "models": plain_value(result.scores), "notes": result.notes,

@@ -66,7 +66,7 @@ def inspect(
     """
     from edp.logs.source import DataSource
 
-    source = replace(DataSource.of(data, signal_map), at_most_h=at_most)
+    source = replace(DataSource.from_path(data, signal_map), at_most_h=at_most)
     asked = page is not None or bool(split or inputs)
     names = tuple(filter(None, inputs.split(",")))
     with show_progress("read", as_json) as progress:

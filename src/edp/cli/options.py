@@ -187,7 +187,7 @@ def source_of(data: Path | Sequence[Path], signal_map: Path | None, repair: list
         if not sign:
             raise ConfigError(f"--repair '{text}': write what=how, for example nan=hold")
         table[key] = value
-    return DataSource.of(data, signal_map, build(Repair, table, "--repair") if table else None)
+    return DataSource.from_path(data, signal_map, build(Repair, table, "--repair") if table else None)
 
 
 def source_if_given(data: Sequence[Path], signal_map: Path | None, repair: list[str]) -> DataSource | None:

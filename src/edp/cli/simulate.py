@@ -92,7 +92,7 @@ def simulate(
     from edp.sim.scenario_file import limit_settings, suffix_of
 
     check_effects(context, {"changes.limit": limit})
-    order = SimulationOrder.of(
+    order = SimulationOrder.from_scenario(
         scenario,
         lambda text: err.print(f"note: {text}"),
         changes,

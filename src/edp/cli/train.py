@@ -173,5 +173,5 @@ def run(
 
     experiment = load_experiment(config, preset, changes)
     with show_progress("train", quiet) as progress:
-        bundle = run_training(source or DataSource.of(data), experiment, folder, training_steps(progress))
+        bundle = run_training(source or DataSource.from_path(data), experiment, folder, training_steps(progress))
     return bundle, progress.display.measured("validation_mae")

@@ -82,4 +82,4 @@ def load_control_experiment(
 
 def control_toml(experiment: ControlExperiment) -> str:
     """Return the complete settings as TOML, including defaults, for the run folder."""
-    return tomli_w.dumps(CONTROL_SETTINGS.plain(experiment))
+    return tomli_w.dumps(CONTROL_SETTINGS.to_dict(experiment))

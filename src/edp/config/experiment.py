@@ -71,7 +71,7 @@ SETTINGS = SettingsTree(
 )
 """Reads and writes the tables of an experiment and of its parts."""
 build = SETTINGS.build
-plain_tree = SETTINGS.plain
+plain_tree = SETTINGS.to_dict
 PRESETS = ("quick", "small", "committee", "standard", "thesis", "pressures", "positions")
 AUTO = "auto"
 """The preset that leaves network and training to `edp.workflows.auto`; it is no experiment by itself."""

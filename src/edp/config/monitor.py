@@ -136,4 +136,4 @@ def load_monitor_experiment(
 
 def monitor_toml(experiment: MonitorExperiment) -> str:
     """Return the complete settings as TOML, including defaults, for the monitor's folder."""
-    return tomli_w.dumps(MONITOR_SETTINGS.plain(experiment))
+    return tomli_w.dumps(MONITOR_SETTINGS.to_dict(experiment))

@@ -90,4 +90,4 @@ def has_choice(experiment: TwinExperiment) -> bool:
 
 def twin_toml(experiment: TwinExperiment) -> str:
     """Return the complete settings as TOML, including defaults, for the run folder."""
-    return tomli_w.dumps(TWIN_SETTINGS.plain(experiment))
+    return tomli_w.dumps(TWIN_SETTINGS.to_dict(experiment))

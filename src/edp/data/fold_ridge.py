@@ -55,7 +55,7 @@ def fold_ridge(
     weights = np.zeros((folds.count, columns, outputs))
     intercepts = np.zeros((folds.count, outputs))
     for chosen in column_sets:
-        spectra = [_Spectrum.of(moments.select_columns(chosen)) for moments in trained]
+        spectra = [_Spectrum.from_moments(moments.select_columns(chosen)) for moments in trained]
         others = [moments.select_columns(chosen) for moments in judged]
         for penalty in sorted(PENALTIES, reverse=True):  # the strongest first: a weaker one must earn its place
             solved = [spectrum.solve(penalty) for spectrum in spectra]
@@ -122,7 +122,7 @@ class _Spectrum:
     turned: DoubleArray
 
     @classmethod
-    def of(cls, moments: TableMoments) -> _Spectrum:
+    def from_moments(cls, moments: TableMoments) -> _Spectrum:
         """Return the eigenvalue decomposition for the moments of some rows."""
         values, vectors = np.linalg.eigh(moments.covariance)
         # Rounding can leave eigenvalues of a singular matrix just below zero.

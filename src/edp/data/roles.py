@@ -110,12 +110,12 @@ def _find_axes_by_kind(channels: Sequence[Channel], inputs: tuple[str, ...]) -> 
     """
     kinds = {channel.name: channel.kind for channel in channels}
 
-    def of(*accepted: Kind) -> list[str]:
+    def select(*accepted: Kind) -> list[str]:
         return [name for name, kind in kinds.items() if kind in accepted and name not in inputs]
 
-    commands = list(inputs) or next((of_kind for kind in COMMANDS if (of_kind := of(kind))), [])
-    speeds = of(Kind.VELOCITY) or of(Kind.ANGULAR_VELOCITY) or (of(Kind.GENERIC) if commands else [])
-    places, pressures = of(Kind.POSITION) or of(Kind.ANGLE), of(Kind.PRESSURE)
+    commands = list(inputs) or next((of_kind for kind in COMMANDS if (of_kind := select(kind))), [])
+    speeds = select(Kind.VELOCITY) or select(Kind.ANGULAR_VELOCITY) or (select(Kind.GENERIC) if commands else [])
+    places, pressures = select(Kind.POSITION) or select(Kind.ANGLE), select(Kind.PRESSURE)
     count = max(len(speeds), min(len(commands), 1))
     # Two pilot pressures for each velocity are the two sides of a spool.
     one_sided = len(commands) == 2 * count and all(kinds[name] == Kind.PILOT_PRESSURE for name in commands)

@@ -126,7 +126,7 @@ def twin_channels(recording: Recording, settings: TwinChannelSettings | None = N
     """
     chosen = settings or TwinChannelSettings()
 
-    def of(names: Sequence[str]) -> tuple[Channel, ...]:
+    def find_channels(names: Sequence[str]) -> tuple[Channel, ...]:
         return tuple(recording.channels[recording.index(name)] for name in names)
 
     roles = roles_of(recording, chosen.commands)
@@ -138,7 +138,13 @@ def twin_channels(recording: Recording, settings: TwinChannelSettings | None = N
     pressures = chosen.pressures or tuple(
         c.name for c in recording.channels if c.kind is Kind.PRESSURE and c.name not in commands
     )
-    return TwinChannels(of(commands), of(velocities), of(strokes), of(pressures), recording.rate_hz)
+    return TwinChannels(
+        find_channels(commands),
+        find_channels(velocities),
+        find_channels(strokes),
+        find_channels(pressures),
+        recording.rate_hz,
+    )
 
 
 def _strokes(velocities: Sequence[str], by_velocity: dict[str, str]) -> tuple[str, ...]:

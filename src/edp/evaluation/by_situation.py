@@ -65,7 +65,7 @@ class Situations:
     def __init__(self, data: Prepared) -> None:
         self.axes = _find_axes(data)
 
-    def of(self, series: Series, horizon: int, ticks: int) -> list[tuple[int, Mapping[str, Ticks]]]:
+    def find_masks(self, series: Series, horizon: int, ticks: int) -> list[tuple[int, Mapping[str, Ticks]]]:
         """Return per axis its target column and a mask ``(ticks,)`` of each situation.
 
         Args:

@@ -191,7 +191,7 @@ class Ruler:
     ) -> None:
         """Add one recording's errors at one horizon."""
         if self.situations.axes:
-            ticks_of = self.situations.of(self.data.test[number], horizon, len(truth))
+            ticks_of = self.situations.find_masks(self.data.test[number], horizon, len(truth))
             tally.update(np.abs(predicted - truth), self._mask_scored(predicted), ticks_of)
 
     def _mask_scored(self, predicted: NDArray[Any]) -> NDArray[np.bool_]:

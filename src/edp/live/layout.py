@@ -30,7 +30,7 @@ class LiveTrace:
     description: str = ""
 
     @staticmethod
-    def of(channel: Channel) -> LiveTrace:
+    def from_channel(channel: Channel) -> LiveTrace:
         """Create the trace of a channel in report units."""
         facts = KINDS[channel.kind]
         return LiveTrace(
@@ -104,7 +104,7 @@ class LiveLayout:
     steered: bool = False
     ticks: int | None = None
 
-    def to_plain(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, object]:
         """Plain JSON values, keys as the fields."""
         plain = asdict(self)
         for entry, forecast in zip(plain["forecasts"], self.forecasts, strict=True):

@@ -50,12 +50,12 @@ def session_page(session: LiveSession) -> str:
     first, rows = session.read(session.ticks - most, most)
     content = {
         "mode": "saved",
-        "layout": session.layout.to_plain(),
+        "layout": session.layout.to_dict(),
         "first": first,
         "count": len(rows),
         "all": session.ticks,
         "rows": base64.b64encode(rows.astype("<f4").tobytes()).decode(),
-        "events": [event.to_plain() for event in session.events()],
+        "events": [event.to_dict() for event in session.events()],
         "ended": session.ended,
         "breaks": session.breaks,
     }

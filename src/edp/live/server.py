@@ -130,7 +130,7 @@ class LiveServer:
             events = self.session.events(self._told)
             self._told = self.session.event_count
             for event in events:
-                self._tell(text_message("event", event=event.to_plain()))
+                self._tell(text_message("event", event=event.to_dict()))
             if loop.time() >= state_due:
                 self._tell(self._state())
                 state_due = loop.time() + STATE_S
@@ -141,7 +141,7 @@ class LiveServer:
         # What came last, with the reason of the end.
         self._offer_rows()
         for event in self.session.events(self._told):
-            self._tell(text_message("event", event=event.to_plain()))
+            self._tell(text_message("event", event=event.to_dict()))
         self._tell(self._state())
         self._tell(text_message("closed"))
         await asyncio.sleep(FLUSH_S)
@@ -230,9 +230,9 @@ class LiveServer:
         session = self.session
         backlog = min(round(BACKLOG_S * session.layout.rate_hz), MAX_PAST)
         self.viewers.add(viewer)
-        viewer.tell(text_message("layout", layout=session.layout.to_plain(), steered=self.pace is not None))
+        viewer.tell(text_message("layout", layout=session.layout.to_dict(), steered=self.pace is not None))
         for event in session.events():
-            viewer.tell(text_message("event", event=event.to_plain()))
+            viewer.tell(text_message("event", event=event.to_dict()))
         viewer.tell(self._state())
         oldest = max(0, self._sent - backlog)
         first, rows = session.read(oldest, self._sent - oldest)

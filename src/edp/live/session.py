@@ -39,7 +39,7 @@ class LiveEvent:
     text: str
     group: str = ""
 
-    def to_plain(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, object]:
         """Plain JSON values, keys as the fields."""
         return asdict(self)
 

@@ -21,12 +21,12 @@ def read_as_before(source: DataSource, reader: Mapping[str, object]) -> DataSour
 
     Args:
         source: logs, or a folder of them; stores and data-set files have maps of their own.
-        reader: how the other logs were read (`DataSource.to_plain`).
+        reader: how the other logs were read (`DataSource.to_dict`).
     """
     if source.signal_map is not None or source.stored or source.address or source.path.suffix == ".toml":
         return source
     try:
-        before = _one_way(DataSource.from_plain(reader))
+        before = _one_way(DataSource.from_dict(reader))
         if before is None:
             return source
         signal_map, repair = before

@@ -112,7 +112,7 @@ class DataSource:
             check_hours(self.at_most_h)
 
     @staticmethod
-    def of(
+    def from_path(
         path: str | Path | Sequence[str | Path], map_file: str | Path | None = None, repair: Repair | None = None
     ) -> DataSource:
         """Return a source from one path or several.
@@ -162,7 +162,7 @@ class DataSource:
         """Folder of the store; for a store in a bucket, the folder of its copy."""
         return local_store(self.address) if self.address else self.path
 
-    def to_plain(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, object]:
         """Convert to a dictionary for provenance, with which the same data can be read again."""
         plain: dict[str, object] = {"path": self.address or str(full_path(self.path))}
         if self.signal_map is not None:
@@ -177,8 +177,8 @@ class DataSource:
         return plain
 
     @staticmethod
-    def from_plain(plain: Mapping[str, Any]) -> DataSource:
-        """Create the source that `to_plain` described."""
+    def from_dict(plain: Mapping[str, Any]) -> DataSource:
+        """Create the source that `to_dict` described."""
         signal_map = drop_derived_kinds(build(SignalMap, plain["map"], "provenance map")) if "map" in plain else None
         repair = build(Repair, plain["repair"], "provenance repair") if "repair" in plain else None
         more = tuple(Path(path) for path in plain.get("more", ()))
@@ -188,7 +188,7 @@ class DataSource:
         """Return the origin of recordings that were read from this source, for the provenance of a result."""
         digests = "".join(recording.digest for recording in recordings)
         digest = hashlib.blake2b(digests.encode(), digest_size=16).hexdigest()
-        return DataOrigin(source=self.label, reader=self.to_plain(), digest=digest)
+        return DataOrigin(source=self.label, reader=self.to_dict(), digest=digest)
 
     def logs(self) -> list[Log]:
         """Return the unread logs of the source, each with its map; empty for a store."""

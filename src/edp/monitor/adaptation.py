@@ -41,12 +41,12 @@ class SlowDrift:
             offset = np.clip(offset + move, -self.most, self.most)
         return out, offset
 
-    def to_plain(self) -> dict[str, float]:
+    def to_dict(self) -> dict[str, float]:
         """Plain values of its file."""
         return {"step": self.step, "most": self.most}
 
     @staticmethod
-    def of(plain: Table) -> SlowDrift:
+    def from_dict(plain: Table) -> SlowDrift:
         """From plain values.
 
         Raises:

@@ -168,14 +168,14 @@ class MonitorChain:
             state.since, state.sums, state.counts = number, np.zeros(len(row)), np.zeros(len(row))
         return verdict
 
-    def to_plain(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, object]:
         """Plain values of its file."""
         return {
-            "summaries": self.summaries.to_plain(),
+            "summaries": self.summaries.to_dict(),
             "clip": self.conditioning.clip,
-            "drift": self.drift.to_plain(),
+            "drift": self.drift.to_dict(),
             "watches": [
-                {"detector": _TREE.plain(watch.detector, "detector"), "scale": watch.scale} for watch in self.watches
+                {"detector": _TREE.to_dict(watch.detector, "detector"), "scale": watch.scale} for watch in self.watches
             ],
             "limit": self.limit,
             "quiet": self.quiet,
@@ -191,23 +191,25 @@ class MonitorChain:
         return named
 
     @staticmethod
-    def of(plain: Table, arrays: Mapping[str, NDArray[Any]]) -> MonitorChain:
+    def from_dict(plain: Table, arrays: Mapping[str, NDArray[Any]]) -> MonitorChain:
         """From plain values and arrays.
 
         Raises:
             ValueError: values that cannot be; files are data from outside.
         """
-        summaries = BlockSummaries.of(plain["summaries"], arrays_under(arrays, "summaries."))
+        summaries = BlockSummaries.from_dict(plain["summaries"], arrays_under(arrays, "summaries."))
         if summaries.width > MAX_SUMMARIES:
             raise ValueError(f"it has {summaries.width} summaries; at most {MAX_SUMMARIES} must hold")
         clip = _number(plain["clip"], "clip")
-        conditioning = Conditioning.of(arrays_under(arrays, "conditioning."), clip, summaries.width, summaries.points)
+        conditioning = Conditioning.from_arrays(
+            arrays_under(arrays, "conditioning."), clip, summaries.width, summaries.points
+        )
         watches = _watches(plain["watches"], arrays, summaries.width)
         settle = plain["settle"]
         if isinstance(settle, bool) or not isinstance(settle, int) or not 0 <= settle <= 1_000_000:
             raise ValueError(f"settle is {str(settle)[:40]}; an integer from 0 to 1,000,000 must hold")
         limit, quiet = _number(plain["limit"], "limit"), _number(plain["quiet"], "quiet")
-        return MonitorChain(summaries, conditioning, SlowDrift.of(plain["drift"]), watches, limit, quiet, settle)
+        return MonitorChain(summaries, conditioning, SlowDrift.from_dict(plain["drift"]), watches, limit, quiet, settle)
 
 
 def _watches(entries: Sequence[Any], arrays: Mapping[str, NDArray[Any]], summaries: int) -> tuple[Watch, ...]:

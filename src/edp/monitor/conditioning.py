@@ -79,7 +79,7 @@ class Conditioning:
         return {name: getattr(self, name) for name in ARRAYS}
 
     @staticmethod
-    def of(arrays: Mapping[str, NDArray[Any]], clip: float, summaries: int, points: int) -> Conditioning:
+    def from_arrays(arrays: Mapping[str, NDArray[Any]], clip: float, summaries: int, points: int) -> Conditioning:
         """From arrays.
 
         Raises:

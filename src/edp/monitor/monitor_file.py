@@ -31,8 +31,8 @@ from edp.training.bundle import HEADER as BUNDLE_HEADER
 from edp.training.bundle import (
     Bundle,
     add_plugins,
-    channel_from_plain,
-    channel_to_plain,
+    channel_from_dict,
+    channel_to_dict,
     checked_text,
     convert_damage,
     load_bundle,
@@ -85,9 +85,9 @@ def save_monitor(monitor: Monitor, folder: str | Path) -> Path:
         "schema": SCHEMA,
         "edp": __version__,
         "rate_hz": monitor.rate_hz,
-        "channels": [channel_to_plain(channel) for channel in monitor.channels],
+        "channels": [channel_to_dict(channel) for channel in monitor.channels],
         "sources": sources,
-        "chain": monitor.chain.to_plain(),
+        "chain": monitor.chain.to_dict(),
         "limit": facts,
         "arrays": entry,
         "provenance": dict(monitor.provenance),
@@ -154,13 +154,13 @@ def _assembled(header: Table, path: Path) -> Monitor:
     entries = header["channels"]
     if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_CHANNELS:
         raise ValueError(f"it has no list of 1 to {MOST_CHANNELS:,} channels")
-    channels = tuple(channel_from_plain(entry) for entry in entries)
+    channels = tuple(channel_from_dict(entry) for entry in entries)
     names = [channel.name for channel in channels]
     if len(set(names)) < len(names):
         raise ValueError("a channel stands twice")
     arrays = load_arrays(read_arrays(path, header["arrays"]))
     sources = _sources(header["sources"], arrays, path)
-    chain = MonitorChain.of(object_with(header["chain"], (), "its chain"), arrays_under(arrays, "chain."))
+    chain = MonitorChain.from_dict(object_with(header["chain"], (), "its chain"), arrays_under(arrays, "chain."))
     _check_fit(sources, chain, names)
     own = {name: values for name, values in arrays.items() if not name.startswith(("chain.", "source."))}
     # Files of earlier versions have no scatter of healthy session means.

@@ -190,7 +190,7 @@ class BlockSummaries:
         summaries = (*SUMMARIES, *(f"drive{number + 1}" for number in range(len(self.drivers))))
         return tuple(f"{residual}.{summary}" for residual in residuals for summary in summaries)
 
-    def to_plain(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, object]:
         """Plain values of its file."""
         return {"block": self.block}
 
@@ -199,7 +199,7 @@ class BlockSummaries:
         return {name: getattr(self, name) for name in ARRAYS}
 
     @staticmethod
-    def of(plain: Mapping[str, object], arrays: Mapping[str, NDArray[Any]]) -> BlockSummaries:
+    def from_dict(plain: Mapping[str, object], arrays: Mapping[str, NDArray[Any]]) -> BlockSummaries:
         """From plain values and arrays.
 
         Raises:

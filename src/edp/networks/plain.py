@@ -53,13 +53,13 @@ def unknown_parts(plain: Any) -> list[str]:
     return sentences
 
 
-def model_to_plain(spec: ModelSpec) -> Table:
+def model_to_dict(spec: ModelSpec) -> Table:
     """Convert a network spec to JSON types; options that are None are omitted."""
-    plain: Table = NETWORK.plain(spec)
+    plain: Table = NETWORK.to_dict(spec)
     return plain
 
 
-def model_from_plain(plain: Mapping[str, object]) -> ModelSpec:
+def model_from_dict(plain: Mapping[str, object]) -> ModelSpec:
     """Create a network spec from JSON types; without ``physics`` it has no physics base.
 
     Raises:
@@ -72,13 +72,13 @@ def model_from_plain(plain: Mapping[str, object]) -> ModelSpec:
         raise BundleError(f"the bundle's network is not understood by this version: {error}") from error
 
 
-def task_to_plain(task: Task) -> Table:
+def task_to_dict(task: Task) -> Table:
     """Convert a task to JSON types."""
     plain: Table = plain_tree(task)
     return plain
 
 
-def task_from_plain(plain: Mapping[str, object]) -> Task:
+def task_from_dict(plain: Mapping[str, object]) -> Task:
     """Create a task from JSON types.
 
     Raises:

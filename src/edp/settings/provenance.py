@@ -34,7 +34,7 @@ class DataOrigin:
 
     Attributes:
         source: description of the source.
-        reader: how to read them again, see `edp.logs.source.DataSource.to_plain`.
+        reader: how to read them again, see `edp.logs.source.DataSource.to_dict`.
         rate_hz: samples per second.
         train, validation, test: parts; None if unknown.
         digest: content address of all recordings.

@@ -156,7 +156,7 @@ class SettingsTree:
         self.positions = dict(positions or {})
         self.null_is_nan = null_is_nan
 
-    def plain(self, value: Any, name: str = "") -> Any:
+    def to_dict(self, value: Any, name: str = "") -> Any:
         """Nested plain values of a spec tree; registered parts carry their ``kind``; None is left out.
 
         Args:
@@ -166,16 +166,16 @@ class SettingsTree:
         if name in self.parts and is_dataclass(value):
             return {"kind": self.parts[name].name_of(value)} | self._plain_fields(value)
         if name in self.parts and isinstance(value, tuple):
-            return [self.plain(item, name) for item in value]
+            return [self.to_dict(item, name) for item in value]
         if is_dataclass(value):
             return self._plain_fields(value)
         if isinstance(value, tuple | list):
-            return [self.plain(item) for item in value]
+            return [self.to_dict(item) for item in value]
         return str(value) if isinstance(value, Enum) else value
 
     def _plain_fields(self, spec: Any) -> dict[str, object]:
         values = {entry.name: getattr(spec, entry.name) for entry in fields(spec)}
-        return {name: self.plain(value, name) for name, value in values.items() if value is not None}
+        return {name: self.to_dict(value, name) for name, value in values.items() if value is not None}
 
     def build(self, cls: type[T], table: object, where: str, path: str = "") -> T:
         """Build a settings object from a table; missing keys take their defaults.
@@ -435,4 +435,4 @@ def _join(path: str, key: str) -> str:
 
 _PLAIN = SettingsTree()
 build = _PLAIN.build
-plain_tree = _PLAIN.plain
+plain_tree = _PLAIN.to_dict

@@ -22,7 +22,7 @@ from edp.sim.excitation import EXCITATIONS
 from edp.sim.limit_file import LimitFile
 from edp.sim.plan import DataSetSpec, machine_hash, scenario_of_unit
 from edp.sim.predictability import LimitSpec, find_limit
-from edp.sim.scenario import Scenario, plain
+from edp.sim.scenario import Scenario, scenario_to_dict
 from edp.sim.scenario_file import read_scenario_file, scenario_changes
 from edp.sim.simulate import simulate
 from edp.storage import (
@@ -62,7 +62,7 @@ class SimulationOrder(DataSetSpec):
     truth: str = ""
 
     @staticmethod
-    def of(
+    def from_scenario(
         scenario: str | Path | None = None,
         note: Callable[[str], None] | None = None,
         overrides: Sequence[str] = (),
@@ -187,7 +187,7 @@ def simulate_data_set(
 
 
 def _unit(scenario: Scenario, folder: Path, order: SimulationOrder) -> WorkUnit:
-    arguments = {"scenario": plain(scenario), "suffix": order.suffix, "files": asdict(order.files())}
+    arguments = {"scenario": scenario_to_dict(scenario), "suffix": order.suffix, "files": asdict(order.files())}
     where = {"folder": str(full_path(folder))}
     label = f"recording '{scenario.name}'"
     return WorkUnit(f"{__name__}:write_log", label, arguments, machine_hash(scenario), where)
@@ -276,7 +276,7 @@ def find_data_set_limit(
 
 def identity_of(plan: Sequence[Scenario], files: WriteOptions, suffix: str = ".parquet") -> dict[str, object]:
     """Return the identity of a simulated data set in JSON types."""
-    identity: dict[str, object] = {"schema": 1, "edp": __version__, "plan": [plain(entry) for entry in plan]}
+    identity: dict[str, object] = {"schema": 1, "edp": __version__, "plan": [scenario_to_dict(entry) for entry in plan]}
     # Only what departs from the usual: folders without these options keep their identity.
     if files != WriteOptions():
         identity["files"] = asdict(files)

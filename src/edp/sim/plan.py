@@ -22,7 +22,7 @@ from edp.sim.faults import FaultSpec, faults_of
 from edp.sim.machine.family import MASSES_T, WIDEST, member_mass, member_name
 from edp.sim.machine.machine_files import load_machine
 from edp.sim.physics.material import load_material
-from edp.sim.scenario import LARGEST_STEP_S, START_STROKES, Scenario, plain
+from edp.sim.scenario import LARGEST_STEP_S, START_STROKES, Scenario, scenario_to_dict
 from edp.sim.simulate import simulate
 from edp.storage.ledger import TrainingIdentity, WithState
 
@@ -251,7 +251,10 @@ def simulate_many(
 def _simulate_together(scenarios: Sequence[Scenario], workers: int) -> Iterator[Recording]:
     units = [
         WorkUnit(
-            f"{__name__}:simulate_unit", f"simulation of '{scenario.label}'", plain(scenario), machine_hash(scenario)
+            f"{__name__}:simulate_unit",
+            f"simulation of '{scenario.label}'",
+            scenario_to_dict(scenario),
+            machine_hash(scenario),
         )
         for scenario in scenarios
     ]

@@ -28,7 +28,7 @@ from edp.signals import TABLE_A1
 from edp.sim.limit_file import LimitErrors, LimitFile, Rows
 from edp.sim.machine import layout as at
 from edp.sim.plan import machine_hash, scenario_of_unit
-from edp.sim.scenario import Scenario, plain
+from edp.sim.scenario import Scenario, scenario_to_dict
 from edp.sim.sensors import sensors
 from edp.sim.simulate import Simulation
 from edp.storage.ledger import TrainingIdentity, WithState
@@ -253,8 +253,11 @@ def _rows(table: Array) -> Rows:
 
 def _unit(job: LimitJob) -> WorkUnit:
     arguments = {
-        "scenario": plain(job.scenario), "moments": list(job.moments), "spec": asdict(job.spec), "seed": job.seed
-    }  # fmt: skip
+        "scenario": scenario_to_dict(job.scenario),
+        "moments": list(job.moments),
+        "spec": asdict(job.spec),
+        "seed": job.seed,
+    }
     return WorkUnit(f"{__name__}:branch_unit", f"'{job.label}'", arguments, machine_hash(job.scenario))
 
 

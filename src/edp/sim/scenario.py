@@ -96,7 +96,7 @@ class Scenario:
         if not self.sensors:
             return machine
         where = f"{machine.name} with the scenario's sensors"
-        values = {**MACHINE_FILE.plain(machine.sensors), **self.sensors}
+        values = {**MACHINE_FILE.to_dict(machine.sensors), **self.sensors}
         changed = replace(machine, sensors=MACHINE_FILE.build(Sensors, values, where))
         check_machine(changed, where)
         return changed
@@ -112,10 +112,10 @@ class Scenario:
         return self.name or f"{load_machine(self.machine).name.lower()}_{self.excitation}_{self.seed}"
 
 
-def plain(scenario: Scenario) -> dict[str, object]:
+def scenario_to_dict(scenario: Scenario) -> dict[str, object]:
     """Convert a scenario to JSON types; `Scenario(**plain(s)) == s`."""
     values = {entry.name: getattr(scenario, entry.name) for entry in fields(scenario)}
     values |= {"start_strokes": list(scenario.start_strokes), "sensors": dict(scenario.sensors)}
     # Only where there are some: data sets and recordings without faults stay what they were.
     del values["faults"]
-    return values | ({"faults": [fault.plain() for fault in scenario.faults]} if scenario.faults else {})
+    return values | ({"faults": [fault.to_dict() for fault in scenario.faults]} if scenario.faults else {})

@@ -97,7 +97,7 @@ def suffix_of(form: str) -> str:
 def _split_settings(settings: Any, table: Mapping[str, object]) -> dict[str, object]:
     """Return the stated values of the data set and of the write options."""
     values = {key: getattr(settings, key) for key in table if key not in ("files", "limit")}
-    files = {} if settings.files is None else SCENARIO_FILE.plain(settings.files)
+    files = {} if settings.files is None else SCENARIO_FILE.to_dict(settings.files)
     if "format" in files:
         files["suffix"] = suffix_of(files.pop("format"))
     return values | files

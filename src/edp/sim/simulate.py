@@ -17,7 +17,7 @@ from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_files import look_up_mass
 from edp.sim.physics.plant import Plant
 from edp.sim.physics.snapshot import Snapshot, capture, restored
-from edp.sim.scenario import Scenario, SimulationError, plain
+from edp.sim.scenario import Scenario, SimulationError, scenario_to_dict
 from edp.sim.sensors import draws, sensors
 from edp.sim.start import seeds_of, start_of
 from edp.sim.view import view_of
@@ -114,7 +114,7 @@ class Simulation:
         """Return a snapshot of plant, operator, random state and log, independent of later steps."""
         arrays: list[NDArray[Any]] = []
         state = capture({key: getattr(self, key) for key in _CHANGING}, arrays)
-        return Snapshot(plain(self.scenario), self.samples, state, tuple(arrays), tuple(self._logs))
+        return Snapshot(scenario_to_dict(self.scenario), self.samples, state, tuple(arrays), tuple(self._logs))
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go to a moment of the same scenario, exactly: what follows gives the same bits as it gave then.
@@ -122,10 +122,10 @@ class Simulation:
         Raises:
             SimulationError: the snapshot belongs to another scenario.
         """
-        if snapshot.scenario != plain(self.scenario):
+        if snapshot.scenario != scenario_to_dict(self.scenario):
             raise SimulationError(
-                f"the snapshot belongs to scenario {snapshot.scenario}, not to {plain(self.scenario)}; "
-                "make the simulation from it with Simulation.of(snapshot)"
+                f"the snapshot belongs to scenario {snapshot.scenario}, not to {scenario_to_dict(self.scenario)}; "
+                "make the simulation from it with Simulation.from_snapshot(snapshot)"
             )
         present = {key: getattr(self, key) for key in _CHANGING}
         for key, value in restored(present, snapshot.state, snapshot.arrays).items():
@@ -134,7 +134,7 @@ class Simulation:
         self._logs, self._targets = list(snapshot.log), []
 
     @staticmethod
-    def of(snapshot: Snapshot) -> Simulation:
+    def from_snapshot(snapshot: Snapshot) -> Simulation:
         """Create the simulation of a snapshot, at its time."""
         simulation = Simulation(Scenario(**snapshot.scenario))
         simulation.restore(snapshot)
@@ -192,7 +192,7 @@ def _recording(scenario: Scenario, machine: Machine, log: Array, clamps: int) ->
     truth |= {name: measured[:, column] for name, column in sensors.shown_names().items()}
     further = {**EXTRA_CHANNELS, **GROUND_CHANNELS, **MOTOR_CHANNELS}
     extra = {name: channel for name, channel in further.items() if name in truth}
-    facts = {key: value for key, value in plain(scenario).items() if key != "name"}
+    facts = {key: value for key, value in scenario_to_dict(scenario).items() if key != "name"}
     mass = look_up_mass(scenario.machine)
     if mass is not None:
         facts["mass_t"] = round(mass, 3)

@@ -106,7 +106,7 @@ def check_spec(registry: Registry[Any], name: str) -> None:
     except TypeError as error:
         raise ContractError(f"{registry.what} '{name}' has an option without a default: {error}") from error
     # Settings files and bundles hold plain values: a part must survive the way there and back.
-    plain = json.loads(json.dumps(SETTINGS.plain(spec)))
+    plain = json.loads(json.dumps(SETTINGS.to_dict(spec)))
     expect(SETTINGS.build(part, plain, name) == spec, f"{registry.what} '{name}' is another one after JSON")
     expect(registry.name_of(spec) == name, f"{registry.what} '{name}' is registered under another name")
     for field in dataclasses.fields(spec):

@@ -229,7 +229,7 @@ def _arrays(spec: TwinSpec, twin: Twin, commands: Array, state: TwinState, where
     shapes = {key: values.shape for key, values in arrays.items() if key not in twin.scales.arrays()}
     expect(shapes == dict(spec.shapes(twin.channels)), f"{where}: its arrays have other shapes than it announces")
     copied = {key: values.copy() for key, values in arrays.items()}
-    again = spec.build(twin.channels, type(twin.scales).of(copied), copied)
+    again = spec.build(twin.channels, type(twin.scales).from_arrays(copied), copied)
     same = np.array_equal(again.rollout(commands, state)[0], twin.rollout(commands, state)[0])
     expect(same, f"{where}: built from its arrays it answers otherwise")
 

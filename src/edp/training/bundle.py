@@ -25,7 +25,7 @@ from edp.ir.rls import Adaptation
 from edp.ir.w8a16 import Formats
 from edp.ir.w8a16.quantise import weights_of
 from edp.networks.integer import IntegerPredictor
-from edp.networks.plain import model_from_plain, model_to_plain, task_from_plain, task_to_plain, unknown_parts
+from edp.networks.plain import model_from_dict, model_to_dict, task_from_dict, task_to_dict, unknown_parts
 from edp.networks.predictor import Predictor
 from edp.registry import missing_parts, origins_in
 from edp.settings.bounds import above
@@ -131,9 +131,9 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
     header: dict[str, object] = {
         "schema": INTEGER_SCHEMA if integer else SCHEMA,
         "edp": __version__,
-        "task": task_to_plain(task),
-        "model": model_to_plain(bundle.predictor.spec),
-        "inputs": [channel_to_plain(channel) for channel in bundle.inputs],
+        "task": task_to_dict(task),
+        "model": model_to_dict(bundle.predictor.spec),
+        "inputs": [channel_to_dict(channel) for channel in bundle.inputs],
         "outputs": [
             {"name": name, "kind": str(kind), "description": text}
             for name, kind, text in zip(task.targets, bundle.target_kinds, bundle.descriptions, strict=True)
@@ -150,7 +150,7 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
     if bundle.adaptation is not None:
         entry = write_arrays(path, "adaptation", save_arrays(bundle.adaptation.arrays()))
         referenced.add(entry["file"])
-        header |= {"schema": ADAPTED_SCHEMA, "adaptation": bundle.adaptation.to_plain() | {"arrays": entry}}
+        header |= {"schema": ADAPTED_SCHEMA, "adaptation": bundle.adaptation.to_dict() | {"arrays": entry}}
     # The header comes last: it is what makes the new files count.
     write_json(path / HEADER, add_plugins(header))
     remove_old_arrays(path, ARRAYS, referenced)
@@ -315,8 +315,8 @@ def _read_header(path: Path) -> dict[str, object]:
 
 def _assemble(header: Table, path: Path) -> Bundle:
     """Build the bundle from a header and its files."""
-    spec, task = model_from_plain(header["model"]), task_from_plain(header["task"])
-    inputs = tuple(channel_from_plain(entry) for entry in header["inputs"])
+    spec, task = model_from_dict(header["model"]), task_from_dict(header["task"])
+    inputs = tuple(channel_from_dict(entry) for entry in header["inputs"])
     kinds = tuple(Kind(c["kind"]) for c in header["outputs"])
     texts = tuple(checked_text(c["description"]) for c in header["outputs"])
     _check_channels(header, task, inputs)
@@ -342,13 +342,13 @@ def _check_channels(header: Table, task: Task, inputs: Sequence[Channel]) -> Non
     _check_rate(task.rate_hz)
 
 
-def channel_to_plain(channel: Channel) -> dict[str, str]:
+def channel_to_dict(channel: Channel) -> dict[str, str]:
     """Convert a channel to JSON types."""
     return {"name": channel.name, "kind": str(channel.kind), "unit": channel.unit, "description": channel.description}
 
 
-def channel_from_plain(entry: Table) -> Channel:
-    """Create a channel from the result of `channel_to_plain`, or from one of earlier versions without a unit.
+def channel_from_dict(entry: Table) -> Channel:
+    """Create a channel from the result of `channel_to_dict`, or from one of earlier versions without a unit.
 
     Raises:
         ValueError: an unknown kind, or another unit than that of the kind.
@@ -403,7 +403,7 @@ def _fill(predictor: Predictor, tensors: Mapping[str, torch.Tensor]) -> None:
 
 
 def _adaptation(entry: Table, task: Task, path: Path) -> Adaptation:
-    adaptation = Adaptation.from_plain(entry, load_arrays(read_arrays(path, entry["arrays"])))
+    adaptation = Adaptation.from_dict(entry, load_arrays(read_arrays(path, entry["arrays"])))
     if (len(adaptation.offset), len(adaptation.columns), adaptation.horizons) != (
         len(task.inputs),
         len(task.targets),

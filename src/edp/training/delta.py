@@ -54,7 +54,7 @@ class Scaled:
     bits: int = MAX_BITS
 
     @staticmethod
-    def of(matrix: NDArray[np.float64], bits: int = MAX_BITS) -> Scaled:
+    def from_matrix(matrix: NDArray[np.float64], bits: int = MAX_BITS) -> Scaled:
         """Return the nearest scaled matrix."""
         steps = 2 ** (bits - 1) - 1
         scales = (np.abs(matrix).max(axis=1) / steps).astype(np.float32)
@@ -155,10 +155,10 @@ def delta_of(
     for bits in range(MAX_BITS, MIN_BITS - 1, -1):
         needed = sum(-(-matrix.size * bits // 8) + 4 * len(matrix) + 2 * EACH_BYTES for matrix in matrices.values())
         if needed <= left:
-            coarse = {name: Scaled.of(matrix, bits) for name, matrix in matrices.items()}
+            coarse = {name: Scaled.from_matrix(matrix, bits) for name, matrix in matrices.items()}
             return Delta(weights_digest(base), dict(facts or {}), vectors, coarse, {})
     ranks = _ranks(matrices, left)
-    whole = {name: Scaled.of(matrices[name]) for name, rank in ranks.items() if rank is None}
+    whole = {name: Scaled.from_matrix(matrices[name]) for name, rank in ranks.items() if rank is None}
     narrow = {name: _factors(matrices[name], rank) for name, rank in ranks.items() if rank is not None}
     return Delta(weights_digest(base), dict(facts or {}), vectors, whole, narrow)
 
@@ -193,7 +193,7 @@ def _factors(matrix: NDArray[np.float64], rank: int) -> tuple[Scaled, Scaled]:
     u, values, v = np.linalg.svd(matrix, full_matrices=False)
     # The root on both sides: both factors are then as exact as each other.
     root = np.sqrt(values[:rank])[:, None]
-    return Scaled.of(root * u[:, :rank].T), Scaled.of(root * v[:rank])
+    return Scaled.from_matrix(root * u[:, :rank].T), Scaled.from_matrix(root * v[:rank])
 
 
 def apply_delta(base: Predictor, delta: Delta) -> Predictor:

@@ -36,7 +36,7 @@ def training_provenance(
 
     origin = DataOrigin(
         source=source.label,
-        reader=source.to_plain(),
+        reader=source.to_dict(),
         rate_hz=data.task.rate_hz,
         train=part(data.train),
         validation=part(data.validation),

@@ -27,8 +27,8 @@ from edp.storage.seals import HASH
 from edp.training.bundle import (
     Bundle,
     add_plugins,
-    channel_from_plain,
-    channel_to_plain,
+    channel_from_dict,
+    channel_to_dict,
     check_hash,
     convert_damage,
     read_arrays,
@@ -123,16 +123,16 @@ def save_twin(bundle: TwinBundle, folder: str | Path) -> Path:
     header = {
         "schema": SCHEMA if bundle.ground is None else GROUNDED,
         "edp": __version__,
-        "twin": _TREE.plain(bundle.spec, "twin"),
+        "twin": _TREE.to_dict(bundle.spec, "twin"),
         "rate_hz": channels.rate_hz,
-        "channels": {part: [channel_to_plain(channel) for channel in getattr(channels, part)] for part in PARTS},
+        "channels": {part: [channel_to_dict(channel) for channel in getattr(channels, part)] for part in PARTS},
         "weights": entry,
-        "intervals": None if bundle.intervals is None else bundle.intervals.to_plain(),
+        "intervals": None if bundle.intervals is None else bundle.intervals.to_dict(),
         "provenance": bundle.provenance.to_table(),
         "scores": dict(bundle.scores),
     }
     if bundle.ground is not None:
-        header["ground"] = {"kind": GROUNDS.name_of(bundle.ground), **bundle.ground.plain()}
+        header["ground"] = {"kind": GROUNDS.name_of(bundle.ground), **bundle.ground.to_dict()}
     write_json(path / HEADER, add_plugins(header))
     remove_old_arrays(path, ("weights",), (entry["file"],))
     return path
@@ -183,7 +183,7 @@ def load_twin(folder: str | Path) -> TwinBundle:
 
 
 def _assemble(header: Table, path: Path) -> TwinBundle:
-    parts = {part: tuple(channel_from_plain(entry) for entry in header["channels"][part]) for part in PARTS}
+    parts = {part: tuple(channel_from_dict(entry) for entry in header["channels"][part]) for part in PARTS}
     channels = TwinChannels(**parts, rate_hz=float(header["rate_hz"]))
     spec = _TREE.build(_Form, {"twin": header["twin"]}, f"'{path / HEADER}'").twin
     expected = {**TwinScales.shapes(channels), **spec.shapes(channels)}
@@ -194,8 +194,8 @@ def _assemble(header: Table, path: Path) -> TwinBundle:
     provenance = Provenance.from_table(object_with(header["provenance"], (), "its provenance"), "its provenance")
     scores = object_with(header["scores"], (), "its scores")
     widths = header.get("intervals") if header["schema"] > 1 else None
-    intervals = None if widths is None else FreeRunIntervals.from_plain(widths, channels)
-    twin = spec.build(channels, TwinScales.of(arrays), arrays)
+    intervals = None if widths is None else FreeRunIntervals.from_dict(widths, channels)
+    twin = spec.build(channels, TwinScales.from_arrays(arrays), arrays)
     return TwinBundle(spec, twin, provenance, scores, intervals, _ground(header, twin))
 
 
@@ -206,6 +206,6 @@ def _ground(header: Table, twin: Twin) -> GroundLaw | None:
     plain = object_with(header["ground"], ("kind",), "its ground")
     try:
         check_grounded(twin)
-        return GROUNDS[str(plain["kind"])[:80]].of(plain)
+        return GROUNDS[str(plain["kind"])[:80]].from_dict(plain)
     except ConfigError as error:
         raise ValueError(f"its ground: {error}") from None

@@ -45,7 +45,7 @@ def compile_ahead(progress: Progress = SILENT) -> None:
         stage.step(1)
         for number, (kind, changes) in enumerate(TWINS.items(), start=2):
             experiment = load_twin_experiment(None, [f"twin.kind={kind}", *JUDGED, *changes])
-            train_twin(DataSource.of(logs), experiment, Path(folder) / kind)
+            train_twin(DataSource.from_path(logs), experiment, Path(folder) / kind)
             stage.step(number)
         if importlib.util.find_spec("daqp") is None:
             return

@@ -262,7 +262,7 @@ def evaluate(
     scores = earlier_scores(target, key)
     if scores is None:
         bench = ModelBench(bundle.predictor, data, chosen)
-        other = json.dumps(None if source is None else source.to_plain(), sort_keys=True)
+        other = json.dumps(None if source is None else source.to_dict(), sort_keys=True)
         at = EvaluatedRun(str(full_path(folder)), other, at_most_h)
         evaluation = _evaluate_models(bench, at, " ".join(judged), workers, progress, minutes)
         # Scores that lack a baseline are not kept for a call that asks for all.
@@ -344,7 +344,7 @@ def _open_bench(evaluated_run: EvaluatedRun, digest: str, spec: JudgeSpec) -> Mo
     """Return a run with its data, read once for all units of a process; `digest` is that of the data."""
     bundle, _, provenance, data = read_trained_run(Path(evaluated_run.run))
     other = json.loads(evaluated_run.source)
-    others = other_recordings(None if other is None else DataSource.from_plain(other), provenance)
+    others = other_recordings(None if other is None else DataSource.from_dict(other), provenance)
     data, _ = judged_data(bundle, data, others, evaluated_run.at_most_h)
     return ModelBench(bundle.predictor, data, spec)
 
@@ -370,7 +370,7 @@ def read_trained_run(folder: Path) -> tuple[Bundle, Experiment, Provenance, Prep
     provenance = read_provenance(folder)
     experiment = load_experiment(folder / "config.toml", preset=None)
     torch.set_num_threads(thread_count(experiment.training))  # the ticks of a stream are too small to share
-    data = prepare_data(DataSource.from_plain(provenance.origin.reader), experiment, provenance.origin.frozen)
+    data = prepare_data(DataSource.from_dict(provenance.origin.reader), experiment, provenance.origin.frozen)
     if data.digest != provenance.origin.digest:
         raise DataError(
             f"the recordings in '{provenance.origin.source}' changed since '{folder}' was trained; the held-out "

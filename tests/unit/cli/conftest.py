@@ -101,7 +101,7 @@ def _trained(tmp_path_factory: pytest.TempPathFactory, logs: Path) -> Path:
     from edp.workflows.train_evaluate import DataSource, evaluate, train
 
     run = tmp_path_factory.mktemp("trained") / "run"
-    train(DataSource.of(logs), load_experiment(preset="quick", overrides=SMALL), run)
+    train(DataSource.from_path(logs), load_experiment(preset="quick", overrides=SMALL), run)
     evaluate(run, baselines=["persistence"])
     return run
 

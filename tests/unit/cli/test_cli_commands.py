@@ -189,8 +189,10 @@ def test_several_logs_are_judged_together_in_a_folder_of_their_own(edp, logs, tr
 
 def test_the_reference_recording_of_parity_is_a_part_of_each_log(logs, trained):
     bundle, paths = load_bundle(trained), [logs / "drive_1.parquet", logs / "drive_2.parquet"]
-    case = record_case(bundle, DataSource.of(paths), 61)
-    parts = [record_case(bundle, DataSource.of(path), ticks) for path, ticks in zip(paths, (31, 30), strict=True)]
+    case = record_case(bundle, DataSource.from_path(paths), 61)
+    parts = [
+        record_case(bundle, DataSource.from_path(path), ticks) for path, ticks in zip(paths, (31, 30), strict=True)
+    ]
     assert np.array_equal(case.inputs, np.concatenate([part.inputs for part in parts]))
 
 

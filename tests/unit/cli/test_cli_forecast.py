@@ -27,7 +27,7 @@ def logs(tmp_path_factory):
 def run(tmp_path_factory, logs):
     folder = tmp_path_factory.mktemp("twins") / "run"
     settings = ("twin.kind=arx", "judge.seconds=4", "judge.starts=2", "judge.at_s=[1, 4]")
-    train_twin(DataSource.of(logs), load_twin_experiment(None, settings), folder)
+    train_twin(DataSource.from_path(logs), load_twin_experiment(None, settings), folder)
     return folder
 
 

@@ -81,7 +81,7 @@ def test_a_run_of_a_grey_box_is_taken_and_one_of_another_kind_refused(edp, logs,
     monkeypatch.setattr(sys.modules["edp.workflows.identify.identify"], "realise_bodies", refused)
     for kind, file in (("greybox", "grey"), ("static", "map")):
         settings = [f"twin.kind={kind}", *(word for word in SMALL if kind == "greybox" or "twin." not in word)]
-        train_twin(DataSource.of(logs), load_twin_experiment(None, settings), tmp_path / file)
+        train_twin(DataSource.from_path(logs), load_twin_experiment(None, settings), tmp_path / file)
     ended = edp("identify", logs, "--out", tmp_path / "mine.toml", "--run", tmp_path / "grey")
     assert ended.code == 6, ended.err
     assert "machine M22 has" in ended.out.splitlines()[0]
@@ -189,7 +189,7 @@ def test_a_stopped_identification_continues_with_the_stages_that_it_has(logs, tm
 
     def identified(folder):
         settings = load_twin_experiment(None, ["twin.kind=greybox", *SMALL])
-        return module.identify(DataSource.of(logs), tmp_path / folder / "mine.toml", experiment=settings)
+        return module.identify(DataSource.from_path(logs), tmp_path / folder / "mine.toml", experiment=settings)
 
     monkeypatch.setattr(module, "fit_grey_box", counted)
     monkeypatch.setattr(module, "_scores", stopped)

@@ -164,13 +164,13 @@ def places(tmp_path_factory, logs, _trained):
         recording = Recording(session.name, channels, session.values, session.rate_hz)
         write_recording(recording, top / "rig" / f"{session.name}.parquet")
     experiment = load_monitor_experiment(None, (), {"hours_per_false_alarm": 0.06, "minutes": 0.05})
-    fit_monitor([], DataSource.of(top / "rig"), experiment, top / "monitor")
+    fit_monitor([], DataSource.from_path(top / "rig"), experiment, top / "monitor")
     entries = "".join(
         f'[[recordings]]\npath = "{log}"\nmachine = "digger {number // 2}"\n'
         for number, log in enumerate(sorted(logs.iterdir()))
     )
     (top / "fleet.toml").write_text(entries)
-    DataSource.of(top / "fleet.toml").store(top / "fleet")
+    DataSource.from_path(top / "fleet.toml").store(top / "fleet")
     return {
         "logs": logs, "log": sorted(logs.iterdir())[0], "run": _trained, "monitor": top / "monitor",
         "fleet": top / "fleet", "actuators": top / "actuators", "rig": top / "rig",

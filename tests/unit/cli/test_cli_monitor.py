@@ -51,7 +51,7 @@ def healthy(tmp_path_factory):
 def fitted(healthy, tmp_path_factory):
     folder = tmp_path_factory.mktemp("monitors") / "rig"
     experiment = load_monitor_experiment(None, (), {"hours_per_false_alarm": 0.06, "minutes": 0.05})
-    fit_monitor([], DataSource.of(healthy), experiment, folder)
+    fit_monitor([], DataSource.from_path(healthy), experiment, folder)
     return folder
 
 

@@ -77,10 +77,10 @@ def test_a_folder_and_files_are_inspected_together_and_each_log_once(logs):
 
 
 def test_a_source_of_several_paths_is_read_and_found_again(logs):
-    source = DataSource.of([logs / "a", logs / "b" / "three.csv", logs / "a" / "one.csv"])
+    source = DataSource.from_path([logs / "a", logs / "b" / "three.csv", logs / "a" / "one.csv"])
     assert [log.path.stem for log in source.logs()] == ["one", "two", "three"]
     assert [recording.name for recording in source.read()] == ["one", "two", "three"]
-    again = DataSource.from_plain(json.loads(json.dumps(source.to_plain())))
+    again = DataSource.from_dict(json.loads(json.dumps(source.to_dict())))
     assert [recording.digest for recording in again.read()] == [recording.digest for recording in source.read()]
     assert source.label.endswith("a and 2 more")
 
@@ -88,14 +88,14 @@ def test_a_source_of_several_paths_is_read_and_found_again(logs):
 def test_a_data_set_file_or_a_store_comes_alone(logs):
     (logs / "set.toml").write_text('[[recordings]]\npath = "a/one.csv"\n')
     with pytest.raises(ConfigError, match=r"set.toml' came with 1 other path.*alone"):
-        DataSource.of([logs / "a", logs / "set.toml"])
+        DataSource.from_path([logs / "a", logs / "set.toml"])
     with pytest.raises(ConfigError, match="came with 1 other path"):
-        DataSource.of([Path("s3://bucket/logs"), logs / "a"])
+        DataSource.from_path([Path("s3://bucket/logs"), logs / "a"])
 
 
 def test_an_empty_list_of_paths_is_refused():
     with pytest.raises(ConfigError, match="got an empty list of paths"):
-        DataSource.of([])
+        DataSource.from_path([])
     with pytest.raises(ConfigError, match="got an empty list of paths"):
         read([])
 
@@ -108,12 +108,12 @@ def test_recordings_of_several_paths_are_read_in_python(logs):
 
 def test_all_paths_count_in_the_name_of_a_source(logs):
     a, b = logs / "a", logs / "b"
-    assert DataSource.of(a / "one.csv").short_name == "one"
-    assert DataSource.of([a, b]).short_name.startswith("a_and_1_more_")
-    names = [DataSource.of(paths).short_name for paths in (a, [a, b], [a, b / "three.csv"], [a / "one.csv", b])]
+    assert DataSource.from_path(a / "one.csv").short_name == "one"
+    assert DataSource.from_path([a, b]).short_name.startswith("a_and_1_more_")
+    names = [DataSource.from_path(paths).short_name for paths in (a, [a, b], [a, b / "three.csv"], [a / "one.csv", b])]
     assert len(set(names)) == len(names)
-    assert DataSource.of([a, b]).short_name[1:] == DataSource.of([b, a]).short_name[1:]
-    assert len(DataSource.of(logs / ("n" * 200)).short_name) < 150
+    assert DataSource.from_path([a, b]).short_name[1:] == DataSource.from_path([b, a]).short_name[1:]
+    assert len(DataSource.from_path(logs / ("n" * 200)).short_name) < 150
 
 
 def test_a_map_is_proposed_for_several_logs(logs):

@@ -53,7 +53,7 @@ def trained(tmp_path_factory, logs):
     from edp.workflows.twin import train_twin
 
     run = tmp_path_factory.mktemp("twins") / "run"
-    train_twin(DataSource.of(logs), load_twin_experiment(None, SMALL), run)
+    train_twin(DataSource.from_path(logs), load_twin_experiment(None, SMALL), run)
     return run
 
 
@@ -212,7 +212,7 @@ def test_a_rollout_writes_measured_and_free_values_row_by_row(edp, logs, trained
     assert ended.code == 0
     assert ended.json["start_s"] == 2.0
     assert [row["at_s"] for row in ended.json["stroke_error"]] == [1.0, 3.0]
-    (written,), (recording,) = DataSource.of(file).read(), DataSource.of(log).read()
+    (written,), (recording,) = DataSource.from_path(file).read(), DataSource.from_path(log).read()
     twin = load_twin(trained).twin
     series = twin.channels.task().series(recording)
     state = twin.reset(series.inputs[None, 80:100], series.targets[None, 80:100])
@@ -241,7 +241,7 @@ def numbers(value: Any, path: str = "") -> dict[str, float]:
 def test_a_twin_is_judged_anew_and_on_other_recordings_beside_a_predictor(edp, logs, trained, tmp_path):
     run, other = shutil.copytree(trained, tmp_path / "run"), tmp_path / "other"
     write_recording(sample_actuators(seed=9, ticks=500), other / "later.parquet")
-    (recording,) = DataSource.of(other).read()
+    (recording,) = DataSource.from_path(other).read()
     speeds = ("speed_1", "speed_2")
     task = Task(FeatureSet("speeds", (*speeds, "lever_1", "lever_2")), speeds, (1, 5), TargetMode.DELTA, 50.0)
     model = ModelSpec(backbone=HybridSpec(channels=(4,), kernel=3, units=4, dropout=0.0), window=20)
@@ -350,7 +350,7 @@ def test_a_rollout_that_cannot_be_is_refused(edp, logs, trained, words, message)
 def test_several_logs_another_rate_and_no_twin_are_refused(edp, logs, trained, tmp_path):
     assert "6 recordings came" in edp("rollout", trained, logs).err
     slow = write_recording(sample_actuators(), tmp_path / "slow.parquet")
-    (recording,) = DataSource.of(slow).read()
+    (recording,) = DataSource.from_path(slow).read()
     short = write_recording(replace(recording, values=recording.values[:15]), tmp_path / "short.parquet")
     assert "has 15 ticks (0.3 s); the twin needs a prefix of 20" in " ".join(edp("rollout", trained, short).err.split())
     write_recording(replace(recording, rate_hz=25.0), slow)

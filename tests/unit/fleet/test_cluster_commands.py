@@ -96,14 +96,14 @@ def test_every_command_survives_a_killed_node_with_the_results_of_one_process(no
     assert [path.read_bytes() for path in made] == [path.read_bytes() for path in paths]
     plug.mend()
 
-    source = DataSource.of(one / "logs")
+    source = DataSource.from_path(one / "logs")
     source.store(tmp_path / "store", there, PullingProgress(plug))
     source.store(one / "store")
     digests = [[entry.digest for entry in read_store(folder / "store")] for folder in (tmp_path, one)]
     assert digests[0] == digests[1]
     plug.mend()
 
-    stored = DataSource.of(one / "store")
+    stored = DataSource.from_path(one / "store")
     assert stored.inspect(PullingProgress(plug), there) == stored.inspect()
     plug.mend()
 
@@ -129,7 +129,7 @@ def test_every_command_survives_a_killed_node_with_the_results_of_one_process(no
     plug.mend()
 
     tuned = FinetuneRequest(spec=FinetuneSpec(rounds=2, batch=4), method="full", baselines=("low_rank", "linear_probe"))
-    logs = DataSource.of(paths[0])
+    logs = DataSource.from_path(paths[0])
     started = threading.Thread(target=_pull_when, args=(tmp_path / "tuned" / "config.toml", plug))
     started.start()
     found = finetune(tmp_path / "run", logs, tuned, tmp_path / "tuned", workers=there)

@@ -91,7 +91,7 @@ def test_a_store_whose_disk_fills_in_a_unit_goes_on_where_it_was(small_logs, her
         done.append(batch.key)
         return real(batch)
 
-    source = DataSource.of(small_logs)
+    source = DataSource.from_path(small_logs)
     monkeypatch.setattr(building, "store_batch", full)
     with pytest.raises(StorageError, match="No space left on device; free space"):
         source.store(tmp_path / "store", here)
@@ -104,12 +104,12 @@ def test_a_store_whose_disk_fills_in_a_unit_goes_on_where_it_was(small_logs, her
 
 
 def test_a_store_built_in_units_holds_the_same_recordings_and_reads_nothing_twice(small_logs, here, tmp_path):
-    source = DataSource.of(small_logs)
+    source = DataSource.from_path(small_logs)
     told = NotedProgress()
     index = source.store(tmp_path / "store", here, told)
     assert index.hours() == pytest.approx(0.01)
     assert told.steps[-1] == 4
-    DataSource.of(small_logs).store(tmp_path / "usual")
+    DataSource.from_path(small_logs).store(tmp_path / "usual")
     for ours, usual in zip(read_store(tmp_path / "store"), read_store(tmp_path / "usual"), strict=True):
         assert (ours.name, ours.digest, dict(ours.meta)) == (usual.name, usual.digest, dict(usual.meta))
         np.testing.assert_array_equal(ours.values, usual.values)
@@ -124,23 +124,23 @@ def test_logs_that_cannot_be_read_are_refused_as_in_one_process(small_logs, here
     for log in sorted(small_logs.glob("*.parquet"))[:2]:
         (folder / log.name).write_bytes(log.read_bytes())
     (folder / "bad.parquet").write_bytes(b"PAR1 and nothing else")
-    index = DataSource.of(folder).store(tmp_path / "store", here)
-    usual = DataSource.of(folder).store(tmp_path / "usual")
+    index = DataSource.from_path(folder).store(tmp_path / "store", here)
+    usual = DataSource.from_path(folder).store(tmp_path / "usual")
     assert index.refused == usual.refused
     assert len(index.recordings) == 2
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
     with pytest.raises(ConfigError, match="is no store and not empty"):
-        DataSource.of(folder).store(tmp_path / "full", here)
+        DataSource.from_path(folder).store(tmp_path / "full", here)
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["mine.txt"]
 
 
 @pytest.mark.parametrize("stored", [False, True])
 def test_an_inspection_in_units_is_that_of_one_process(small_logs, here, tmp_path, stored):
-    source = DataSource.of(small_logs)
+    source = DataSource.from_path(small_logs)
     if stored:
         source.store(tmp_path / "store")
-        source = DataSource.of(tmp_path / "store")
+        source = DataSource.from_path(tmp_path / "store")
     told = NotedProgress()
     assert source.inspect(told, here) == source.inspect()
     assert told.stages == [("recording" if stored else "log", 4)]
@@ -152,7 +152,7 @@ def test_two_processes_give_the_same_logs_store_and_inspection(small_logs, small
     two = Workers(count=2)
     for path in simulate_data_set(tmp_path / "logs", small_order, two):
         assert path.read_bytes() == (small_logs / path.name).read_bytes()
-    source = DataSource.of(small_logs)
+    source = DataSource.from_path(small_logs)
     index = source.store(tmp_path / "store", two)
     usual = source.store(tmp_path / "usual")
     assert [entry.digest for entry in index.recordings] == [entry.digest for entry in usual.recordings]

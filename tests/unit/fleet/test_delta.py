@@ -98,7 +98,7 @@ def test_factors_of_a_product_beyond_the_network_are_refused_before_they_are_mul
     base, tuned = networks
     delta = delta_of(base, tuned, {}, 9_000)
     name = next(iter(delta.narrow))
-    long = Scaled.of(np.ones((1, 1_000_000)))
+    long = Scaled.from_matrix(np.ones((1, 1_000_000)))
     hostile = replace(delta, narrow={name: (long, long)})
     with pytest.raises(BundleError, match="in another shape"):
         apply_delta(base, delta_from_bytes(hostile.to_bytes(), "hostile"))

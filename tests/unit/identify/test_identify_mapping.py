@@ -71,7 +71,7 @@ def test_numbers_of_a_grey_box_made_from_a_machine_map_back_to_it(parts):
     own = MachineParametrisation.from_guess(M22, parts, parts.table.nominal[parts.load])
     numbers = grey_numbers(machine, parts, own.load)
     theta = nearest_machine(own, numbers, 1e4 * np.eye(len(numbers)), prior=0.0)
-    again, truth = (np.array([n.of(m) for n in MACHINE_NUMBERS]) for m in (own.machine(theta), machine))
+    again, truth = (np.array([n.read(m) for n in MACHINE_NUMBERS]) for m in (own.machine(theta), machine))
     assert np.abs(again / truth - 1.0).max() < 1e-9
 
 
@@ -82,9 +82,9 @@ def test_what_the_data_do_not_tell_stays_at_the_guess(parts):
     excited = np.zeros(len(numbers))
     excited[parts.table.valve_at[0, at.BAND] : parts.table.valve_at[0, at.BAND] + 12] = 1e6
     theta = nearest_machine(own, numbers, np.diag(excited))
-    machine_found = {n.label: n.of(own.machine(theta)) for n in MACHINE_NUMBERS}
-    truth = {n.label: n.of(machine) for n in MACHINE_NUMBERS}
-    base = {n.label: n.of(M22) for n in MACHINE_NUMBERS}
+    machine_found = {n.label: n.read(own.machine(theta)) for n in MACHINE_NUMBERS}
+    truth = {n.label: n.read(machine) for n in MACHINE_NUMBERS}
+    base = {n.label: n.read(M22) for n in MACHINE_NUMBERS}
     for label in ("valves.dead_band_extend[boom]", "valves.meter_in_extend[boom]", "valves.meter_out_extend[boom]"):
         assert machine_found[label] == pytest.approx(truth[label], rel=1e-3)
     for label in ("valves.meter_in_extend[arm]", "friction.viscous[boom]", "pumps.max_flow"):
@@ -131,7 +131,7 @@ def test_commands_that_reach_half_of_the_full_pilot_see_half_of_the_curve(parts)
 @pytest.fixture(scope="module")
 def poses():
     strokes = np.random.default_rng(3).uniform(0.05, 0.95, (60, 3)) * np.array(M22.cylinders.stroke)
-    return Poses.of(M22, strokes)
+    return Poses.from_strokes(M22, strokes)
 
 
 def test_inertia_and_gravity_are_linear_in_the_nine_numbers(poses):
@@ -178,7 +178,7 @@ def test_the_text_of_a_machine_is_read_back_as_the_machine():
     machine = replace(other_machine(2), description='a "quoted" text')
     text = machine_text(machine, ["from logs\nname = 'x'"], {("pumps", "relief"): "1 to 2\n[valves]"})
     again = parse_machine(text, "text")
-    values, truth = (np.array([n.of(m) for n in MACHINE_NUMBERS]) for m in (again, machine))
+    values, truth = (np.array([n.read(m) for n in MACHINE_NUMBERS]) for m in (again, machine))
     assert values == pytest.approx(truth, rel=1e-5)
     assert again.description == machine.description
     assert "  # 1 to 2 [valves]\n" in text

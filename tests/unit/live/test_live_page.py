@@ -23,7 +23,7 @@ HOSTILE = "<img src=x onerror=\"document.title='owned'\">"
 
 def session_of(steered: bool = True) -> LiveSession:
     names = (HOSTILE, "</script><script>document.title='owned'</script>", "Lever_1")
-    traces = [LiveTrace.of(Channel(name, Kind.VELOCITY, name)) for name in names]
+    traces = [LiveTrace.from_channel(Channel(name, Kind.VELOCITY, name)) for name in names]
     forecast = Forecast(HOSTILE, "mm/s", 1e3, 10, 3, 4, 5, 0.9, 0)
     layout = LiveLayout(
         HOSTILE, HOSTILE, 100.0, 10, traces, [forecast], geometry_of(load_machine("M22")), (6, 7, 8), (2,),

@@ -62,7 +62,7 @@ class Served:
 
 @pytest.fixture
 def served() -> Iterator[Served]:
-    traces = [LiveTrace.of(Channel(name, Kind.VELOCITY)) for name in NAMES]
+    traces = [LiveTrace.from_channel(Channel(name, Kind.VELOCITY)) for name in NAMES]
     layout = LiveLayout("<b>title</b>", "source", 100.0, len(NAMES), traces, steered=True)
     one = Served(LiveServer(LiveSession(layout), Pace(100.0)))
     yield one

@@ -17,7 +17,7 @@ from edp.signals import Channel, Kind
 
 
 def layout_of(width: int = 2, ticks: int | None = None, **changes) -> LiveLayout:
-    traces = [LiveTrace.of(Channel(f"c{n}", Kind.VELOCITY)) for n in range(width)]
+    traces = [LiveTrace.from_channel(Channel(f"c{n}", Kind.VELOCITY)) for n in range(width)]
     return LiveLayout("title", "source", 100.0, width, traces, ticks=ticks, **changes)
 
 
@@ -150,7 +150,7 @@ def test_names_are_bounded_text():
         label("x\u202ey\x1b[2J\n") == "x\N{REPLACEMENT CHARACTER}y\N{REPLACEMENT CHARACTER}[2J\N{REPLACEMENT CHARACTER}"
     )
     assert sentence("grün <b>") == "grün <b>"
-    plain = layout_of(statistics={"s" * 200: 1}).to_plain()
+    plain = layout_of(statistics={"s" * 200: 1}).to_dict()
     assert len(plain["statistics"][0]["name"]) == MOST_LABEL
 
 

@@ -218,7 +218,7 @@ def test_the_simulator_works_on_and_its_operator_sees_what_the_batch_simulation_
     assert all(np.shape(a) == np.shape(b) for a, b in zip(view[:7], seen[:7], strict=True))
     assert source._env.tip(full * seen.strokes)[:3] == pytest.approx([seen.tip_x, seen.tip_y, seen.attitude], abs=1e-6)
     wanted = Needs((Channel("PumpPressure_1", Kind.PRESSURE), Channel("other", Kind.PRESSURE)), 50.0)
-    needed = SOURCES["sim"].of(SourceOptions("M22"), wanted)
+    needed = SOURCES["sim"].from_options(SourceOptions("M22"), wanted)
     assert needed.rate_hz == 50.0
     assert "PumpPressure_1" in [channel.name for channel in needed.channels]
     with pytest.raises(ConfigError, match="unknown excitation"):
@@ -235,7 +235,7 @@ def test_a_loop_is_shown_with_reference_and_levers(twin_as_plant, tmp_path):
     if twin_as_plant:
         bundle = TwinBundle(TWINS["static"](), sample_excavator_twin())
         settings["plant"] = save_twin(bundle, tmp_path / "twin")
-    source = SOURCES["loop"].of(SourceOptions("point", settings=settings), Needs())
+    source = SOURCES["loop"].from_options(SourceOptions("point", settings=settings), Needs())
     assert isinstance(source._env, TwinEnvironment) == twin_as_plant
     live = run_of(source)
     thread = threading.Thread(target=live.play)
@@ -361,7 +361,7 @@ def test_a_map_gives_names_and_units_to_columns():
         UdpSource(source.port, 100.0, source.channels)
     source.close()
     with pytest.raises(ConfigError, match="give --rate"):
-        SOURCES["udp"].of(SourceOptions("0"), Needs())
+        SOURCES["udp"].from_options(SourceOptions("0"), Needs())
 
 
 def test_channels_of_a_first_row_are_taken_where_nothing_else_names_them(monkeypatch):
@@ -372,7 +372,7 @@ def test_channels_of_a_first_row_are_taken_where_nothing_else_names_them(monkeyp
 
 def test_without_ros_the_source_says_what_is_missing():
     with pytest.raises(ConfigError, match="--ros2 needs ROS 2 with rclpy"):
-        SOURCES["ros2"].of(SourceOptions("ros2", rate_hz=100.0), Needs())
+        SOURCES["ros2"].from_options(SourceOptions("ros2", rate_hz=100.0), Needs())
 
 
 def test_joints_and_pressures_of_ros_are_rows(monkeypatch):
@@ -401,7 +401,7 @@ def test_joints_and_pressures_of_ros_are_rows(monkeypatch):
     for name, module in modules.items():
         monkeypatch.setitem(sys.modules, name, module)
     channels = (TABLE_A1["CylVels_1"], TABLE_A1["CylPressures_1"], TABLE_A1["CylVels_2"])
-    live = run_of(SOURCES["ros2"].of(SourceOptions("ros2"), Needs(channels, 100.0)))
+    live = run_of(SOURCES["ros2"].from_options(SourceOptions("ros2"), Needs(channels, 100.0)))
     live.play()
     assert "enough" in str(live.failure)
     assert live.session.ticks == 20

@@ -89,7 +89,7 @@ def test_only_large_grave_faults_stop_a_machine():
 
 
 def test_classes_come_back_and_others_are_refused():
-    assert class_of(BIAS.plain(), "x") == BIAS
+    assert class_of(BIAS.to_dict(), "x") == BIAS
     for change in (
         {"sizes": [1.0] * 99},
         {"sizes": [float("nan")]},
@@ -98,7 +98,7 @@ def test_classes_come_back_and_others_are_refused():
         {"unit": 3},
     ):
         with pytest.raises(DataError, match="x: "):
-            class_of(BIAS.plain() | change, "x")
+            class_of(BIAS.to_dict() | change, "x")
     with pytest.raises(DataError, match="no fault class"):
         class_of({"kind": "a"}, "x")
 

@@ -154,7 +154,7 @@ def test_pools_keep_the_largest_value():
 
 
 def alarm_line(**changes):
-    cause = Cause("k", "s", "part", "sensor", 1.0, "bar", 0.9, "reads 1 bar too high", 0.5).plain()
+    cause = Cause("k", "s", "part", "sensor", 1.0, "bar", 0.9, "reads 1 bar too high", 0.5).to_dict()
     entry = {
         "recording": "a", "raised_s": 3.0, "since_s": 1.0, "detector": "cusum 1", "statistic": 2.0, "limit": 1.0,
         "evidence": [["x.mean", 2.0]], "causes": [cause], "sentence": "x", "severity": "note",

@@ -53,7 +53,7 @@ def machines(tmp_path_factory: pytest.TempPathFactory) -> DataSource:
         for seed in range(2):
             recording = drive(machine, seed)
             write_recording(recording, folder / f"{recording.name}.parquet")
-    return DataSource.of(folder)
+    return DataSource.from_path(folder)
 
 
 @pytest.fixture(scope="session")

@@ -46,7 +46,7 @@ def store(machines, tmp_path_factory):
 @pytest.fixture(scope="module")
 def run(store, experiment, tmp_path_factory):
     folder = tmp_path_factory.mktemp("fleet") / "run"
-    pretrain(DataSource.of(store), experiment, Pretrain(), folder)
+    pretrain(DataSource.from_path(store), experiment, Pretrain(), folder)
     return folder
 
 

@@ -49,7 +49,7 @@ def test_cells_of_structs_become_a_recording_each_and_those_named_val_test(arm, 
     assert {guess.column for guess in proposal.proposal.select_role("command")} == {"u_1", "u_2"}
     assert any("7 experiments" in note and "2 test" in note for note in proposal.notes)
     write_proposal(proposal, tmp_path / "out")
-    data = DataSource.of(tmp_path / "out" / "data.toml")
+    data = DataSource.from_path(tmp_path / "out" / "data.toml")
     recordings = data.read()
     assert [recording.name for recording in recordings] == [*(f"train_{i + 1}" for i in range(5)), "val_1", "val_2"]
     assert [recording.samples for recording in recordings] == [400, 410, 420, 430, 440, 400, 400]

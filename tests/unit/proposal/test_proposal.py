@@ -92,7 +92,7 @@ def test_files_are_read_by_the_next_commands(cylinder, tmp_path):
     proposal = propose(cylinder)
     paths = write_proposal(proposal, tmp_path / "out")
     assert [path.name for path in paths] == [MAP, SETTINGS]
-    recording = DataSource.of(cylinder, paths[0]).read()[0]
+    recording = DataSource.from_path(cylinder, paths[0]).read()[0]
     assert recording.column("Kolbenweg").mean() == pytest.approx(machine()["Kolbenweg [mm]"].mean() * 1e-3, rel=1e-3)
     settings = load_auto(paths[1])
     task = settings.task.resolve(recording.rate_hz, recording.channel_names)
@@ -110,7 +110,7 @@ def test_commands_name_the_channels_of_experiments_that_stand_side_by_side(tmp_p
     times = {"t": np.arange(1000) / 10.0}
     proposal = propose(write(tmp_path / "both.csv", times | dict(sorted(columns.items()))))
     write_proposal(proposal, tmp_path / "out")
-    recordings = DataSource.of(tmp_path / "out" / DATA).read()
+    recordings = DataSource.from_path(tmp_path / "out" / DATA).read()
     assert [recording.name for recording in recordings] == ["both_est", "both_val"]
     assert proposal.inputs == ("u",)
     assert proposal.targets == ("y",)
@@ -242,7 +242,7 @@ def test_a_folder_of_mixed_files(tmp_path):
     assert any("not readable" in note and "broken.mat" in note for note in proposal.notes)
     paths = write_proposal(proposal, tmp_path / "out")
     assert DATA in {path.name for path in paths}
-    assert len(DataSource.of(tmp_path / "out" / DATA).read()) == 2
+    assert len(DataSource.from_path(tmp_path / "out" / DATA).read()) == 2
 
 
 def test_repairs_that_training_needs_are_named(tmp_path):
@@ -290,7 +290,7 @@ def test_hostile_headers(tmp_path):
     signal_map = load_signal_map(paths[0])
     assert [entry.column for entry in signal_map.channels] == [g.column for g in proposal.proposal.columns if g.channel]
     assert not any("red" in entry.column for entry in signal_map.channels)
-    recording = DataSource.of(tmp_path / "x.csv", paths[0]).read()[0]
+    recording = DataSource.from_path(tmp_path / "x.csv", paths[0]).read()[0]
     task = load_auto(paths[1]).task.resolve(recording.rate_hz, recording.channel_names)
     assert set(task.targets) <= set(recording.channel_names)
 
@@ -343,7 +343,7 @@ def test_a_plant_model_of_angles_and_commands_alone_is_named_and_takes_their_cha
     plant = shlex.split(proposal.plant_command(tmp_path / "out"))
     assert plant[-4:] == ["--set", 'channels.commands=["joystick_boom"]', "--set", "split.kind=time"]
     write_proposal(proposal, tmp_path / "out")
-    recordings = DataSource.of(tmp_path / "x.csv", tmp_path / "out" / MAP).read()
+    recordings = DataSource.from_path(tmp_path / "x.csv", tmp_path / "out" / MAP).read()
     completed, settings = complete_velocities(recordings, load_twin_experiment(None, plant[-3:-2]).channels)
     channels = twin_channels(completed[0], settings)
     assert [channel.name for channel in channels.answers] == ["boom_angle_rad_velocity", "boom_angle_rad"]

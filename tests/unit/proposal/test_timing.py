@@ -47,7 +47,7 @@ def written(proposal: LogsProposal, folder: Path) -> DataSource:
     """The data as the proposed commands read it."""
     write_proposal(proposal, folder)
     if DATA in proposal.files:
-        return DataSource.of(folder / DATA)
+        return DataSource.from_path(folder / DATA)
     return replace(proposal.source, signal_map=load_signal_map(folder / MAP))
 
 

@@ -64,7 +64,7 @@ def test_mutual_information_of_a_gaussian_is_what_theory_says() -> None:
     rng = np.random.default_rng(0)
     x = rng.normal(size=(8000, 2))
     x[:, 1] = 0.8 * x[:, 0] + 0.6 * x[:, 1]
-    assert Information(x.astype(np.float32), 3).of(0, 1) == pytest.approx(-0.5 * np.log(1 - 0.64), abs=0.04)
+    assert Information(x.astype(np.float32), 3).estimate(0, 1) == pytest.approx(-0.5 * np.log(1 - 0.64), abs=0.04)
 
 
 def table_of(parts: list[list[np.ndarray]]) -> CandidateTable:

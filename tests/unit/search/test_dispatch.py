@@ -31,7 +31,7 @@ class Stop(Exception):
 def context(lever_sessions):
     base = Arm.from_experiment(load_experiment(None, "quick", CHANGES))
     names = tuple(f"s{number}" for number in range(5))
-    return SearchContext(SPEC, base, lever_sessions.to_plain(), names[:4], names[4:], ("lever", "speed"))
+    return SearchContext(SPEC, base, lever_sessions.to_dict(), names[:4], names[4:], ("lever", "speed"))
 
 
 def test_a_search_that_was_stopped_does_nothing_twice_and_decides_the_same(context, tmp_path):

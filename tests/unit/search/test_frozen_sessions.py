@@ -163,7 +163,7 @@ def copied(source, folder, **names):
     for recording in source.read():
         name = names.get(recording.name, recording.name)
         write_recording(replace(recording, name=name), folder / f"{name}.parquet")
-    return DataSource.of(folder)
+    return DataSource.from_path(folder)
 
 
 def test_no_frozen_session_trains_or_chooses_from_the_study_to_the_compressed_network(
@@ -254,7 +254,7 @@ def test_other_data_are_drawn_only_when_that_is_said(study, run, six_sessions, t
     for recording in six_sessions.read():
         moved = replace(recording, values=recording.values + np.float32(1))
         write_recording(moved, tmp_path / f"{recording.name}.parquet")
-    other = DataSource.of(tmp_path)
+    other = DataSource.from_path(tmp_path)
     with pytest.raises(DataError, match=r"2 of 2 frozen sessions.*split\.missing=draw"):
         prepare_data(other, load_experiment(study.teacher, "quick"))
     drawn = prepare_data(other, load_experiment(study.teacher, "quick", ["split.missing=draw"]))

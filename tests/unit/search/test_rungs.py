@@ -96,7 +96,7 @@ CREW = Here(count=1)
 @pytest.fixture(scope="module")
 def order(lever_sessions):
     settings = Arm.from_experiment(load_experiment(None, "quick", [*TINY, 'task.features="all"'])).tables
-    return TrainingRequest(settings, lever_sessions.to_plain(), ("s0", "s1", "s2"), ("s3", "s4"), seed=1, updates=12)
+    return TrainingRequest(settings, lever_sessions.to_dict(), ("s0", "s1", "s2"), ("s3", "s4"), seed=1, updates=12)
 
 
 def parts_of(order, stops=(3, 6)):

@@ -186,7 +186,7 @@ def test_a_study_of_other_settings_is_not_gone_on_with(six_sessions, finished, c
 def copied(source, folder):
     for file in sorted(source.path.glob("*.parquet")):
         write_recording(read_recording(file), folder / file.name)
-    return DataSource.of(folder)
+    return DataSource.from_path(folder)
 
 
 def test_other_data_in_the_same_folder_are_refused(six_sessions, plan, finished, tmp_path):
@@ -300,11 +300,11 @@ def test_wrong_settings_are_told_before_anything_is_read(change, match):
 def test_presets_can_be_built(preset):
     plan = load_plan(None, preset)
     assert plan.spec.horizon in plan.experiment.task.horizons
-    assert plan.to_plain()["search"]["folds"] == plan.spec.folds
+    assert plan.to_dict()["search"]["folds"] == plan.spec.folds
 
 
 def test_the_identity_of_a_study_is_that_of_versions_without_tables_for_phases(plan):
-    identity = plan.to_plain()["search"]
+    identity = plan.to_dict()["search"]
     assert (identity["variance_runs"], identity["free_trials"]) == (
         plan.spec.isolation.runs,
         plan.spec.exploration.trials,

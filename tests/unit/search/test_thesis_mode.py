@@ -88,7 +88,7 @@ def plan():
 def order(lever_sessions, plan):
     arm = Arm.from_experiment(plan.experiment)
     settings = arm.with_value("task.features", "all").with_value("training.schedule.patience", 0).tables
-    source = lever_sessions.to_plain()
+    source = lever_sessions.to_dict()
     names = ("s0", "s1", "s2"), ("s3", "s4")
     return TrainingRequest(settings, source, *names, seed=1, updates=24, epochs=8, patience=3, validation=names[1])
 

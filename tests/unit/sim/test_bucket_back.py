@@ -171,7 +171,7 @@ def test_a_snapshot_goes_on_to_the_bit(tmp_path):
     moment = simulation.snapshot()
     moment.save(tmp_path / "m.npz")
     expected = simulation.run(500)
-    again = Simulation.of(type(moment).load(tmp_path / "m.npz"))
+    again = Simulation.from_snapshot(type(moment).load(tmp_path / "m.npz"))
     np.testing.assert_array_equal(again.run(500), expected)
 
 

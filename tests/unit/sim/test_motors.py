@@ -198,7 +198,7 @@ def test_a_snapshot_holds_swing_and_travel(excitation, material, tmp_path):
     first = simulation.run(300).copy()
     simulation.restore(moment)
     assert np.array_equal(simulation.run(300), first)
-    again = Simulation.of(type(moment).load(moment.save(tmp_path / "moment.npz")))
+    again = Simulation.from_snapshot(type(moment).load(moment.save(tmp_path / "moment.npz")))
     assert np.array_equal(again.run(300), first)
     again.restore(moment)
     again.branch(np.random.SeedSequence(9))

@@ -79,7 +79,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run on the first machine; tests leave it as it is."""
     folder = tmp_path_factory.mktemp("source")
     logs = write(folder / "logs", [machine(f"s{i}", i, (0.2, -0.1)) for i in range(5)])
-    train(DataSource.of(logs), load_experiment(preset="quick", overrides=SETTINGS), folder / "run")
+    train(DataSource.from_path(logs), load_experiment(preset="quick", overrides=SETTINGS), folder / "run")
     return folder / "run"
 
 
@@ -87,7 +87,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def target(tmp_path_factory: pytest.TempPathFactory) -> DataSource:
     """Logs of the second machine."""
     folder = tmp_path_factory.mktemp("target") / "logs"
-    return DataSource.of(write(folder, [machine(f"t{i}", 50 + i, (0.3, -0.2)) for i in range(2)]))
+    return DataSource.from_path(write(folder, [machine(f"t{i}", 50 + i, (0.3, -0.2)) for i in range(2)]))
 
 
 @pytest.fixture(scope="session")

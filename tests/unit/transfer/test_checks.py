@@ -21,7 +21,7 @@ def refused(run, small, written, tmp_path):
     """The message with which logs are refused before anything is written."""
 
     def message(*recordings, **changes):
-        logs = DataSource.of(written(tmp_path / "logs", list(recordings)))
+        logs = DataSource.from_path(written(tmp_path / "logs", list(recordings)))
         with pytest.raises((DataError, ConfigError)) as caught:
             finetune(run, logs, FinetuneRequest(spec=small, **changes), tmp_path / "out")
         assert not (tmp_path / "out").exists()
@@ -91,7 +91,7 @@ def test_another_sign_is_found_by_correlation_with_the_pilot_pressure(refused, m
 
 
 def test_logs_of_another_sign_are_taken_where_that_is_asked_for(run, small, made_by, written, tmp_path):
-    logs = DataSource.of(written(tmp_path / "logs", [made_by("a", 1, (0.3, 0.2))]))
+    logs = DataSource.from_path(written(tmp_path / "logs", [made_by("a", 1, (0.3, 0.2))]))
     spec = dataclasses.replace(small, check_signs=False)
     found = finetune(
         run, logs, FinetuneRequest(spec=spec, changes=("training.updates=2",)), tmp_path / "out"

@@ -280,7 +280,7 @@ def test_a_bypass_that_kept_its_regression_learns_the_target(
     settings, target, small, made_by, written, tmp_path, method
 ):
     blocks = 'model.blocks=[{kind="linear_bypass", taps=4, start="ridge", trained=false}]'
-    logs = DataSource.of(written(tmp_path / "logs", [made_by(f"s{i}", i, (0.2, -0.1)) for i in range(4)]))
+    logs = DataSource.from_path(written(tmp_path / "logs", [made_by(f"s{i}", i, (0.2, -0.1)) for i in range(4)]))
     train(logs, load_experiment(preset="quick", overrides=(*settings, blocks)), tmp_path / "run")
     order = FinetuneRequest(spec=small, method=method, changes=("training.updates=10",))
     finetune(tmp_path / "run", target, order, tmp_path / "out")

@@ -43,7 +43,7 @@ def written(folder, recordings):
     folder.mkdir()
     for recording in recordings:
         write_recording(recording, folder / f"{recording.name}.parquet")
-    return DataSource.of(folder)
+    return DataSource.from_path(folder)
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ def logs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("logs")
     for seed in range(5):
         write_recording(sample_actuators(seed=seed), folder / f"log_{seed}.parquet")
-    return DataSource.of(folder)
+    return DataSource.from_path(folder)
 
 
 @pytest.fixture
@@ -105,7 +105,7 @@ def identifies_nothing(monkeypatch):
 def front_logs(folder):
     for seed in range(5):
         write_recording(sample_front(seed=seed), folder / f"log_{seed}.parquet")
-    return DataSource.of(folder)
+    return DataSource.from_path(folder)
 
 
 @pytest.mark.parametrize(("change", "message"), [(moved, "beyond an end stop"), (cut, "the longest recording has 20")])

@@ -119,7 +119,7 @@ def test_they_come_back_with_the_twin_and_earlier_twins_have_none(tmp_path):
     intervals = calibrated([(twin, series[:2])], FreeRunJudgeSpec(seconds=2.0))
     save_twin(TwinBundle(StaticMap(prefix_ticks=10), twin, intervals=intervals), tmp_path)
     loaded = load_twin(tmp_path).intervals
-    assert loaded.to_plain() == intervals.to_plain()
+    assert loaded.to_dict() == intervals.to_dict()
     save_twin(TwinBundle(StaticMap(prefix_ticks=10), twin), tmp_path)
     assert load_twin(tmp_path).intervals is None
     header = json.loads((tmp_path / HEADER).read_text())

@@ -171,7 +171,7 @@ def test_a_bundle_keeps_its_ground_and_exports_refuse_it(twin, law, tmp_path):
     save_twin(bundle, tmp_path / "twin")
     again = load_twin(tmp_path / "twin").ground
     assert isinstance(again, DragLaw)
-    assert again.plain() == bundle.ground.plain()
+    assert again.to_dict() == bundle.ground.to_dict()
     assert again.rows()[-1].excited is False
     with pytest.raises(ExportError, match=r"the twin has a ground \('drag'\), which exported forms do not have"):
         plant_bundle(bundle)

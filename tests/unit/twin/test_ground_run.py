@@ -48,7 +48,7 @@ def loam(tmp_path_factory):
     folder = tmp_path_factory.mktemp("loam")
     order = SimulationOrder(minutes=2.0, recordings=4, seed=3, mix={"dig": 1.0}, materials={"sandy_loam": 1.0})
     simulate_data_set(folder, order, workers=IN_PROCESS)
-    return DataSource.of(folder)
+    return DataSource.from_path(folder)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from edp.networks.twin.symbolic.machine_code import CodeModule, digest_of, load,
 def compiled(graph, inputs, results):
     """A Python function of an array for results."""
     module = CodeModule(graph, ([], [], inputs))
-    module.add("made", [graph.of(result) for result in results])
+    module.add("made", [graph.wrap(result) for result in results])
     loaded = load(module.object_code(), module.names)
     call = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4)(loaded.addresses["made"])
 
@@ -73,10 +73,10 @@ def test_equal_expressions_are_one_and_constants_are_folded():
     graph = ExpressionGraph()
     x, y = graph.inputs("x", 2)
     assert x * y + 1.0 is x * y + 1.0
-    assert x * 0.0 is graph.of(0.0)
+    assert x * 0.0 is graph.wrap(0.0)
     assert x + 0.0 is x
     assert 1.0 * x is x
-    assert graph.of(2.0) * 3.0 is graph.of(6.0)
+    assert graph.wrap(2.0) * 3.0 is graph.wrap(6.0)
     assert all(graph.function(name, 0.5).value == getattr(math, name)(0.5) for name in FUNCTIONS)
     assert graph.jacobian([x * 2.0], [y]) == {}
 

@@ -132,7 +132,7 @@ class Information:
         # sweeping along the channel with fewer equal values leaves fewer neighbours to look at
         self._ties = (np.diff(self._sorted, axis=1) < 1e-6).sum(axis=1)
 
-    def of(self, i: int, j: int) -> float:
+    def estimate(self, i: int, j: int) -> float:
         """Return the mutual information of two columns, at least 0."""
         if self._ties[i] > self._ties[j]:
             i, j = j, i
@@ -152,13 +152,13 @@ class Information:
         self, column_pairs: Iterable[tuple[int, int]], on_share: Callable[[float], None] | None = None
     ) -> list[float]:
         """Return the mutual information of several pairs of columns."""
-        return spread(lambda pair: self.of(*pair), column_pairs, on_share)
+        return spread(lambda pair: self.estimate(*pair), column_pairs, on_share)
 
     def matrix(self, on_share: Callable[[float], None] | None = None) -> Array:
         """Return the mutual information of all pairs, ``(channel, channel)``, with NaN on the diagonal."""
         count = len(self._values)
         information = np.full((count, count), np.nan)
-        rows = spread(lambda i: [self.of(i, j) for j in range(i)], range(1, count), on_share)
+        rows = spread(lambda i: [self.estimate(i, j) for j in range(i)], range(1, count), on_share)
         for i, row in enumerate(rows, start=1):
             information[i, :i] = information[:i, i] = row
         return information

@@ -89,7 +89,7 @@ def _metrics(channels: FloatArray, targets: FloatArray, spec: ScreeningSpec) -> 
     for i in np.flatnonzero(~constant[:width]):
         for j in np.flatnonzero(~constant[width:]):
             metrics[2, i, j] = kendall.tau(int(i), width + int(j))
-            metrics[3, i, j] = information.of(int(i), width + int(j))
+            metrics[3, i, j] = information.estimate(int(i), width + int(j))
     metrics[:, constant[:width]] = np.nan
     metrics[:, :, constant[width:]] = np.nan
     return metrics

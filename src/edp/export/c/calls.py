@@ -45,7 +45,7 @@ class Calls:
         base, at = WORK[scratch_number(layer)], self.plan.scratch[layer.name] + offset
         return f"{base} + {at}" if at else base
 
-    def of(self, layer: Layer) -> list[str]:
+    def translate(self, layer: Layer) -> list[str]:
         """Return the statements that compute a layer.
 
         Raises:

@@ -211,7 +211,7 @@ class Model:
         # Ages are counts, through which nothing is differentiated.
         parts = [(layer, part) for layer, part in self.graph.slots() if part.name != "age"]
         calls, work = tangents.Tangents(self.graph, self.plan, changes), changes.sizes[Number.FLOAT]
-        lines = [line for layer in self.graph.layers for line in ("", describe(layer), *calls.of(layer))]
+        lines = [line for layer in self.graph.layers for line in ("", describe(layer), *calls.translate(layer))]
         fields = [(tangents.changed(name, part.name), max(1, part.size)) for name, part in parts]
         copies = []
         for meaning, value in self.graph.results.items():
@@ -282,7 +282,7 @@ def clear_work(plan: MemoryPlan) -> list[str]:
 def computed(graph: Graph, plan: MemoryPlan) -> tuple[list[str], list[str]]:
     """Statements of a tick: the layers one after the other, and what becomes of the results."""
     calls = Calls(graph, plan)
-    lines = [line for layer in graph.layers for line in ("", describe(layer), *calls.of(layer))]
+    lines = [line for layer in graph.layers for line in ("", describe(layer), *calls.translate(layer))]
     checks: list[str] = []
     copies = []
     for meaning, value in graph.results.items():

@@ -39,7 +39,7 @@ class Tangents:
         """Return the location of a tangent's scratch memory."""
         return f"t->work + {self.plan.scratch[layer.name] + offset}"
 
-    def of(self, layer: Layer) -> list[str]:
+    def translate(self, layer: Layer) -> list[str]:
         """Return the statements that compute a layer and propagate its tangent.
 
         Raises:
@@ -67,7 +67,7 @@ class Tangents:
         The directions and the change of its value are the last arguments.
         """
         # Tangents come first: they read states that the layer itself brings on.
-        return [call(function, *arguments, "d", self.change(layer.name)), *self.calls.of(layer)]
+        return [call(function, *arguments, "d", self.change(layer.name)), *self.calls.translate(layer)]
 
 
 Write = Callable[[Tangents, Any], list[str]]
@@ -106,7 +106,7 @@ def _gather(t: Tangents, layer: layers.Gather) -> list[str]:
     for name, first, length in runs(t.calls, layer):
         lines.append(call("edp_copy_tangent", t.change(name, first), length, "d", t.change(layer.name, at)))
         at += length
-    return [*lines, *t.calls.of(layer)]
+    return [*lines, *t.calls.translate(layer)]
 
 
 def _clip(t: Tangents, layer: layers.Clip) -> list[str]:
@@ -180,7 +180,12 @@ def _lstm(t: Tangents, layer: memory.Lstm | memory.LayerNormLstm) -> list[str]:
     # The LSTM overwrites its cell, whose old value the tangent still needs.
     copied_state = call("edp_copy", slot(layer, "c"), units, old)
     rest = (gates, units, number(layer.share), norms, old, dgates, *states)
-    return [first, copied_state, *t.calls.of(layer), call("edp_lstm_cell_tangent", *rest, "d", t.change(layer.name))]
+    return [
+        first,
+        copied_state,
+        *t.calls.translate(layer),
+        call("edp_lstm_cell_tangent", *rest, "d", t.change(layer.name)),
+    ]
 
 
 def _gru(t: Tangents, layer: memory.Gru) -> list[str]:
@@ -198,7 +203,7 @@ def _gru(t: Tangents, layer: memory.Gru) -> list[str]:
         "d",
         t.change(layer.name),
     )
-    return [copied_state, *t.calls.of(layer), own]
+    return [copied_state, *t.calls.translate(layer), own]
 
 
 def _min_gru(t: Tangents, layer: memory.MinGru) -> list[str]:
@@ -246,7 +251,7 @@ def _prefix(t: Tangents, layer: memory.PrefixCorrection) -> list[str]:
         old = changed(name, part)
         lines.append("    " + call("edp_add_tangent", old, t.scratch(layer, at), sizes[name, part], "d", old))
         at += sizes[name, part]
-    return [*lines, "}", *t.calls.of(layer)]
+    return [*lines, "}", *t.calls.translate(layer)]
 
 
 def _feedback(t: Tangents, layer: memory.Feedback) -> list[str]:
@@ -256,7 +261,7 @@ def _feedback(t: Tangents, layer: memory.Feedback) -> list[str]:
 def _feed(t: Tangents, layer: memory.Feed) -> list[str]:
     source = layer.inputs[0]
     size, into = t.graph.width_of(source), changed(layer.into, "last")
-    return [call("edp_copy_tangent", t.change(source), size, "d", into), *t.calls.of(layer)]
+    return [call("edp_copy_tangent", t.change(source), size, "d", into), *t.calls.translate(layer)]
 
 
 TANGENTS: dict[type[Layer], Write] = {

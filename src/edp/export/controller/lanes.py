@@ -107,7 +107,7 @@ class LaneModel:
                 continue
             whole = self._whole(calls, layer)
             if whole is None:
-                together += [describe(layer), *calls.of(layer)]
+                together += [describe(layer), *calls.translate(layer)]
                 continue
             yield from _loop(self.name, together)
             yield from (describe(layer), whole)

@@ -167,14 +167,14 @@ class Adaptation:
         values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
-    def to_plain(self) -> Table:
+    def to_dict(self) -> Table:
         """Everything but the arrays, as JSON gives it back."""
         columns, horizons = list(self.columns), list(self.horizons)
         return {"spec": asdict(self.spec), "rate_hz": self.rate_hz, "horizons": horizons, "columns": columns}
 
     @classmethod
-    def from_plain(cls, plain: Table, arrays: Mapping[str, Array]) -> Adaptation:
-        """Create an adaptation from `to_plain` and `arrays`.
+    def from_dict(cls, plain: Table, arrays: Mapping[str, Array]) -> Adaptation:
+        """Create an adaptation from `to_dict` and `arrays`.
 
         Raises:
             ConfigError: they do not go together.
@@ -188,7 +188,7 @@ class Adaptation:
     def digest(self) -> str:
         # Sorted, so that the digest depends on the content and not on the order of fields.
         """Content address."""
-        plain = self.to_plain()
+        plain = self.to_dict()
         # The word before bundles of schema 8: a state that a controller saved bears the digest.
         plain["spec"] = {"rest" if key == "dead_zone" else key: value for key, value in plain["spec"].items()}
         state = hashlib.blake2b(repr(sorted(plain.items())).encode(), digest_size=16)

@@ -33,7 +33,7 @@ class WeightRounding:
     weights: Mapping[str, NDArray[np.int8]] = field(default_factory=dict)
     moments: Mapping[str, Array] = field(default_factory=dict)
 
-    def of(self, matrix: str, weight: Array, scale: Array) -> NDArray[np.int8]:
+    def round(self, matrix: str, weight: Array, scale: Array) -> NDArray[np.int8]:
         """Whole multiples of a scale for each output.
 
         Args:

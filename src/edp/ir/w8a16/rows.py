@@ -36,7 +36,7 @@ def rows(
     """
     input_frac, frac = formats
     scale = _scale(weight, bias, input_frac)
-    rounded = rounding.of(matrix, weight, scale)
+    rounded = rounding.round(matrix, weight, scale)
     offset = np.floor(bias / scale * 2.0**input_frac + 0.5)
     _check(matrix, rounded, offset)
     multiplier, shift = fixed.factor(scale * 2.0 ** (frac - input_frac))

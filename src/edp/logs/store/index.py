@@ -209,7 +209,7 @@ def index_of(table: object, where: str) -> StoreIndex:
 
 def plain_index(index: StoreIndex) -> dict[str, object]:
     """Convert an index to JSON types."""
-    plain: dict[str, object] = _TREE.plain(index)
+    plain: dict[str, object] = _TREE.to_dict(index)
     return plain
 
 

@@ -48,7 +48,7 @@ class FaultClass:
         sign = ("-",) if self.sizes and self.sizes[0] < self.neutral else ()
         return ":".join((self.kind, *filter(None, (self.site,)), *sign))
 
-    def plain(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, object]:
         """Convert to JSON types."""
         return asdict(self) | {"sizes": list(self.sizes)}
 
@@ -81,7 +81,7 @@ class Cause:
     grade: float | None = None
     grave: bool = False
 
-    def plain(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, object]:
         """Convert to JSON types."""
         return asdict(self)
 

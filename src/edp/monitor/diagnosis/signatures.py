@@ -113,7 +113,7 @@ def save_dictionary(dictionary: Dictionary, folder: Path) -> None:
     header = {
         "schema": SCHEMA,
         "summaries": list(dictionary.summaries),
-        "classes": [fault.plain() for fault in dictionary.classes],
+        "classes": [fault.to_dict() for fault in dictionary.classes],
         "signatures": len(dictionary.owner),
         **{name: getattr(dictionary, name) for name in NUMBERS},
         "confusions": [asdict(pair) for pair in dictionary.confusions],

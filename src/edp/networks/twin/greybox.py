@@ -158,14 +158,14 @@ class GreyBox:
     def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> GreyTwin:
         """Build the grey box with the given parameters. Does not read the machine file of a linkage again."""
         elements = self.elements(channels)
-        table = self.table(elements, channels, scales, KnownLinkage.of(arrays) if self.linkage else None)
+        table = self.table(elements, channels, scales, KnownLinkage.from_arrays(arrays) if self.linkage else None)
         numbers = arrays["numbers"].astype(np.float64)
         if not (numbers[table.positive] > 0).all():
             raise ValueError("one of its numbers is not positive")
         if not (numbers == numbers[table.priors.leader]).all():
             raise ValueError("both sides of one of its motors have not the same displacement")
         scales = turning_scales(elements, channels, scales)
-        wiring = GreyChannelMap.of(elements, channels, scales)
+        wiring = GreyChannelMap.connect(elements, channels, scales)
         return GreyTwin(channels, scales, self, (table, wiring), numbers, arrays["full"])
 
     def _network(self, channels: TwinChannels, seed: int) -> dict[str, Array]:

@@ -60,14 +60,14 @@ class FreeRunIntervals:
         at_log, knots_log = np.log(np.maximum(ticks, 1)), np.log(self.ticks)
         return np.stack([np.interp(at_log, knots_log, column) for column in self.half_width.T], axis=1)
 
-    def to_plain(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, object]:
         """Convert to JSON types."""
         widths = [[float(value) for value in row] for row in self.half_width]
         return {"coverage": self.coverage, "ticks": list(self.ticks), "half_width": widths, "runs": self.runs}
 
     @staticmethod
-    def from_plain(entry: Table, channels: TwinChannels) -> FreeRunIntervals:
-        """Create intervals from the result of `to_plain`.
+    def from_dict(entry: Table, channels: TwinChannels) -> FreeRunIntervals:
+        """Create intervals from the result of `to_dict`.
 
         Raises:
             ValueError: not the intervals of a twin with these channels.

@@ -90,14 +90,14 @@ class N4sid:
         most = len(list_solved_columns(channels)) * (self.horizon - 1)
         orders = sorted({min(order, most) for order in self.orders})
         chosen = orders[0] if len(orders) == 1 else self._choose_order(channels, scales, train, orders)
-        solution = _Projections.of(_scale_series(channels, scales, train), self.horizon)
+        solution = _Projections.from_segments(_scale_series(channels, scales, train), self.horizon)
         return self._twin(channels, scales, solution, chosen)
 
     def _choose_order(
         self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], orders: Sequence[int]
     ) -> int:
         fitted, judged = _divide(train, self.prefix_ticks + 2 * self.horizon + 2)
-        solution = _Projections.of(_scale_series(channels, scales, fitted), self.horizon)
+        solution = _Projections.from_segments(_scale_series(channels, scales, fitted), self.horizon)
         return min(orders, key=lambda order: _free_error(self._twin(channels, scales, solution, order), judged))
 
     def _twin(self, channels: TwinChannels, scales: TwinScales, solution: _Projections, order: int) -> Twin:
@@ -210,7 +210,7 @@ class _Projections:
     by_past: Doubles
 
     @staticmethod
-    def of(pairs: Sequence[Pair], horizon: int) -> _Projections:
+    def from_segments(pairs: Sequence[Pair], horizon: int) -> _Projections:
         """Compute one QR factorisation of all windows, stacked over the segments.
 
         Raises:

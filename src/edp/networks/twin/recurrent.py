@@ -140,7 +140,7 @@ class RecurrentTwin(Twin):
         members: int = 1,
     ) -> None:
         super().__init__(channels, scales, prefix_ticks)
-        self.network, self.static, self.bounds = network, static, Bounds.of(channels, scales)
+        self.network, self.static, self.bounds = network, static, Bounds.from_scales(channels, scales)
         self.members = members
 
     def initial_state(self, command: Array, measured: Array) -> TwinState:

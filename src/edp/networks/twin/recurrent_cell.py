@@ -114,7 +114,7 @@ class Bounds:
     velocities: int
 
     @staticmethod
-    def of(channels: TwinChannels, scales: TwinScales) -> Bounds:
+    def from_scales(channels: TwinChannels, scales: TwinScales) -> Bounds:
         """Return the bounds of a twin in its scaled units."""
         offset, width = scales.answer_offset, scales.answer_width
         low, high = (np.ascontiguousarray((end - offset) / width) for end in (scales.low, scales.high))

@@ -53,7 +53,7 @@ class TwinScales:
         return {e.name: (commands if e.name.startswith("command") else answers,) for e in fields(TwinScales)}
 
     @staticmethod
-    def of(arrays: Mapping[str, Array]) -> TwinScales:
+    def from_arrays(arrays: Mapping[str, Array]) -> TwinScales:
         """Create scales from arrays by name; other arrays are ignored.
 
         Raises:

@@ -148,11 +148,15 @@ def scene_of(
 
 
 def _select_rows(line: ForecastLine, rows: NDArray[np.int_]) -> ForecastLine:
-    def of(values: Array | None) -> Array | None:
+    def select(values: Array | None) -> Array | None:
         return None if values is None else values[rows]
 
     return replace(
-        line, predicted=line.predicted[rows], measured=line.measured[rows], lower=of(line.lower), upper=of(line.upper)
+        line,
+        predicted=line.predicted[rows],
+        measured=line.measured[rows],
+        lower=select(line.lower),
+        upper=select(line.upper),
     )
 
 

@@ -234,7 +234,7 @@ class Panel:
     title: str = ""
     second: ChartAxis | None = None
 
-    def of(self, chosen: Mapping[str, str]) -> Panel:
+    def select(self, chosen: Mapping[str, str]) -> Panel:
         """Return the panel with the marks of the chosen options."""
         return replace(self, marks=tuple(mark for mark in self.marks if fits(mark, chosen)))
 
@@ -298,7 +298,7 @@ class Chart:
     def first(self) -> Chart:
         """Return the chart with the first option of each choice, for media without choices."""
         chosen = {control.key: control.options[0][0] for control in self.choices}
-        return replace(self, panels=tuple(panel.of(chosen) for panel in self.panels), choices=())
+        return replace(self, panels=tuple(panel.select(chosen) for panel in self.panels), choices=())
 
     def pictures(self) -> Iterator[Chart]:
         """Yield one chart without choices for each picture; title and axes state the chosen options."""
@@ -307,10 +307,10 @@ class Chart:
         for options in itertools.product(*(control.options for control in chosen_by)):
             texts = {control.key: text for control, (_, text) in zip(chosen_by, options)}
             chosen = {control.key: key for control, (key, _) in zip(chosen_by, options)}
-            panels = [_set_title(panel.of(chosen), texts) for panel in self.panels]
+            panels = [_set_title(panel.select(chosen), texts) for panel in self.panels]
             width, height = self.inches
             if across is not None:
-                parts = [(text, panel.of({across.key: key})) for key, text in across.options for panel in panels]
+                parts = [(text, panel.select({across.key: key})) for key, text in across.options for panel in panels]
                 panels = [replace(panel, title=text) for text, panel in parts if panel.marks]
                 width = max(width * len(panels), 7.0)  # one panel alone still has room for a title
             if any(panel.marks for panel in panels):

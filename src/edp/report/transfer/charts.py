@@ -39,7 +39,7 @@ def picture_charts(facts: Transfer) -> list[Chart]:
         label = facts.methods[method].label
         course = prediction_chart(facts, (method,))
         name = course.choices[0].options[0][0]
-        panels = tuple(panel.of({RECORDING: name}) for panel in course.panels)
+        panels = tuple(panel.select({RECORDING: name}) for panel in course.panels)
         course = replace(course, panels=panels, choices=course.choices[1:], title=f"{label}, {name}, {{horizon}}")
         charts += [replace(course, file=f"prediction_{method}_k{{horizon}}"), error_chart(facts, (method,))]
         charts[-1] = replace(charts[-1], title=f"{label}, {{horizon}}", file=f"errors_{method}_k{{horizon}}")

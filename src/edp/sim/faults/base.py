@@ -213,8 +213,8 @@ class FaultSpec:
         kind = FAULTS[self.kind]
         return kind.neutral * kind.units.get(kind.unit, 1.0)
 
-    def plain(self) -> dict[str, object]:
-        """Convert to plain data; `FaultSpec(**fault.plain()) == fault`. Default values are omitted."""
+    def to_dict(self) -> dict[str, object]:
+        """Return the fault in JSON types without default values; `FaultSpec(**fault.to_dict()) == fault`."""
         values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         return {key: value for key, value in values.items() if key == "kind" or value not in (None, "", 0.0)} | (
             # A size of zero is a size.

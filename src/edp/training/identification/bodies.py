@@ -54,7 +54,7 @@ class Poses:
     levers: Doubles
 
     @staticmethod
-    def of(machine: Machine, strokes: Doubles) -> Poses:
+    def from_strokes(machine: Machine, strokes: Doubles) -> Poses:
         """Angles and lever arms at strokes ``(pose, 3)``; at most `MAX_POSES`, evenly chosen."""
         axes, plant = pack(machine)
         chosen = strokes[:: max(1, -(-len(strokes) // MAX_POSES))]

@@ -50,7 +50,7 @@ class MachineNumber:
         """Name in messages and comments."""
         return self.path + ("" if self.cylinder is None else f"[{CYLINDERS[self.cylinder]}]")
 
-    def of(self, machine: Machine) -> float:
+    def read(self, machine: Machine) -> float:
         """Return its value: the flow of a rating, the excess over Coulomb friction for static friction."""
         value = getattr(getattr(machine, self.section), self.key)
         value = value if self.cylinder is None else value[self.cylinder]
@@ -123,7 +123,7 @@ _LEAST = {"conflux_extra_dead_time": 5e-3, "spool_leakage": 1e-16, "piston_leaka
 
 def guesses(machine: Machine) -> Doubles:
     """Values of a machine from which a fit begins ``(number,)``; never zero."""
-    values = np.array([number.of(machine) for number in MACHINE_NUMBERS])
+    values = np.array([number.read(machine) for number in MACHINE_NUMBERS])
     for k, number in enumerate(MACHINE_NUMBERS):
         if values[k] > 0.0:
             continue

@@ -86,7 +86,7 @@ class MachineParametrisation:
 
     def machine(self, theta: Doubles) -> Machine:
         """Return the machine for these coordinates; fixed parameters equal the guess, zeros included."""
-        stated = np.array([number.of(self.base) for number in MACHINE_NUMBERS])
+        stated = np.array([number.read(self.base) for number in MACHINE_NUMBERS])
         values = np.where(self.free, np.minimum(self.machine_priors.values(theta[:COUNT]), MOST), stated)
         # A machine file refuses strokes that its pins cannot take, and cushions that meet in the middle.
         values[STROKES] = np.clip(values[STROKES], *(share * stated[STROKES] for share in STROKE_RANGE))

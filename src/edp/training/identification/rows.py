@@ -55,7 +55,7 @@ class IdentifiedNumber:
             return unknown
         return f"{'' if self.is_told else 'roughly '}{typed(self.low, 3)} to {typed(self.high, 3)}"
 
-    def plain(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, object]:
         """For JSON."""
         return dict(vars(self))
 
@@ -72,10 +72,10 @@ def number_rows(base: Machine, machine: Machine, left: Doubles, excited: NDArray
     rows = []
     for number, share, is_known in zip(MACHINE_NUMBERS, left, excited, strict=True):
         # Where parts of the logs contradict one another, an interval may have no end.
-        value, deviation = number.of(machine), min(share, FARTHEST) * number.width
+        value, deviation = number.read(machine), min(share, FARTHEST) * number.width
         low, high = interval(value, deviation if is_known else 0.0, positive=True)
         is_told = bool(is_known and np.exp(NORMAL * deviation) <= 1.0 + TOLD)
-        measured = number.label, number.group, number.unit, number.of(base), value, float(low), float(high)
+        measured = number.label, number.group, number.unit, number.read(base), value, float(low), float(high)
         rows.append(IdentifiedNumber(*measured, bool(is_known), is_told))
     return rows
 

@@ -282,7 +282,7 @@ def read(
         DataError: nothing to read, or a log that cannot be used as it is.
         ConfigError: a map or a repair that cannot be.
     """
-    source = DataSource.of(path)
+    source = DataSource.from_path(path)
     if map is None:
         # The maps of a data-set file are in it, and those of a store were applied when it was built.
         signal_map = None if source.path.suffix == ".toml" or is_store(source.path) else SignalMap(others=True)

@@ -143,9 +143,9 @@ class ReadOnce:
         self._recordings = self._recordings or self._source.read()
         return self._recordings
 
-    def to_plain(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, object]:
         """Return the plain values of the source."""
-        return self._source.to_plain()
+        return self._source.to_dict()
 
 
 def prepare(source: ReadOnce, settings: AutoSettings, foundation: Foundation | None) -> tuple[Prepared, Amount]:

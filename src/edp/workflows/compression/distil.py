@@ -163,7 +163,7 @@ def read_run(run: str | Path, changes: Sequence[Change] = ()) -> tuple[Predictor
         )
     # Frozen sessions were judged once; a student that trains on them would make the test part worthless.
     keep_frozen(before.split, experiment.split)
-    return bundle.predictor, experiment, DataSource.from_plain(read_provenance(folder).origin.reader)
+    return bundle.predictor, experiment, DataSource.from_dict(read_provenance(folder).origin.reader)
 
 
 def read_frozen_sessions(run: str | Path, experiment: Experiment) -> dict[str, str]:

@@ -207,7 +207,7 @@ def search(
         if result.best is not None:
             test = comparison.open_test_set(result.best, folder, held_out, request.again)
         # The test part of the same data that `edp evaluate` has judged is no sealed set any more.
-        same_data = held_out.name == TEST_PART and (source is None or source.to_plain() == own.to_plain())
+        same_data = held_out.name == TEST_PART and (source is None or source.to_dict() == own.to_dict())
         seen = same_data and is_file_at(Path(run) / "scores.json")
         test = replace(test, seen_before=held_out.opened_before or len(test.openings) > 1 or seen)
         result = replace(result, held_out_test=test)

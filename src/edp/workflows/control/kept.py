@@ -35,8 +35,8 @@ from edp.storage.paths import is_file_at
 from edp.storage.runs import missing_text
 from edp.training.bundle import (
     add_plugins,
-    channel_from_plain,
-    channel_to_plain,
+    channel_from_dict,
+    channel_to_dict,
     convert_damage,
     read_arrays,
     remove_old_arrays,
@@ -115,7 +115,7 @@ def keep_controller(
     if twin is not None:
         # A controller plans in free air, and estimates what soil does.
         save_twin(replace(load_twin(twin), ground=None), folder / TWIN)
-    machine = MACHINE_FILE.plain(plant.geometry.machine)
+    machine = MACHINE_FILE.to_dict(plant.geometry.machine)
     write_bytes(folder / MACHINE, tomli_w.dumps(machine).encode())
     entry = write_arrays(folder, "arrays", save_arrays({k: np.ascontiguousarray(v) for k, v in arrays.items()}))
     header = {
@@ -123,7 +123,7 @@ def keep_controller(
         "edp": __version__,
         "rate_hz": plant.rate_hz,
         "source": plant.source,
-        "channels": [channel_to_plain(channel) for channel in plant.channels],
+        "channels": [channel_to_dict(channel) for channel in plant.channels],
         "twin": twin is not None,
         "arrays": entry,
     }
@@ -146,7 +146,7 @@ def load_kept(run: str | Path) -> KeptController:
         raise StorageError(missing_text(path, "control", "a run of edp control, or is one of an earlier version"))
     with convert_damage(folder):
         header = sealed_header(folder / HEADER, "controller", (SCHEMA,), "run edp control again")
-        channels = tuple(channel_from_plain(entry) for entry in header["channels"])
+        channels = tuple(channel_from_dict(entry) for entry in header["channels"])
         arrays = load_arrays(read_arrays(folder, header["arrays"]))
         rules = ARRAYS | (MAP if {*MAP} & {*arrays} else {})
         arrays = checked_arrays(arrays, rules, "its arrays", {"channels": len(channels)})

@@ -78,7 +78,7 @@ def control_loops(
     if guard is not None:
         guard.reset(bench.plant)
     models = {"sources": chosen.digests(), "guard": None if guard is None else repr(guard)}
-    key = run_key(CONTROL_SETTINGS.plain(experiment) | models, "")
+    key = run_key(CONTROL_SETTINGS.to_dict(experiment) | models, "")
     with Run.create(out, "control", key, control_toml(experiment)) as run:
         units = run.file(UNITS)
         results = bench.results(progress=progress, guard=guard, divided=DividedLoops(workers, units, key))
@@ -101,7 +101,7 @@ def control_loops(
 
 
 def _content(experiment: ControlExperiment, tasks: Sequence[ControlTask], results: Sequence[LoopResult]) -> ControlFile:
-    plain = CONTROL_SETTINGS.plain(experiment)
+    plain = CONTROL_SETTINGS.to_dict(experiment)
     summary = _summary(results)
     return ControlFile(
         edp=__version__,

@@ -102,7 +102,7 @@ def tune_gains(
     bench.check()
     judge.check()
     sources = {"tuned_on": tuned_on.digests(), "judged_on": judged_on.digests()}
-    key = run_key(CONTROL_SETTINGS.plain(experiment) | sources | {"tuning": asdict(chosen)}, "")
+    key = run_key(CONTROL_SETTINGS.to_dict(experiment) | sources | {"tuning": asdict(chosen)}, "")
     with Run.create(out, "tuning", key, control_toml(experiment)) as run, workers.stay() as staying:
         if run.is_finished:
             content = TuningFile.read(run.path)

@@ -118,7 +118,7 @@ def try_feature_sets(
     for done, trial in enumerate(planned):
         tell(trial.name, done, len(planned), None)
         bundle = _train_trial(source, trial, partial(tell, trial.name, done, len(planned)))
-        finished.setdefault(trial.name, []).append(_Finished.of(bundle, trial.run))
+        finished.setdefault(trial.name, []).append(_Finished.from_bundle(bundle, trial.run))
     trials = _tabulate_trials(finished, notes, experiment.task.horizons)
     trials.write(folder)
     return trials
@@ -253,7 +253,7 @@ class _Finished:
     scores: ScoresFile
 
     @staticmethod
-    def of(bundle: Bundle, run: Path) -> _Finished:
+    def from_bundle(bundle: Bundle, run: Path) -> _Finished:
         return _Finished(
             bundle.task.inputs,
             len(bundle.task.features.features),

@@ -160,7 +160,7 @@ def identify(
     if loaded is not None:
         check_same_linkage(loaded[0], base, machine)
     made_of = {"machine": asdict(base), "from": None if run is None else model_digest(run)}
-    key = run_key({"identify": TWIN_SETTINGS.plain(settings)} | made_of, data.digest)
+    key = run_key({"identify": TWIN_SETTINGS.to_dict(settings)} | made_of, data.digest)
     with Run.create(target.with_suffix(RUN), KIND, key, twin_toml(settings)) as opened:
         if loaded is None:
             fitted = _fit_grey_box(opened, base, machine, grey, (channels, data, settings.training.seed), progress)
@@ -197,7 +197,7 @@ def identify(
         facts = {"schema": 1, "machine": str(target), "base": base.name, "basis": BASIS, "notes": notes}
         write_json(
             target.with_suffix(".json"),
-            facts | {"numbers": [row.plain() for row in rows], "models": plain_value(scores)},
+            facts | {"numbers": [row.to_dict() for row in rows], "models": plain_value(scores)},
         )
         seconds = time.process_time() - began
         provenance = training_provenance(source, data, settings.training.seed, 1, seconds)
@@ -376,7 +376,7 @@ def _machine(fit: _FittedMachine, spread: Doubles, data: Prepared) -> tuple[Mach
     machine = replace(machine, oil=replace(machine.oil, temperature=own.parts.celsius))
     speeds = len(twin.channels.velocities)
     strokes = np.concatenate([part.targets[:, speeds : 2 * speeds] for part in data.train]).astype(np.float64)
-    poses = Poses.of(machine, strokes)
+    poses = Poses.from_strokes(machine, strokes)
     nine, body = body_rows(own, load, spread[count:, count:], twin.wiring.z_of, poses)
     numbers = number_rows(own.base, machine, left[:count], excited)
     if own.parts.table.front is not None:

@@ -134,7 +134,7 @@ class LiveRun:
         preparing = (source or SOURCES[order.source]).preparing
         if preparing:
             self._on_event("preparing", preparing)
-        self.source = source or SOURCES[order.source].of(order.options, needs_of(models, order.monitor))
+        self.source = source or SOURCES[order.source].from_options(order.options, needs_of(models, order.monitor))
         try:
             self._parts, layout = self._assemble_parts(models)
             self.pace = Pace(self.source.rate_hz, order.speed)
@@ -314,7 +314,7 @@ class LiveRun:
             source=label(source.text),
             rate_hz=source.rate_hz,
             width=width,
-            traces=[LiveTrace.of(channel) for channel in source.channels],
+            traces=[LiveTrace.from_channel(channel) for channel in source.channels],
             forecasts=forecasts,
             geometry=geometry,
             angles=list(angles),

@@ -138,7 +138,7 @@ def propose(path: str | Path | Sequence[str | Path], progress: Progress = SILENT
     Raises:
         DataError: no log there can be read, or nothing in it can be predicted.
     """
-    source = DataSource.of(path)
+    source = DataSource.from_path(path)
     for one in source.paths:
         if one.suffix.lower() == ".toml":
             raise ConfigError(f"'{one}' is a data-set file; give the log or the folder of logs that it is to describe")

@@ -150,7 +150,7 @@ class Dispatcher:
         # A search that goes on comes by earlier batches first, and one that stops here needs what it had.
         if new and all(record.status in FINAL for record in records.values()):
             self.ledger.keep_states({*self.teacher_keys, *batch})
-        return [Outcome.of(request, records[key]) for request, key in zip(requests, keys, strict=True)]
+        return [Outcome.from_record(request, records[key]) for request, key in zip(requests, keys, strict=True)]
 
     def _job(self, request: TrainingRequest) -> Job:
         return job_of(request, self.data, self.threads, self.seconds, self.memory_mb)

@@ -48,7 +48,7 @@ class SearchPlan:
     experiment: Experiment
     preset: str = ""
 
-    def to_plain(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, object]:
         """Return the identity of a study, in parts that a message can name."""
         spec = plain_spec(self.spec)
         return {"space": spec.pop("space"), "search": spec, "network": Arm.from_experiment(self.experiment).tables}

@@ -122,7 +122,7 @@ def run_search(
     # Samples that a prediction reads and looks ahead.
     reach = plan.experiment.model.window + max(plan.experiment.task.horizons)
     parts = None if is_enough(len(recordings), plan.spec) else divide_logs(source, recordings, reach)
-    data = _Data.of(recordings if parts is None else parts.recordings, plan)
+    data = _Data.from_recordings(recordings if parts is None else parts.recordings, plan)
     development, test, second = set_apart(data.names, data.families, plan.spec)
     target = make_folder(folder)
     if parts is not None:
@@ -137,12 +137,12 @@ def run_search(
         if ledger.damaged:
             progress.note(f"{len(ledger.damaged)} damaged records were set apart and will be trained again")
         # A folder is bound to data and settings: another search in it would mix records.
-        ledger.bind({"data": data.digest, **plan.to_plain()})
+        ledger.bind({"data": data.digest, **plan.to_dict()})
         if parts is not None:
             write_bytes(source.path, parts.data_set().encode())
         base = Arm.from_experiment(plan.experiment)
         context = SearchContext(
-            plan.spec, base, source.to_plain(), development, test, data.channels, data.unit, second=second
+            plan.spec, base, source.to_dict(), development, test, data.channels, data.unit, second=second
         )
         study_log = StudyLog(target, _study(plan, data, source, context), context)
         executor = open_things.enter_context(resources.open())
@@ -187,7 +187,7 @@ class _Data:
     digests: dict[str, str]
 
     @staticmethod
-    def of(recordings: Sequence[Recording], plan: SearchPlan) -> _Data:
+    def from_recordings(recordings: Sequence[Recording], plan: SearchPlan) -> _Data:
         _refuse_twice(recordings)
         unit = _check_channels(recordings, plan)
         names = tuple(recording.name for recording in recordings)
@@ -247,7 +247,7 @@ class _Observer:
 
     def on_record(self, record: Record, order: TrainingRequest, trained: bool) -> None:
         if record.result is not None and set(order.judged) & set(self.context.second):
-            self.second[record.key] = Outcome.of(order, record)
+            self.second[record.key] = Outcome.from_record(order, record)
         self.study_log.on_record(record, order, trained)
         self.study_log.report(self.stage)
 

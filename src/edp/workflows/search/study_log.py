@@ -98,7 +98,7 @@ class StudyLog:
         self._heard.add(record.key)
         which = self._row_of[record.key]
         row = self.rows[which]
-        outcome = Outcome.of(order, record)
+        outcome = Outcome.from_record(order, record)
         score, result = outcome.mean(self.horizon), record.result or {}
         seconds = float(record.measured.get("seconds", 0.0))
         row = replace(

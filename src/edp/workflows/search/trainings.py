@@ -40,7 +40,7 @@ class TrainingRequest:
 
     Attributes:
         settings: the whole experiment as plain tables (`edp.workflows.search.arms.Arm`); its split is not used.
-        source: result of `DataSource.to_plain`.
+        source: result of `DataSource.to_dict`.
         train: names of the sessions that train.
         judged: names of the sessions that judge; none of them trains, and with one epoch none chooses anything.
         seed: root of every random choice of the training.
@@ -137,7 +137,7 @@ class Outcome:
     message: str = ""
 
     @staticmethod
-    def of(order: TrainingRequest, record: Record) -> Outcome:
+    def from_record(order: TrainingRequest, record: Record) -> Outcome:
         """Return the outcome of a request from the ledger's record."""
         return Outcome(order, str(record.status), record.result, record.message)
 
@@ -288,7 +288,7 @@ class _Named:
 @lru_cache(maxsize=1)
 def _recordings(source: str) -> Sequence[Recording]:
     """Return the recordings of a source, kept by the process that trains on them repeatedly."""
-    return DataSource.from_plain(json.loads(source)).read()
+    return DataSource.from_dict(json.loads(source)).read()
 
 
 def costs_of(arm: Arm, channels: Sequence[str] = ()) -> dict[str, float]:

@@ -48,7 +48,7 @@ class BaseTwin:
     digest: str
 
     @staticmethod
-    def of(folder: str | Path) -> BaseTwin:
+    def from_run(folder: str | Path) -> BaseTwin:
         """Return the twin of a run folder.
 
         Raises:

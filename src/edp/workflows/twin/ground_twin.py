@@ -61,7 +61,7 @@ def ground_twin(
     progress.note("reading recordings")
     channels, data = cut_recordings(source.read(), experiment)
     base.check(channels, data.train)
-    key = run_key({"twin": TWIN_SETTINGS.plain(experiment), "from": base.digest}, data.digest)
+    key = run_key({"twin": TWIN_SETTINGS.to_dict(experiment), "from": base.digest}, data.digest)
     with Run.create(out, "twin", key, twin_toml(experiment)) as run:
         if run.is_finished:
             return load_twin(run.path), True

@@ -167,7 +167,7 @@ def evaluate_twin(
     check_writable(folder)
     experiment = load_twin_experiment(folder / "config.toml")
     progress.note("reading recordings")
-    recordings = DataSource.from_plain(bundle.provenance.origin.reader).read()
+    recordings = DataSource.from_dict(bundle.provenance.origin.reader).read()
     channels, data = cut_recordings(recordings, experiment)
     if data.digest != bundle.provenance.origin.digest:
         raise DataError(

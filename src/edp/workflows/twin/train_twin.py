@@ -90,7 +90,7 @@ def train_twin(
         grounded, finished = ground_twin(source, experiment, out, start, progress)
         return TrainedTwin(grounded, read_models(grounded.scores, f"'{out}'"), finished)
     progress.note("reading recordings")
-    base = None if start is None else BaseTwin.of(start)
+    base = None if start is None else BaseTwin.from_run(start)
     if base is not None:
         experiment = base.settled(experiment)
     recordings = source.read()
@@ -101,7 +101,7 @@ def train_twin(
         begun = {"from": base.digest}
     _check_judged(channels, data, experiment, base)
     # Runs of versions that knew no ground are the same ones.
-    settings = {name: value for name, value in TWIN_SETTINGS.plain(experiment).items() if name != "ground"}
+    settings = {name: value for name, value in TWIN_SETTINGS.to_dict(experiment).items() if name != "ground"}
     key = run_key({"twin": settings} | begun | _linkage(experiment), data.digest)
     create = Run.create(out, "twin", key, twin_toml(experiment))
     with create as run, workers.stay() as staying:

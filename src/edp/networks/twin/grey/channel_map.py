@@ -39,7 +39,7 @@ class GreyChannelMap:
     nodes: int
 
     @staticmethod
-    def of(elements: Elements, channels: TwinChannels, scales: TwinScales) -> GreyChannelMap:
+    def connect(elements: Elements, channels: TwinChannels, scales: TwinScales) -> GreyChannelMap:
         """Return the wiring of connected elements."""
         names = [channel.name for channel in channels.answers]
         commands = [channel.name for channel in channels.commands]

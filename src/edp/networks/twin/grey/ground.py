@@ -79,12 +79,12 @@ class GroundLaw(ABC):
         """Return the undisturbed ground before a run."""
 
     @abstractmethod
-    def plain(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, object]:
         """All of it as JSON takes it."""
 
     @classmethod
     @abstractmethod
-    def of(cls, plain: Mapping[str, object]) -> GroundLaw:
+    def from_dict(cls, plain: Mapping[str, object]) -> GroundLaw:
         """From what `plain` gave.
 
         Raises:

@@ -123,7 +123,7 @@ class DragLaw(GroundLaw):
     def contact(self, twin: GreyTwin) -> DragContact:
         return DragContact(self._front(twin), self.numbers, self._level(twin))
 
-    def plain(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, object]:
         # JSON has no infinity.
         deviations = [float(value) if np.isfinite(value) else None for value in self.deviations]
         return {
@@ -134,7 +134,7 @@ class DragLaw(GroundLaw):
         }
 
     @classmethod
-    def of(cls, plain: Mapping[str, Any]) -> DragLaw:
+    def from_dict(cls, plain: Mapping[str, Any]) -> DragLaw:
         numbers = np.array(plain["numbers"], float)
         deviations = np.array([np.inf if value is None else value for value in plain["deviations"]], float)
         bucket, surface = plain["bucket_m"], plain["surface_m"]

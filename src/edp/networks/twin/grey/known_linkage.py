@@ -86,7 +86,7 @@ class KnownLinkage:
         return KnownLinkage(_single(values), _single(bodies.ravel()))
 
     @staticmethod
-    def of(arrays: Mapping[str, Singles]) -> KnownLinkage:
+    def from_arrays(arrays: Mapping[str, Singles]) -> KnownLinkage:
         """From the arrays of a bundle, which may be damaged.
 
         Raises:

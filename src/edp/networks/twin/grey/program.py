@@ -137,8 +137,8 @@ class ExpressionAlgebra:
 
     def derivatives(self, results: Sequence[Any], variables: Sequence[Expression]) -> list[list[Expression]]:
         """Return the Jacobian as nested lists, one row per result."""
-        slopes = self.graph.jacobian([self.graph.of(result) for result in results], variables)
-        zero = self.graph.of(0.0)
+        slopes = self.graph.jacobian([self.graph.wrap(result) for result in results], variables)
+        zero = self.graph.wrap(0.0)
         return [[slopes.get((i, k), zero) for k in range(len(variables))] for i in range(len(results))]
 
 
@@ -214,14 +214,14 @@ class _Functions:
 
     def _add(self, name: str, results: Sequence[Any]) -> None:
         self.results = max(self.results, len(results))
-        self.module.add(name, [self.graph.of(result) for result in results])
+        self.module.add(name, [self.graph.wrap(result) for result in results])
 
     def _slopes(
         self, group: int, first: int, results: Sequence[Any], variables: dict[int, Expression]
     ) -> list[Expression]:
         """Return the derivatives by `variables` (by column) and record their positions in the results."""
         columns = list(variables)
-        slopes = self.graph.jacobian([self.graph.of(result) for result in results], list(variables.values()))
+        slopes = self.graph.jacobian([self.graph.wrap(result) for result in results], list(variables.values()))
         self._note(group, first, [(row, columns[k]) for row, k in slopes])
         return list(slopes.values())
 

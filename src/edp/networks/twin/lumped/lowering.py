@@ -53,7 +53,7 @@ class _Tick:
         one = np.ones(self.build.width(x))
         return self.build.add(ScaleShift, name, x, gain=gain * one, shift=shift * one)
 
-    def of(self, function: Function, name: str, x: str) -> str:
+    def apply(self, function: Function, name: str, x: str) -> str:
         """Apply a function to each element."""
         return self.build.add(Activate, name, x, function=function, size=self.build.width(x))
 
@@ -125,7 +125,7 @@ def _masses(tick: _Tick) -> str:
     velocity = tick.read("velocity", columns)
     for k in range(twin.spec.steps):
         with tick.build.inside(f"step_{k + 1}"):
-            side = tick.of(Function.TANH, "side", tick.line("slip", velocity, 1.0 / slip))
+            side = tick.apply(Function.TANH, "side", tick.line("slip", velocity, 1.0 / slip))
             damping = tick.line("damping", side, viscous * skew, viscous)
             flat = tick.line("flat", tick.both("square", MULTIPLY, side, side), -1.0 / slip, 1.0 / slip)
             lean = tick.both("lean", MULTIPLY, tick.line("rise", velocity, viscous * skew, coulomb), flat)
@@ -166,7 +166,7 @@ def _tanks(tick: _Tick) -> list[tuple[str, list[int]]]:
     if hidden:
         own = [i for i, tank in enumerate(tanks) if not tank.level]
         left = tick.both("left", ADD, build.pick("before", before, own), build.pick("rise", risen, own))
-        build.add(Feed, "remembered", tick.of(Function.RELU, "no_less_than_empty", left), into=hidden)
+        build.add(Feed, "remembered", tick.apply(Function.RELU, "no_less_than_empty", left), into=hidden)
     if not measured:
         return []
     own, count = [i for i, tank in enumerate(tanks) if tank.level], len(twin.channels.velocities)
@@ -192,7 +192,7 @@ def _add_level_changes(tick: _Tick, before: str) -> str:
     which = [twin.inputs[tank.source] if p else 0 for tank, p in zip(tanks, pumped, strict=True)]
     width = EDGE * twin.scales.command_width[which].astype(np.float64)
     lifted = tick.line("above_offset", build.pick("pumps", INPUT, which), 1.0 / width, -zero / width)
-    filled = tick.line("pumped", tick.of(Function.SOFTPLUS, "ramp", lifted), np.where(pumped, inflow * width, 0.0))
+    filled = tick.line("pumped", tick.apply(Function.SOFTPLUS, "ramp", lifted), np.where(pumped, inflow * width, 0.0))
     risen = ""
     for k in range(twin.spec.steps):
         with build.inside(f"step_{k + 1}"):
@@ -210,13 +210,13 @@ def _rates(tick: _Tick, levels: str, pumped: str) -> str:
     inflow, outflow, exponent = (tick.numbers(names, n) for n in ("inflow", "outflow", "exponent"))
     edge, zero = tick.numbers(names, "edge", 1.0), tick.numbers(names, "zero", 0.0)
     gain, shift = 1.0 / (edge * EDGE), -zero / (edge * EDGE)
-    full = tick.of(Function.SOFTPLUS, "full", tick.line("share", levels, gain, shift))
+    full = tick.apply(Function.SOFTPLUS, "full", tick.line("share", levels, gain, shift))
     bound = np.full(len(tanks), EMPTY)
     share = build.add(Clip, "not_empty", tick.line("height", full, EDGE), low=bound, high=1.0 / bound)
-    logarithm = tick.of(Function.LOG, "logarithm", share)
-    out = tick.of(Function.EXP, "out", tick.line("exponent", logarithm, exponent))
+    logarithm = tick.apply(Function.LOG, "logarithm", share)
+    out = tick.apply(Function.EXP, "out", tick.line("exponent", logarithm, exponent))
     beyond = tick.line("beyond", levels, gain, shift - 1.0 / EDGE)
-    over = tick.line("over", tick.of(Function.SOFTPLUS, "spill", beyond), SPILL * rate * EDGE)
+    over = tick.line("over", tick.apply(Function.SOFTPLUS, "spill", beyond), SPILL * rate * EDGE)
     above = [names.index(tank.source) if tank.source in names else i for i, tank in enumerate(tanks)]
     fed = np.array([tank.source not in twin.inputs for tank in tanks])
     into = tick.numbers(names, "spilled_into", 0.0)

@@ -35,31 +35,31 @@ class Expression:
     value: float = 0.0
 
     def __add__(self, other: Any) -> Expression:
-        return self.graph.add(self, self.graph.of(other))
+        return self.graph.add(self, self.graph.wrap(other))
 
     def __radd__(self, other: Any) -> Expression:
-        return self.graph.add(self.graph.of(other), self)
+        return self.graph.add(self.graph.wrap(other), self)
 
     def __sub__(self, other: Any) -> Expression:
-        return self.graph.subtract(self, self.graph.of(other))
+        return self.graph.subtract(self, self.graph.wrap(other))
 
     def __rsub__(self, other: Any) -> Expression:
-        return self.graph.subtract(self.graph.of(other), self)
+        return self.graph.subtract(self.graph.wrap(other), self)
 
     def __mul__(self, other: Any) -> Expression:
-        return self.graph.multiply(self, self.graph.of(other))
+        return self.graph.multiply(self, self.graph.wrap(other))
 
     def __rmul__(self, other: Any) -> Expression:
-        return self.graph.multiply(self.graph.of(other), self)
+        return self.graph.multiply(self.graph.wrap(other), self)
 
     def __truediv__(self, other: Any) -> Expression:
-        return self.graph.divide(self, self.graph.of(other))
+        return self.graph.divide(self, self.graph.wrap(other))
 
     def __rtruediv__(self, other: Any) -> Expression:
-        return self.graph.divide(self.graph.of(other), self)
+        return self.graph.divide(self.graph.wrap(other), self)
 
     def __neg__(self) -> Expression:
-        return self.graph.subtract(self.graph.of(0.0), self)
+        return self.graph.subtract(self.graph.wrap(0.0), self)
 
 
 @dataclass(eq=False)
@@ -82,7 +82,7 @@ class ExpressionGraph:
             self._known[identity] = node
         return self._known[identity]
 
-    def of(self, value: Expression | float) -> Expression:
+    def wrap(self, value: Expression | float) -> Expression:
         """Return `value` itself if it is an expression, else a constant expression."""
         return value if isinstance(value, Expression) else self._node("constant", value=float(value))
 
@@ -101,7 +101,7 @@ class ExpressionGraph:
     def add(self, a: Expression, b: Expression) -> Expression:
         """Return a + b."""
         if a.operation == b.operation == "constant":
-            return self.of(a.value + b.value)
+            return self.wrap(a.value + b.value)
         if _is(a, 0.0) or _is(b, 0.0):
             return b if _is(a, 0.0) else a
         return self._node("+", a, b)
@@ -109,15 +109,15 @@ class ExpressionGraph:
     def subtract(self, a: Expression, b: Expression) -> Expression:
         """Return a - b."""
         if a.operation == b.operation == "constant":
-            return self.of(a.value - b.value)
+            return self.wrap(a.value - b.value)
         return a if _is(b, 0.0) else self._node("-", a, b)
 
     def multiply(self, a: Expression, b: Expression) -> Expression:
         """Return a * b."""
         if a.operation == b.operation == "constant":
-            return self.of(a.value * b.value)
+            return self.wrap(a.value * b.value)
         if _is(a, 0.0) or _is(b, 0.0):
-            return self.of(0.0)
+            return self.wrap(0.0)
         if _is(a, 1.0) or _is(b, 1.0):
             return b if _is(a, 1.0) else a
         return self._node("*", a, b)
@@ -125,16 +125,16 @@ class ExpressionGraph:
     def divide(self, a: Expression, b: Expression) -> Expression:
         """Return a / b."""
         if a.operation == b.operation == "constant":
-            return self.of(a.value / b.value)
+            return self.wrap(a.value / b.value)
         if b.operation == "constant":
-            return self.multiply(a, self.of(1.0 / b.value))
+            return self.multiply(a, self.wrap(1.0 / b.value))
         # Quotients by one value share its reciprocal, and so do their derivatives.
-        return self.multiply(a, self._node("/", self.of(1.0), b))
+        return self.multiply(a, self._node("/", self.wrap(1.0), b))
 
     def less(self, a: Any, b: Any, then: Any, otherwise: Any) -> Expression:
         """Return `then` if a < b, else `otherwise`; NaN compares as false."""
-        chosen = self.of(then), self.of(otherwise)
-        return chosen[0] if chosen[0] is chosen[1] else self._node("less", self.of(a), self.of(b), *chosen)
+        chosen = self.wrap(then), self.wrap(otherwise)
+        return chosen[0] if chosen[0] is chosen[1] else self._node("less", self.wrap(a), self.wrap(b), *chosen)
 
     def least(self, a: Any, b: Any) -> Expression:
         """Return the smaller of two expressions."""
@@ -150,14 +150,14 @@ class ExpressionGraph:
 
     def function(self, name: str, a: Any) -> Expression:
         """Return the function `name`, one of `FUNCTIONS`, of an expression."""
-        argument = self.of(a)
+        argument = self.wrap(a)
         if argument.operation == "constant":
-            return self.of(getattr(math, name)(argument.value))
+            return self.wrap(getattr(math, name)(argument.value))
         return self._node(name, argument)
 
     def gradient(self, result: Expression) -> dict[int, Expression]:
         """Return the derivatives of an expression by its subexpressions, by their index; zeros are omitted."""
-        adjoint: dict[int, Expression] = {result.index: self.of(1.0)}
+        adjoint: dict[int, Expression] = {result.index: self.wrap(1.0)}
         for node in self._below([result]):
             weight = adjoint.get(node.index)
             if weight is None:

@@ -140,7 +140,7 @@ class LiveSource(ABC):
 
     @classmethod
     @abstractmethod
-    def of(cls, options: SourceOptions, needs: Needs) -> LiveSource:
+    def from_options(cls, options: SourceOptions, needs: Needs) -> LiveSource:
         """Return the source of the user's options.
 
         Raises:

@@ -28,7 +28,7 @@ class LogSource(LiveSource):
         self.ending = f"the log has ended after {typed(recording.duration_s)} s"
 
     @classmethod
-    def of(cls, options: SourceOptions, needs: Needs) -> LogSource:
+    def from_options(cls, options: SourceOptions, needs: Needs) -> LogSource:
         """`SourceOptions.value` is the path of one log."""
         recording = read_with_truth(
             DataSource(Path(options.value), options.signal_map(), options.settings.get("repair"))

@@ -43,7 +43,7 @@ class LoopSource(LiveSource):
         self.text = f"closed loop, {bench.tasks[0].name}, {bench.plant.geometry.machine.name}"
 
     @classmethod
-    def of(cls, options: SourceOptions, needs: Needs) -> LoopSource:
+    def from_options(cls, options: SourceOptions, needs: Needs) -> LoopSource:
         """`SourceOptions.value` is the name of a task, or a file of settings of `edp control` (TOML).
 
         Settings: ``controller`` (a name), ``twin`` and ``predictor`` (run folders that it uses) and ``plant`` (a

@@ -60,7 +60,7 @@ class Ros2Source(LiveSource):
         self._node.create_subscription(messages.FluidPressure, pressures, self._on_pressure, profile)
 
     @classmethod
-    def of(cls, options: SourceOptions, needs: Needs) -> Ros2Source:
+    def from_options(cls, options: SourceOptions, needs: Needs) -> Ros2Source:
         """Return a source with the channels of the models; without a model those of Table A.1."""
         channels = tuple(needs.channels) or tuple(VOCABULARY.values())[:24]
         source = cls(channels, choose_rate(options, needs, "--ros2"))

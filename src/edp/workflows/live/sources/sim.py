@@ -75,7 +75,7 @@ class SimSource(LiveSource):
         self.text = f"simulator, {self._env.machine.name}, {name}, seed {seed}"
 
     @classmethod
-    def of(cls, options: SourceOptions, needs: Needs) -> SimSource:
+    def from_options(cls, options: SourceOptions, needs: Needs) -> SimSource:
         """`SourceOptions.value` is the machine."""
         rate_hz = options.rate_hz or needs.rate_hz or USUAL_RATE_HZ
         names = [channel.name for channel in needs.channels]

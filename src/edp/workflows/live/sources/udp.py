@@ -78,7 +78,7 @@ class UdpSource(LiveSource):
         self.channels = channels or self._first_channels()
 
     @classmethod
-    def of(cls, options: SourceOptions, needs: Needs) -> UdpSource:
+    def from_options(cls, options: SourceOptions, needs: Needs) -> UdpSource:
         """`SourceOptions.value` is the port; the setting ``bind`` another address than loopback."""
         rate, signal_map = choose_rate(options, needs, "--udp"), options.signal_map()
         mapped = tuple(channel_from_entry(entry) for entry in signal_map.channels) if signal_map else ()
