@@ -196,7 +196,7 @@ def driven(folder: Path, part: Series) -> tuple[Rows, Rows]:
 
 
 def fitted_grey(recordings: Sequence[Recording], fit: GreyFitSpec, seed: int) -> tuple[GreyTwin, float]:
-    """A grey box of the machine before its change, told the linkage and wrong bodies; processor s of its fit."""
+    """Fit a grey box of the machine before its change; return the twin and the processor seconds of the fit."""
     channels, data = cut_recordings(list(recordings), load_twin_experiment(None, ("twin.kind=greybox",)))
     return fitted_linkage((channels, fit_scales(channels, data.train), data), seed, fit)
 
@@ -279,7 +279,7 @@ class Recovered:
 def recovery(
     bundle: Bundle, law: Adaptation, tests: dict[str, DataSource], folder: Path, follower: Follower, behind_s: float
 ) -> Recovered:
-    """What every way makes of the scenarios; `folder` holds the program of network and correction."""
+    """Measure every adaptation method on the scenarios; `folder` holds the program of network and correction."""
     predictor, window = bundle.predictor, bundle.predictor.spec.window
     result, labels = Recovered({}, {}, {}), follower.parts.correction().tuned.labels
     for name, source in tests.items():
@@ -330,7 +330,7 @@ def instructions(bundle: Bundle) -> tuple[int, int]:
 
 
 def narrow(bundle: Bundle, seed: int) -> Bundle:
-    """The same inputs, scaling and adaptation around a narrow network with weights as drawn."""
+    """Create a narrow untrained network with the inputs, scaling and adaptation of a bundle."""
     predictor = bundle.predictor
     numbers = (predictor.front.offset, predictor.front.width, predictor.code.offset, predictor.code.width)
     scaler = Scaler(*(part.detach().double().numpy() for part in numbers))
@@ -339,7 +339,7 @@ def narrow(bundle: Bundle, seed: int) -> Bundle:
 
 
 def attacked(bundle: Bundle, bank: NDArray[np.float32], ticks: int) -> list[float]:
-    """What the adversary prints."""
+    """Run the adversarial program and return the numbers that it prints."""
     law = bundle.adaptation
     if law is None:
         raise RuntimeError("the bundle has no adaptation")
@@ -445,7 +445,7 @@ def check_followers(bench: Bench, found: dict[str, dict[str, float]], attainable
 
 
 def check_recovered(bench: Bench, found: dict[str, dict[str, float]]) -> None:
-    """A verdict a change; the table shows all ways."""
+    """Add one verdict for each change; the table shows all methods."""
     before, rows = found["before"], []
     for name, ways in found.items():
         loss = ways["frozen"] - before["frozen"]

@@ -143,7 +143,7 @@ def tasks_of(entry: dict[str, Any], trainings: Sequence[Training]) -> list[Task]
 
 
 def notes_of(trainings: Sequence[Training]) -> dict[str, Any]:
-    """What was chosen, in how many seconds, and how many numbers a student has, for every seed."""
+    """Return the chosen model, its training time and its number of parameters for every seed."""
     return {
         "chosen": [one.chosen for one in trainings],
         "seconds": [one.seconds for one in trainings],

@@ -114,7 +114,7 @@ def variants(folder: Path) -> dict[str, Variant]:
 
 
 def wider_dead_band(folder: Path) -> Path:
-    """A machine file of M22 with wider dead bands of the main spools."""
+    """Write a machine file of M22 with wider dead bands of the main spools."""
     machine = load_machine(MACHINE)
     valves = machine.valves
     bands = {

@@ -109,29 +109,27 @@ class Models:
         return self._simulated("recordings", order)
 
     def twin(self) -> Path:
-        """The twin of M22."""
         return self._twin(self.recordings(), "good_twin", self.size.twin)
 
     def grey(self, size: GreySize) -> Path:
-        """The grey box of M22, told its linkage beside bodies that are 10 to 50 % off; its logs are in free air."""
+        """Return the run folder of M22's grey box: known linkage, body priors 10 to 50 % off, logs in free air."""
         order = SimulationOrder(
             minutes=size.minutes, recordings=size.recordings, seed=self.seed + 31, mix=MIX, materials={"air": 1.0}
         )
         return self._grey(self._simulated("air", order), "m22", self.folder / "guess.toml", "grey_twin", size.fit)
 
     def other_grey(self, fit: Sequence[str]) -> Path:
-        """The grey box of C14 from minutes of its own logs in free air, and nothing of M22."""
+        """Return the run folder of a grey box of C14, fitted on minutes of its own logs in free air."""
         name, order = f"c14_air_{self.size.other}", self._of_other(41, {"air": 1.0})
         guess = self.folder / "guess_c14.toml"
         return self._grey(self._simulated(name, order), "c14", guess, f"c14_grey_{self.size.other}", fit)
 
     def other_twin(self) -> Path:
-        """The twin of M22 gone on with minutes of C14 in free air and in soil."""
+        """Return the run folder of the M22 twin, fine-tuned with minutes of C14 in free air and in soil."""
         name, settings = f"c14_{self.size.other}", [one for one in self.size.twin if not one.startswith("twin.")]
         return self._twin(self._simulated(name, self._of_other(21, SOILS)), f"{name}_twin", settings, self.twin())
 
     def _of_other(self, draw: int, materials: Mapping[str, float]) -> SimulationOrder:
-        """Logs of C14."""
         minutes = self.size.other
         return SimulationOrder(
             machine="C14", minutes=float(minutes), recordings=max(5, minutes // 2), seed=self.seed + draw, mix=MIX,

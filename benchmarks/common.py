@@ -250,7 +250,7 @@ def table(headings: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
 
 
 def kept(path: Path, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What an earlier run left in this file, or what is found now."""
+    """Return the stored result of an earlier run, or measure and store it."""
     if not path.exists():
         write_json(path, finite(measure()))
     found: dict[str, Any] = read_json(path)

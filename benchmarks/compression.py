@@ -47,14 +47,14 @@ FORMAT = "w8a16"
 
 
 def settings(horizon: int, seed: int, epochs: int, updates: int) -> Experiment:
-    """The teacher's."""
+    """Return the settings of the teacher."""
     changes = [f"task.horizons=[{horizon}]", f"training.seed={seed}", f"split.seed={seed}", "training.loss.delta=0.1"]
     changes += [f"training.epochs={epochs}", f"training.updates={updates}", "training.patience=0", "training.threads=1"]
     return load_experiment(None, "standard", changes)
 
 
 def one(source: DataSource, horizon: int, seed: int, folder: Path, arguments: argparse.Namespace) -> CompressionResult:
-    """A teacher, and the search for what fits."""
+    """Train a teacher and search for the best network within the budget."""
     epochs, updates = (1, 5) if arguments.quick else (5, max(1, arguments.updates // 5))
     run = folder / f"k{horizon}_seed{seed}"
     train(source, settings(horizon, seed, epochs, updates), run / "teacher")
@@ -91,7 +91,7 @@ def rows_of(found: CompressionResult, horizon: int) -> list[list[object]]:
 
 
 def facts_of(found: CompressionResult, horizon: int, made: dict[str, int]) -> dict[str, Any]:
-    """What is kept of a search."""
+    """Return the figures of a search that are stored."""
 
     def plain(row: CompressedRow) -> dict[str, Any]:
         mae = row.scores[str(horizon)]["mae"]
@@ -123,7 +123,7 @@ def memory(row: CompressedRow) -> int:
 
 
 def check(bench: Bench, found: Sequence[CompressionResult], objects: Sequence[dict[str, int]], horizon: int) -> None:
-    """The goals at one horizon: the largest of what is taken, the median of errors over the seeds.
+    """Add the verdicts at one horizon: the largest size and the median error over the seeds.
 
     Args:
         bench: of the run.

@@ -160,7 +160,7 @@ class LoopBench:
     def exported(
         self, twin: TwinBundle, blocks: tuple[int, ...], folder: Path, **options: float
     ) -> tuple[KeptController, ControllerParts]:
-        """A controller on this twin, written as C with the loop of the first one."""
+        """Export a controller on this twin as C with the loop of the first controller."""
         spec = PredictiveControl(blocks=blocks, **options)
         models = ControlModels(self.valves, twin.twin)
         experiment = ControlExperiment(task=self.task, controller=spec)
@@ -196,7 +196,7 @@ def host_instructions(folder: Path) -> int:
 
 
 def controller_sources(folder: Path) -> list[str]:
-    """The program, and the C files of the controller."""
+    """Return the test program and the C files of the controller."""
     return ["program.c", *listed_sources(folder)]
 
 
@@ -205,7 +205,7 @@ def built_for_m7(folder: Path, *flags: str) -> None:
 
 
 def m7_instructions(folder: Path) -> int:
-    """Executed instructions of a tick on the M7, the mean over four behind the first ones."""
+    """Return the executed instructions of one sample on the M7, averaged over four samples after the first ones."""
     built_for_m7(folder, "-DCOUNTED", f"-DTICKS={WARM + 4}u", f"-DSKIPPED={WARM}u")
     return int(run_image(folder, QEMU_M7)[-1])
 
@@ -279,7 +279,7 @@ class Compiled:
 
 
 def graded(run: Path, twin: TwinBundle, folder: Path, quick: bool) -> dict[str, dict[str, Any]]:
-    """The lines of `closed_loop.py`, graded by the compiled controller, in free air and in loam."""
+    """Evaluate the compiled controller on the lines of `closed_loop.py`, in free air and in loam."""
     rows: dict[str, dict[str, Any]] = {}
     for name, (material, spec) in list(GRADED.items())[: 1 if quick else None]:
         rows[name] = row = {"path_rms_mm": [], "position_rms_mm": [], "attitude_rms_deg": [], "violations": 0}
@@ -315,7 +315,7 @@ def graded(run: Path, twin: TwinBundle, folder: Path, quick: bool) -> dict[str, 
 
 
 def as_library(bench: ControlBench, experiment: ControlExperiment, twin: TwinBundle, folder: Path) -> Path:
-    """The controller of a bench as a shared library; valve maps of other draws are others."""
+    """Compile the controller of a bench as a shared library; each random draw has valve maps of its own."""
     own = folder / str(experiment.seed)
     write_controller(parts_of(experiment, bench.plant, bench.models, twin), "machine", own)
     (own / "program.c").write_text("")

@@ -172,7 +172,7 @@ def a_tick(bundle: Bundle) -> tuple[int, float]:
 
 
 def of_preset(preset: str, seed: int, changes: tuple[str, ...] = ()) -> Bundle:
-    """A network of a preset with weights as drawn."""
+    """Create an untrained network of a preset."""
     experiment = load_experiment(None, preset, list(changes))
     return drawn(experiment.task.resolve(100.0), experiment.model, seed)
 

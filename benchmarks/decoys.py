@@ -55,7 +55,7 @@ class Recipe:
 
 
 def lay_decoys(recordings: Sequence[Recording], each: int = 20, seed: int = 0) -> tuple[list[Recording], list[Decoy]]:
-    """The recordings with `each` decoys of every family behind their channels, in mixed order, and what they are.
+    """Append `each` decoys of every family to the channels of recordings, in random order.
 
     Args:
         recordings: at least two, with the names of Table A.1.

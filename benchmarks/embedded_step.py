@@ -47,7 +47,7 @@ WHOLE_HEADS = ["channels/units", "constant bytes", "W8A16 instructions", "per MA
 
 
 def whole(bundle: Bundle, seed: int) -> Bundle:
-    """The same network in whole numbers; which ones they are does not change what they cost."""
+    """Return the network in integer arithmetic; its weights are arbitrary, since they do not change the cost."""
     graph = bundle.predictor.graph()
     chosen = calibrate(graph, [random_inputs(bundle.predictor, 500, seed)])
     return replace(bundle, predictor=IntegerPredictor(bundle.predictor, chosen))
@@ -64,7 +64,7 @@ def make(channels: int, units: int, seed: int) -> Bundle:
 
 
 def rival_instructions(folder: Path, kind: str) -> int:
-    """Executed instructions of a prediction by the rival's C, which must be ours within its tolerance."""
+    """Count the instructions of one prediction by the reference's C code, after comparing its outputs with ours."""
     counted, permille = on_board(folder, onnx_rivals.counting(folder, kind, RUNS[kind]), "-I..")
     if int(permille) > 1000:
         raise RuntimeError(f"emx-onnx-cgen's {kind} is {int(permille) / 1000} times the tolerance away from PyTorch")

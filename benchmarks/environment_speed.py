@@ -86,7 +86,7 @@ def one_by_one(levers: Array, seed: int, **settings: Any) -> Turn:
 
 
 def plant_alone(levers: Array, machine: str, step_s: float) -> Turn:
-    """The plant a sample at a time without any sensors: what a loop in Python cannot go below."""
+    """Return the plant without sensors, one sample at a time: the lower bound for a loop in Python."""
     parameters = load_machine(machine)
 
     def turn() -> float:
@@ -97,7 +97,7 @@ def plant_alone(levers: Array, machine: str, step_s: float) -> Turn:
 
 
 def naive(levers: Array, seed: int, machine: str, step_s: float) -> Turn:
-    """The plant a sample at a time, and the sensors anew over the last rows at each tick."""
+    """Return the plant with sensors that are recomputed over the last rows at each sample."""
     parameters, rng = load_machine(machine), np.random.default_rng(seed)
 
     def turn() -> float:

@@ -175,7 +175,7 @@ class Newcomer:
 
 
 def person_seconds(result: dict[str, Any]) -> dict[str, float]:
-    """What a person's part would take by a model, in seconds; the waiting is not the person's.
+    """Estimate a person's time in seconds, without waiting for the computer.
 
     Returns:
         ``deciding``: the first command is typed and the printed ones are copied; all that `edp init` and `edp inspect`
@@ -194,7 +194,7 @@ def person_seconds(result: dict[str, Any]) -> dict[str, float]:
 
 
 def first_hour(logs: Path, columns: dict[str, Truth], folder: Path, minutes: float) -> dict[str, Any]:
-    """The whole way on one set: what was mapped how, and each command's figures."""
+    """Run the complete workflow on one data set and return the signal mapping and the figures of each command."""
     person = Newcomer(folder)
     person.edp("init", str(logs), "--yes")
     # Once more for this script: a person reads the text.
@@ -231,7 +231,7 @@ def first_hour(logs: Path, columns: dict[str, Truth], folder: Path, minutes: flo
 
 
 def shown_of(result: dict[str, Any]) -> dict[str, Any]:
-    """What is kept of a set: the commands' last words name folders of this machine."""
+    """Return the stored figures of a data set, without last lines of commands, which name local folders."""
     facts = {key: value for key, value in result.items() if key != "steps"}
     return facts | {"person_model_s": person_seconds(result)}
 

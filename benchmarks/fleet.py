@@ -53,7 +53,7 @@ NETWORK = ('model.backbone={kind="hybrid",channels=[64],kernel=4,units=64}', "ta
 
 
 def rest(identity: Any, where: Any) -> dict[str, Any]:
-    """A unit that takes no processor time: what is left is the coordinator's."""
+    """Run a work unit that takes no processor time, which leaves the coordinator's cost."""
     time.sleep(0.02)
     return {"number": identity.config["number"]}
 
@@ -88,7 +88,7 @@ class Fleet:
         return SimulationOrder(minutes=minutes, recordings=recordings, seed=self.seed)
 
     def logs(self, name: str, order: SimulationOrder) -> Path:
-        """Logs, simulated where they are not there yet."""
+        """Return the folder of simulated logs; simulate missing ones."""
         simulate_data_set(self.work / name, order, workers=IN_PROCESS)
         return self.work / name
 
@@ -96,7 +96,7 @@ class Fleet:
         return load_experiment(None, "quick", [*NETWORK, f"training.seed={self.seed}", *changes])
 
     def run(self) -> Path:
-        """A network that commands judge."""
+        """Return a trained network for the evaluation commands."""
         logs = self.logs("many", self.order(self.size.minutes, self.size.recordings))
         updates = 10 if self.quick else 100
         experiment = self.experiment("training.epochs=1", f"training.updates={updates}")
@@ -120,7 +120,7 @@ def spent_s(process: int) -> float:
 
 
 def children(process: int) -> list[int]:
-    """Processes that a process started, in any thread."""
+    """Return the processes that a process started, from any of its threads."""
     found = []
     with contextlib.suppress(OSError):
         for thread in Path(f"/proc/{process}/task").iterdir():
@@ -172,7 +172,7 @@ class Meter:
             self.own[0] = time.thread_time()
 
     def mark(self) -> None:
-        """What was spent until now counts no more."""
+        """Reset the processor time to zero."""
         self.look()
         self.own[1] = self.own[0]
         self.marked = {process: spent for place in self.seen.values() for process, spent in place.items()}
@@ -282,7 +282,7 @@ def two_against_one(command: Command) -> dict[str, Any]:
 
 
 def coordinating(workers: int) -> dict[str, float]:
-    """The coordinator's processor time a unit over many that take none."""
+    """Measure the coordinator's processor time per work unit, over many empty units."""
     units = [WorkUnit("fleet:rest", f"unit {n}", {"number": n}) for n in range(UNITS)]
     began, wall = time.process_time(), time.perf_counter()
     list(Workers(count=workers).map(units))
@@ -363,7 +363,7 @@ def unit_seconds(fleet: Fleet) -> list[float]:
 
 
 def cost(fleet: Fleet, rows: Sequence[dict[str, Any]], coordinator_ms: float) -> dict[str, float]:
-    """A fleet of 10,000 h on 100 cores, from measured units; and two workers as foretold and as measured."""
+    """Estimate the cost of a fleet of 10,000 h on 100 cores; compare the estimate for two workers with a run."""
     seconds = unit_seconds(fleet)
     hours = fleet.size.minutes / 60.0
     simulated = next(row for row in rows if row["command"] == "simulate")

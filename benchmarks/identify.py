@@ -75,7 +75,7 @@ def main(bench: Bench) -> object:
 
 
 def one_machine(given: Any, name: str) -> dict[str, Any]:
-    """A machine of the family, simulated, identified and compared."""
+    """Simulate a machine of the family, identify its parameters and compare them."""
     quick, seed = given.quick, given.seed
     minutes, recordings = (4.0, 8) if quick else (given.minutes, 8 if given.short else 16)
     fit = f"twin.fit.ticks={given.ticks}", f"twin.fit.starts={given.starts}"

@@ -27,7 +27,7 @@ STUDY = "study"
 
 
 def tiny(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str, Any]:
-    """A training of some milliseconds: gradient descent on a quadratic drawn with the seed."""
+    """Run gradient descent on a random quadratic for some milliseconds."""
     folder = Path(where["study"])
     word = "twice" if known(folder, identity.key) else "start"
     _note(where, f"{word} {identity.seed}")
@@ -46,7 +46,7 @@ def _note(where: Mapping[str, Any], line: str) -> None:
 
 
 def coordinate(study: str, log: str, trainings: int, seconds: float) -> None:
-    """The process that is killed: all trainings through the ledger, then the digest."""
+    """Run all trainings through the ledger and write the digest; this process is killed."""
     with Ledger(study) as ledger, LocalPool(2) as pool:
         settings, where = {"seconds": seconds}, {"study": study, "log": log}
         words = ("code", "data", {"threads": "1"})
@@ -67,7 +67,7 @@ class Round:
         return self.log.read_text().count("end ") if self.log.exists() else 0
 
     def workers(self) -> list[int]:
-        """Processes whose parent is the coordinator."""
+        """Return the child processes of the coordinator."""
         found = []
         for state in Path("/proc").glob("[0-9]*/stat"):
             try:

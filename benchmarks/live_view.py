@@ -61,7 +61,7 @@ class Waves(LiveSource):
 
     @classmethod
     def from_options(cls, options: SourceOptions, needs: Needs) -> Waves:
-        """An endless one."""
+        """Create a source that never ends."""
         return cls(None, True)
 
     def run(self, sink: Sink) -> None:
@@ -219,7 +219,7 @@ class Readers:
 
 
 def narrow(host: str) -> socket.socket:
-    """A connection whose buffer is soon full; the system's megabytes would hide that nobody reads."""
+    """Open a connection with a small receive buffer, so that a reader that stops is noticed."""
     one = socket.socket()
     one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 14)
     name, port = host.split(":")
@@ -228,7 +228,7 @@ def narrow(host: str) -> socket.socket:
 
 
 def served(ticks: int | None, paced: bool, models: tuple[str, ...] = ()) -> tuple[Any, Connection, str]:
-    """A process with source and server, its pipe and its address."""
+    """Start a process with source and server; return the process, its pipe and its address."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=serve, args=(theirs, ticks, paced, models), daemon=True)
@@ -287,7 +287,7 @@ def watched(seconds: float, models: tuple[str, ...] = ()) -> dict[str, float]:
 
 
 def day(ticks: int, note: Callable[[str], None]) -> dict[str, float]:
-    """A day as fast as it goes."""
+    """Measure one day of data at full speed."""
     process, pipe, address = served(ticks, False)
     readers = Readers(address, 1, 1)
     pipe.send("go")

@@ -236,7 +236,7 @@ print(json.dumps([int(status.split("VmHWM:")[1].split()[0]) / 1024, samples, tot
 
 
 def write_large(path: Path, gigabytes: float, seed: int) -> int:
-    """A log of 128 channels of float64, about so large as a file; returns its samples."""
+    """Write a log of 128 float64 channels with the given file size; return its number of samples."""
     channels = 128
     wide = 19 if path.suffix == ".csv" else 8
     samples = int(gigabytes * 1e9 / (wide * channels))

@@ -65,7 +65,7 @@ class Signal:
         return np.random.default_rng([self.seed, piece + 1]).standard_normal(shape, dtype=np.float32)
 
     def piece(self, number: int) -> NDArray[np.float32]:
-        """Inputs ``(PIECE, input)`` of a piece, SI units."""
+        """Return the inputs of a segment in SI units, shape ``(PIECE, input)``."""
         noise = np.concatenate([self._noise(number - 1)[-SPAN:], self._noise(number)])
         smooth = lfilter(np.float32([0.4]), np.float32([1.0, -0.9]), noise, axis=0)[SPAN:]
         phase = 2 * np.pi * (number * PIECE + np.arange(PIECE)) / self.ticks
@@ -93,7 +93,7 @@ class Drift:
 
 
 def whole(bundle: Bundle, signal: Signal) -> Bundle:
-    """The network in whole numbers, calibrated on pieces of the day."""
+    """Quantise the network, calibrated on segments of the day."""
     count = signal.ticks // PIECE
     rows = [signal.piece(number) for number in range(0, count, max(1, count // 32))]
     predictor = bundle.predictor
@@ -105,7 +105,6 @@ FORMATS: dict[str, Callable[[Bundle, Signal], Bundle]] = {"float32": lambda bund
 
 
 def program_of(bundle: Bundle, folder: Path) -> Path:
-    """The test program of an exported network."""
     files = CTarget().write(bundle, "predictor", folder)
     sources = [file.name for file in files if file.suffix == ".c" and file.name not in ("example_task.c", "fuzz.c")]
     command = ["gcc", "-std=c99", "-O2", "-ffp-contract=off", *sources, "-lm", "-o", "program"]

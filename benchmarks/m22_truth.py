@@ -133,7 +133,7 @@ def _push(simulation: Simulation, name: str, size: float) -> None:
 
 
 def _given_by(name: str, recordings: Sequence[Recording]) -> tuple[str, ...]:
-    """The channels from which a law of the simulator gives `name`, checked on the logs."""
+    """Return the channels that determine `name` by an equation of the simulator, checked on the logs."""
     machine = load_machine(str(recordings[0].meta["machine"]))
     if name.startswith("CylAcc_"):
         source = name.replace("Acc", "Vels")

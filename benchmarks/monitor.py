@@ -70,7 +70,7 @@ QUICK_SETTINGS = (
 
 
 def our_cases(plan: Plan, found: dict[str, list[MonitorAlarm]]) -> list[Case]:
-    """What was found of the faulty sessions."""
+    """Return the detection result of each faulty session."""
     cases = []
     for name, alarms in found.items():
         session, moving = session_facts(plan.data / "test", name)
@@ -116,7 +116,7 @@ def measure(plan: Plan, seed: int, side_by_side: SideBySide) -> dict[str, Any]:
 
 
 def settled(what: str, work: Beside, plan: Plan) -> Any:
-    """The result of work beside the run; None where the time is over before."""
+    """Return the result of parallel work, or None if the time limit is reached first."""
     while not work.done() and time.monotonic() - BEGAN < plan.until:
         time.sleep(0.2)
     if not work.done():
@@ -128,7 +128,7 @@ def settled(what: str, work: Beside, plan: Plan) -> Any:
 def rates_of(
     plan: Plan, names: Mapping[str, Sequence[str]], alarms: Mapping[str, Sequence[MonitorAlarm]]
 ) -> dict[str, dict[str, Any]]:
-    """False alarms of each set that is healthy."""
+    """Return the false alarms of each healthy set."""
     seconds = QUICK_SECONDS if plan.quick else DURATION_S
     return {
         group: false_alarm_rate(sum(len(alarms[n]) for n in some), len(some) * seconds / 3600.0)
@@ -140,7 +140,7 @@ def rates_of(
 def judgement(
     plan: Plan, names: Mapping[str, Sequence[str]], wrong: dict[str, list[MonitorAlarm]], side_by_side: SideBySide
 ) -> dict[str, Any]:
-    """What the monitor finds, and its false alarms on every set that is healthy."""
+    """Return the detection results and the false alarms on every healthy set."""
     cases = our_cases(plan, wrong)
     healthy = [name for group, some in names.items() if group != "faulty" for name in some]
     rates = rates_of(plan, names, watched(plan, healthy, side_by_side))
@@ -149,7 +149,9 @@ def judgement(
 
 
 def without_flow(plan: Plan, names: Mapping[str, Sequence[str]], side_by_side: SideBySide) -> dict[str, Any]:
-    """False alarms of the same monitor without balances of flow in sets that must stay silent.
+    """Return the false alarms without flow balances, in healthy sets.
+
+    Empty if the monitor has no flow balances, or only flow balances.
 
     Empty where it has none, or nothing else.
     """
@@ -196,7 +198,7 @@ def naming(plan: Plan, found: dict[str, list[MonitorAlarm]]) -> dict[str, float]
 
 
 def component(kind: str, site: str) -> str:
-    """The part that a mechanic would look at."""
+    """Return the component that a mechanic would inspect."""
     if kind not in FAULTS:
         return kind
     of = getattr(FAULTS[kind], "component", None)
@@ -301,7 +303,7 @@ def _row(name: str, figures: dict[str, Any], false: dict[str, Any]) -> list[obje
 
 
 def check(bench: Bench, found: dict[str, Any], hours: float) -> None:
-    """The goals, one by one."""
+    """Add the verdicts."""
     ours, goals = found["ours"], GOALS
     # A rival that raises more false alarms than promised is no rival at this rate: it is shown, not taken.
     best = max((r["found"] for r in found["rivals"].values()), default=None)

@@ -163,7 +163,7 @@ def compare_with_predictor(folder: Path, seed: int) -> dict[str, Any]:
 def drawn_parts(
     size: tuple[int, ...], seed: int, network: NetworkPart | None = None, channels: tuple[Channel, ...] = ()
 ) -> MonitorParts:
-    """A monitor with drawn numbers."""
+    """Create a monitor with random parameters."""
     residuals, inputs, points, directions, drivers = size
     rng, summaries = np.random.default_rng(seed), (5 + drivers) * residuals
     channels = channels or tuple(Channel(f"c{i}", Kind.GENERIC) for i in range(inputs))

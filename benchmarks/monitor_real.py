@@ -89,13 +89,13 @@ class Rig:
         return found
 
     def recording(self, cycle: int) -> Recording:
-        """A cycle as a log."""
+        """Return a cycle as a recording."""
         channels = tuple(Channel(name, KINDS.get(name[0], Kind.GENERIC)) for name in self.sensors)
         return Recording(f"cycle_{cycle:04d}", channels, np.ascontiguousarray(self.values[cycle]), 1.0, "rig")
 
 
 def read_rig(path: Path) -> Rig:
-    """The rig's Parquet file."""
+    """Read the rig's Parquet file."""
     columns = parquet.read_table(path).to_pydict()
     beside = {"cycle", "second", "stable_flag", *CONDITIONS}
     sensors = tuple(name for name in columns if name not in beside)
@@ -110,7 +110,7 @@ Score = Callable[[int], float]
 
 
 def our_score(rig: Rig, training: Sequence[int], seed: int) -> Score:
-    """The largest statistic of the monitor's parts in a cycle.
+    """Return the largest statistic of the monitor's parts in a cycle.
 
     `edp.workflows.monitor` refuses logs of ten minutes; here its parts are put together without an operating point, for
     which there are too few blocks. Every other cycle tells what is expected at each second, the rest sets scales and
@@ -139,7 +139,7 @@ def our_score(rig: Rig, training: Sequence[int], seed: int) -> Score:
 
 
 def rival_score(rig: Rig, training: Sequence[int], rival: Rival) -> Score:
-    """The longest white row of a cycle, blocks of ten seconds."""
+    """Return the largest whitened row of a cycle, in blocks of ten seconds."""
     rival.fit([rig.values[i] for i in training], ticks=10)
     return lambda cycle: float(np.linalg.norm(rival.rows(rig.values[cycle]), axis=1).max())
 
@@ -217,7 +217,7 @@ SIZES: Mapping[str, tuple[float, ...]] = {
 
 
 def injected(values: Values, column: int, kind: str, size: float, onset: int, rng: np.random.Generator) -> Values:
-    """A copy with a fault of one sensor from a tick on.
+    """Return a copy with a fault of one sensor, starting at a given sample.
 
     Args:
         values: shape (ticks, channels).
@@ -244,7 +244,7 @@ def injected(values: Values, column: int, kind: str, size: float, onset: int, rn
 
 
 def short_settings(rate_hz: float) -> tuple[str, ...]:
-    """Settings of a monitor for minutes of logs, in place of hours."""
+    """Return settings of a monitor for minutes of logs instead of hours."""
     spans, block_s = [ticks / rate_hz for ticks in SPANS_TICKS], BLOCK_TICKS / rate_hz
     memory = f"memory_s={MEMORY_BLOCKS * block_s}"
     return (
@@ -302,7 +302,7 @@ class _Refused:
 
 
 def divided(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recording]]:
-    """The first part of each recording, and segments of the rest."""
+    """Split each recording into its first part and segments of the remainder."""
     healthy, test = [], []
     for recording in recordings:
         cut = round(HEALTHY_SHARE * recording.samples)

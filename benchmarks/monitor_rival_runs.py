@@ -41,7 +41,7 @@ class _RivalJob:
 
 
 def rival_result(job: _RivalJob) -> dict[str, dict[str, Any]]:
-    """A rival on the same sessions, with each of its charts."""
+    """Evaluate a reference method on the same sessions, with each of its charts."""
     plan = job.plan
     learning, limiting = parts_of(plan)
     # Forty sessions are 5 h: what is linear or of neighbours has seen all there is to see by then.

@@ -184,7 +184,7 @@ def has_pyod() -> bool:
 
 
 def limit_of(chart: DetectorSpec, sessions: Sequence[Floats], rows_per_s: float, hours: float) -> AlarmLimit:
-    """The limit of a chart on held-out healthy sessions."""
+    """Fit the limit of a chart on held-out healthy sessions."""
     return calibrated(chart, sessions, rows_per_s, hours)
 
 

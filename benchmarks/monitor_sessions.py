@@ -192,7 +192,7 @@ def faults_of_draws(draws: int, seed: int, seconds: float = DURATION_S) -> list[
 
 
 def sister(machine: Machine, tolerance: float, rng: np.random.Generator) -> Machine:
-    """A machine of the same series: numbers that production scatters, evenly within a share of what they are.
+    """Create a machine of the same series, with parameters drawn uniformly within the production tolerance.
 
     Pins, lengths, bores and strokes stay: they are machined to less than a thousandth.
     """
@@ -232,7 +232,7 @@ def machine_of(plan: SessionPlan) -> Machine:
 
 
 def measured(recording: Recording, seed: int) -> NDArray[np.float32]:
-    """The channels of a machine with the noise of sensors that the simulator shows without, shape (time, CHANNELS)."""
+    """Return the channels of a machine with sensor noise, which the simulation omits, shape (time, CHANNELS)."""
     rng = np.random.default_rng([seed, 9])
     values = np.stack([recording.column(name) for name in CHANNELS], axis=1)
     for column, name in enumerate(CHANNELS):
@@ -303,14 +303,14 @@ def write_sessions(plans: Sequence[SessionPlan], folder: Path, side_by_side: Sid
 
 
 def read_session(folder: Path, name: str) -> Session:
-    """A session by its name, such as ``healthy_000``."""
+    """Read a session by its name, such as ``healthy_000``."""
     plan, moving = session_facts(folder, name)
     values = np.load(folder / f"{name}.npy", allow_pickle=False)
     return Session(plan, _recording(plan, values), moving)
 
 
 def session_facts(folder: Path, name: str) -> tuple[SessionPlan, NDArray[np.int64]]:
-    """What only the simulator knows of a session: its plan, and ticks of each second in which it moved."""
+    """Return the plan of a session and the number of samples in motion for each second."""
     facts = read_json(folder / f"{name}.json")
     return SessionPlan(**facts["plan"]), np.array(facts["moving"])
 

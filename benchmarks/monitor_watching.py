@@ -261,7 +261,7 @@ def fitted(plan: Plan, side_by_side: SideBySide = ONE_BY_ONE) -> dict[str, Any]:
 
 
 def add_dictionary(plan: Plan, side_by_side: SideBySide = ONE_BY_ONE) -> bool:
-    """The monitor with a dictionary of faults in a folder of its own; false where there is no machine to simulate."""
+    """Fit a monitor with a fault dictionary in a separate folder; return false without a machine to simulate."""
     if not (plan.named / "monitor.json").exists():
         monitor, spec = load_monitor(plan.monitor), plan.experiment.dictionary
         names = monitor.provenance["calibrated_on"]
@@ -275,7 +275,7 @@ def add_dictionary(plan: Plan, side_by_side: SideBySide = ONE_BY_ONE) -> bool:
 
 
 def columns_without_flow(monitor: Monitor) -> tuple[list[ResidualSource], list[int], list[int]]:
-    """Sources that are no balances of flow, places of their residuals, and columns of their summaries."""
+    """Return the sources without flow balances, their residual indices and their summary columns."""
     kept = [source for source in monitor.sources if not isinstance(source, FlowBalances)]
     own = {name for source in kept for name in source.names}
     residuals = [place for place, name in enumerate(monitor.residual_names) if name in own]
@@ -284,7 +284,7 @@ def columns_without_flow(monitor: Monitor) -> tuple[list[ResidualSource], list[i
 
 
 def fit_without_flow(plan: Plan, side_by_side: SideBySide = ONE_BY_ONE) -> list[int]:
-    """The monitor less its balances of flow, all behind them fitted anew; columns of the summaries that it has."""
+    """Refit the monitor without flow balances; return the columns of its summaries."""
     monitor = load_monitor(plan.monitor)
     kept, residuals, columns = columns_without_flow(monitor)
     if not (plan.without_flow / "monitor.json").exists():
@@ -322,7 +322,7 @@ BEGAN = time.monotonic()
 
 
 def say(what: str, value: Any) -> None:
-    """A line with what was found, for runs that are cut off."""
+    """Print an intermediate result, for runs that are interrupted."""
     print(json.dumps({"found": what, "after_s": round(time.monotonic() - BEGAN), "value": finite(value)}), flush=True)
 
 
@@ -346,7 +346,7 @@ class Beside:
         return not self._thread.is_alive()
 
     def result(self) -> Any:
-        """What came of it; waits for it.
+        """Wait for the result and return it.
 
         Raises:
             Exception: that of the work.

@@ -131,7 +131,7 @@ class World:
         return np.asarray(np.sqrt(overlap) * shared + np.sqrt(1.0 - overlap) * self._draw(rng, (arms, sets, 1), 1.0))
 
     def _draw(self, rng: np.random.Generator, shape: tuple[int, ...], deviation: float) -> Array:
-        """Normal draws for each metric, ``(metric, *shape)``, partly common to all."""
+        """Draw normal samples for each metric, ``(metric, *shape)``, with a common component."""
         common, own = rng.standard_normal(shape), rng.standard_normal((len(METRICS), *shape))
         return np.asarray(deviation * (np.sqrt(self.shared) * common + np.sqrt(1.0 - self.shared) * own))
 
@@ -205,7 +205,7 @@ def thesis_design(source: Source, repetition: int) -> tuple[Mask, NDArray[np.int
 
 
 def drawn_as(source: Source, repetition: int) -> int:
-    """Number of the folds of a study; where scores are trained, studies share folds, as trainings are dear."""
+    """Return the fold assignment of a study; trained studies share folds, since trainings are expensive."""
     return repetition % source.designs if source.designs else repetition
 
 
@@ -286,7 +286,7 @@ def null_table(
 
 
 def deviation(share: float, studies: int) -> float:
-    """Standard error of a share."""
+    """Return the standard error of a fraction."""
     return float(np.sqrt(share * (1.0 - share) / studies))
 
 

@@ -88,7 +88,6 @@ def m22_channels() -> TwinChannels:
 
 
 def twin(channels: TwinChannels, seed: int) -> Bundle:
-    """The default twin, untrained."""
     one = {name: np.ones(shape, np.float32) for name, shape in TwinScales.shapes(channels).items()}
     offsets = {name: 0.0 * one[name] for name in ("command_offset", "answer_offset")}
     scales = TwinScales.from_arrays(one | offsets | {"low": -10.0 * one["low"], "high": 10.0 * one["high"]})
@@ -97,7 +96,7 @@ def twin(channels: TwinChannels, seed: int) -> Bundle:
 
 
 def rival(channels: TwinChannels, seed: int) -> Bundle:
-    """A look-ahead predictor of the velocities: a GRU as wide, with heads so small that both have as many products."""
+    """Create a k-step-ahead GRU predictor of the velocities with as many multiplications as the twin."""
     read = channels.commands + channels.answers
     features = FeatureSet("all", tuple(channel.name for channel in read))
     targets = tuple(channel.name for channel in channels.velocities)

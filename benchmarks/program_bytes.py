@@ -74,7 +74,7 @@ def run(folder: Path, *command: object) -> str:
 
 
 def contracts() -> ModuleType:
-    """The networks of the contract tests."""
+    """Import the networks of the contract tests."""
     spec = importlib.util.spec_from_file_location("contract_networks", ROOT / "tests/conftest.py")
     if spec is None or spec.loader is None:
         raise RuntimeError("tests/conftest.py cannot be loaded")

@@ -51,7 +51,7 @@ Call = Callable[[], float]
 
 
 def make_logs(folder: Path, minutes: float, each: int, seed: int) -> None:
-    """Simulated logs with decoys; kept between runs."""
+    """Simulate logs with decoys; reuse those of an earlier run."""
     if (folder / "made.json").exists():
         return
     simulated = folder.parent / f"{folder.name}_simulated"
@@ -160,7 +160,7 @@ class Rival:
         self.stage("lag curves of other pairs", [(lambda i=i, j=j: 0 * curve(i, j).max(), 0.0) for i, j in rest])
 
     def stability(self) -> None:
-        """The four metrics in each piece, and between pieces."""
+        """Compute the four metrics for each segment, and between segments."""
         rows = [piece_rows(self.data, p, self.spec) for p in range(len(self.data.pieces))]
         values = {(s["metric"], s["channel"], s["target"]): s["values"] for s in self.found["stability"]}
         metrics = {
@@ -188,7 +188,7 @@ class Rival:
             self.stage(f"{name} between pieces", crossed)
 
     def forest(self) -> None:
-        """The same forest, permuted by predicting anew."""
+        """Compute the permutation importance of the same forest by new predictions."""
         options, entries = self.spec.forest, [e for e in self.found["importance"] if e["target"] == "all"]
         members = [e["members"] for e in entries]
         columns = np.array(sorted(self.data.names.index(name) for group in members for name in group))

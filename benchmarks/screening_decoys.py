@@ -37,7 +37,7 @@ from screening_thesis import TARGETS, only_table_a1
 
 
 def judged(found: ScreeningResult, decoys: Sequence[Decoy], truth: Sequence[Cause]) -> dict[str, Any]:
-    """What the proposal did with causes and decoys."""
+    """Count the causes and decoys in the proposal."""
     kept = set(found.proposal.kept)
     flagged = {flag.channel for flag in found.flags if flag.kind is FlagKind.LEAK}
     leaks = {decoy.name for decoy in decoys if decoy.family == "leak"}
@@ -74,7 +74,7 @@ def show_screening(found: dict[str, Any], decoys: Sequence[Decoy], truth: Sequen
 
 
 def goals(found: dict[str, Any], decoys: Sequence[Decoy], truth: Sequence[Cause], quick: bool) -> list[Verdict]:
-    """The issue's goals."""
+    """Return the verdicts for the issue's targets."""
     needed = sum(c.needed for c in truth)
     leaks = sum(decoy.family == "leak" for decoy in decoys)
     return [
@@ -88,7 +88,7 @@ def goals(found: dict[str, Any], decoys: Sequence[Decoy], truth: Sequence[Cause]
 
 
 def on_disk(recordings: Sequence[Recording], folder: Path) -> DataSource:
-    """The recordings as logs, with the map that names all their columns."""
+    """Write the recordings as logs with a map that names all columns."""
     for recording in recordings:
         path = folder / f"{recording.name}.parquet"
         if not path.exists():

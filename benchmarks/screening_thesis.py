@@ -63,7 +63,7 @@ class Figures:
     found: ScreeningResult
 
     def at(self, metric: str, channel: str, target: str) -> float:
-        """An entry of one of the matrices."""
+        """Return an entry of one of the matrices."""
         names = self.found.matrices.names
         if channel not in names:
             return float("nan")
@@ -178,7 +178,6 @@ def _triple(values: Sequence[float]) -> str:
 
 
 def of_the_correlations(figures: Figures) -> list[Statement]:
-    """What the thesis says of fig. 4.1."""
     found = figures.found
     names = [name for name in found.matrices.names if name not in TARGETS]
     by_metric = {
@@ -210,7 +209,7 @@ def of_the_correlations(figures: Figures) -> list[Statement]:
 
 
 def of_the_information(figures: Figures) -> list[Statement]:
-    """What the thesis says of fig. 4.2: pooled over recordings, and each recording for itself."""
+    """Return the thesis's statements on fig. 4.2, pooled over recordings and for each recording."""
     statements = []
     for form in ("pooled", "per recording"):
 
@@ -239,7 +238,6 @@ def of_the_information(figures: Figures) -> list[Statement]:
 
 
 def of_the_lags(found: ScreeningResult, rows: Sequence[dict[str, Any]]) -> list[Statement]:
-    """What the thesis says of Table 4.2."""
     statements = [
         Statement(f"lags of the {row['group']}", f"{row['thesis'][0]} to {row['thesis'][1]}",
                   ", ".join("no peak" if one["open"] else f"{one['leading']}" for one in row["each"]), row["within"])
@@ -269,7 +267,7 @@ def data_set(minutes: float, seed: int, workers: int) -> list[Recording]:
 
 
 def only_table_a1(recording: Recording) -> Recording:
-    """The recording without what only a simulation knows."""
+    """Remove the channels that only a simulation has."""
     return Recording(recording.name, tuple(TABLE_A1.values()), np.ascontiguousarray(recording.select(list(TABLE_A1))),
                      recording.rate_hz, recording.source, recording.meta)  # fmt: skip
 

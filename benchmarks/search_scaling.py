@@ -32,7 +32,7 @@ HORIZONS, SCORES, SESSIONS = ("1", "10"), ("mae", "rmse", "p95", "p99", "composi
 
 
 def fill(folder: Path, count: int) -> None:
-    """Records of the size that a search writes; not synced one by one, as they are only read."""
+    """Write records of the size that a search writes, without flushing each to disk."""
     with Ledger(folder):
         pass
     config, machine = {"settings": SETTINGS, "updates": 800}, environment(1)

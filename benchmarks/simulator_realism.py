@@ -63,7 +63,7 @@ class Fact:
 
 
 def lag_of(lead: Sequence[Array], follow: Sequence[Array], signed: bool) -> int:
-    """Samples by which `lead` precedes `follow` where their correlation (its size, unless `signed`) is largest."""
+    """Return the lag in samples at which the correlation (its absolute value if not `signed`) is largest."""
     total = np.zeros(MOST + 1)
     for x, y in zip(lead, follow, strict=True):
         x, y = x - x.mean(), y - y.mean()
@@ -72,7 +72,7 @@ def lag_of(lead: Sequence[Array], follow: Sequence[Array], signed: bool) -> int:
 
 
 def fast(values: Sequence[Array], rate_hz: float) -> list[Array]:
-    """What lies above `FAST_HZ`, with no delay."""
+    """Return the components above `FAST_HZ`, without delay."""
     filters = signal.butter(2, FAST_HZ, "highpass", fs=rate_hz, output="sos")
     return [signal.sosfiltfilt(filters, v) for v in values]
 
@@ -172,7 +172,7 @@ def dependencies(signals: Signals, seed: int) -> dict[str, dict[str, tuple[float
 
 
 def rises(name: str) -> dict[str, tuple[float, ...]]:
-    """Times (s) from a full, half and quarter lever step at mid-stroke to 10 % and 63 % of the speed reached."""
+    """Return rise times (s) to 10 % and 63 % of the final speed for full, half and quarter steps at mid-stroke."""
     found: dict[str, list[float]] = {"10 %": [], "63 % least": [], "63 % most": []}
     for i in range(3):
         first, late = [], []

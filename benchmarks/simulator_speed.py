@@ -42,14 +42,14 @@ def parity_module(name: str) -> ModuleType:
 
 
 def speed(work: Callable[[], float]) -> float:
-    """Simulated seconds, which `work` returns, per CPU second."""
+    """Measure simulated seconds, which `work` returns, per processor second."""
     began = time.process_time()
     simulated = work()
     return simulated / (time.process_time() - began)
 
 
 def ours(seconds: float, seed: int, material: str, excitation: str) -> Callable[[], float]:
-    """The whole loop; the seed stays, so that every turn does the same work."""
+    """Return the complete loop with a fixed seed, so that every repetition does the same work."""
     scenario = Scenario(duration_s=seconds, seed=seed, material=material, excitation=excitation)
 
     def work() -> float:

@@ -76,13 +76,13 @@ def run(command: list[str]) -> tuple[float, float]:
 
 
 def training(data: Path, out: Path, updates: int, epochs: int = 2) -> list[str]:
-    """A training of the preset quick with so many updates an epoch."""
+    """Return the command of a training of preset `quick` with the given updates per epoch."""
     sets = [f"training.epochs={epochs}", f"training.updates={updates}"]
     return ["train", str(data), "--out", str(out), "--preset", "quick", *(w for text in sets for w in ("--set", text))]
 
 
 def repeated(store: Path, out: Path, times: int) -> Path:
-    """A store that lists the recordings of another one so many times, each time under other names."""
+    """Create a store that lists the recordings of another store several times under new names."""
     out.mkdir()
     (out / "rows").symlink_to((store / "rows").resolve())
     index = read_json(store / INDEX)
@@ -96,7 +96,7 @@ def repeated(store: Path, out: Path, times: int) -> Path:
 
 
 def of_hours(store: Path, folder: Path, times: int, hours: float, commands: list[str], quick: bool) -> list[Row]:
-    """What commands take on a store: name, hours, processor s, memory in MB; of a training also s an update."""
+    """Measure commands on a store: name, hours, processor time (s), memory (MB); for trainings also s per update."""
     data = repeated(store, folder / f"store_{hours:g}", times)
     few, many = (2, 20) if quick else UPDATES
     rows: list[Row] = []
@@ -117,7 +117,7 @@ def of_hours(store: Path, folder: Path, times: int, hours: float, commands: list
 
 
 def of_a_part(bench: Bench, base: float, hours: float, at_most: float) -> object:
-    """What commands take that look at some hours of a store, and their verdicts, in results of their own."""
+    """Measure commands that read some hours of a store, and store their verdicts in a separate file."""
     folder, quick = bench.folder, bench.quick
     store, data = folder / "store", folder / f"store_{hours:g}"
     write_logs(folder / "logs", base, 20, bench.seed)

@@ -118,7 +118,7 @@ def floors(names: tuple[str, ...], parts: Any, seed: int) -> dict[str, tuple[Twi
 
 
 def fitted_models(arguments: Any, experiment: TwinExperiment, parts: Any) -> dict[str, tuple[Twin, float]]:
-    """The twins that are asked for, each with the processor seconds of its training."""
+    """Fit the requested twins; return each with the processor seconds of its training."""
     quick, only, seed = arguments.quick, arguments.only, arguments.seed
     fit = QUICK_FIT if quick else grey_fit(arguments)
     training = replace(experiment.training, seed=seed)
@@ -167,7 +167,7 @@ def validation_mae(twin: Twin, data: Any, experiment: TwinExperiment) -> float:
 
 
 def check_goals(bench: Bench, scores: dict[str, dict[str, Any]], named: list[str], coverage: float) -> None:
-    """The goals, asked of the formulation that has less error on the validation part."""
+    """Add the verdicts for the formulation with the smaller validation error."""
     best = min(named, key=lambda name: scores[name]["validation_mae"])
     print(f"less error on the validation part: {best}")
     ours, rival = scores[best], scores["static"]
@@ -200,7 +200,7 @@ def check_specialist(bench: Bench, scores: dict[str, Any]) -> None:
 
 
 def trained(experiment: TwinExperiment, training: FreeRunSpec, parts: Any) -> tuple[RecurrentTwin, float]:
-    """A recurrent twin and the processor seconds of its training."""
+    """Train a recurrent twin; return the twin and its processor seconds."""
     channels, scales, data = parts
     formulation: Any = experiment.twin  # RECURRENT says which
     twin: RecurrentTwin = formulation.start(channels, scales, data.train, training.seed)
@@ -217,7 +217,7 @@ def grey_fit(arguments: Any) -> GreyFitSpec:
 def fitted_once(
     folder: Path | None, name: str, fitted: Callable[..., Any], how: tuple[Any, ...], spec: Any = None
 ) -> tuple[Twin, float]:
-    """A twin and the processor seconds of its fit; from the folder where an earlier run with it was stopped."""
+    """Fit a twin, resuming an interrupted run of the folder; return the twin and its processor seconds."""
     if folder is None:
         return fitted(*how)
     home = folder / name.replace(", ", "_").replace(" ", "_")
@@ -229,7 +229,7 @@ def fitted_once(
 
 
 def fitted_linkage(parts: Any, seed: int, fit: GreyFitSpec) -> tuple[GreyTwin, float]:
-    """The same, told pins and lengths of M22, with bodies that are not its own."""
+    """Fit a grey box with the known linkage of M22 and wrong body parameters."""
     with tempfile.TemporaryDirectory() as folder:
         return fitted_grey_box(parts, seed, fit, write_guess("m22", Path(folder) / "guess.toml"))
 
@@ -244,7 +244,7 @@ def write_guess(machine: str, path: Path) -> str:
 
 
 def fitted_grey_box(parts: Any, seed: int, settings: GreyFitSpec, linkage: str = "") -> tuple[GreyTwin, float]:
-    """A grey box and the processor seconds of its fit; of the machine a linkage is told, and its channels."""
+    """Fit a grey box; return the twin and its processor seconds. A known linkage uses the machine's channels."""
     channels, scales, data = parts
     twin = GreyBox(fit=settings, linkage=linkage).start(channels, scales, data.train, seed)
     fit = fit_grey_box(twin, data.train, data.validation, seed, told)

@@ -137,7 +137,7 @@ def experiment(seed: int, quick: bool, ahead: bool = False) -> Experiment:
 
 
 def smaller(settings: Experiment) -> Experiment:
-    """The same with fewer channels and units."""
+    """Return the settings with fewer channels and units."""
     backbone = replace(settings.model.backbone, channels=(SMALL,), units=SMALL)
     return replace(settings, model=replace(settings.model, backbone=backbone))
 
@@ -200,7 +200,7 @@ def judged(net: Predictor, data: Prepared, spec: JudgeSpec) -> dict[str, dict[st
 
 
 def check(bench: Bench, rows: dict[str, Any], limits: dict[int, float]) -> None:
-    """The table, and what is asked of it."""
+    """Print the table and add the verdicts."""
     ridge = {k: rows["ridge ARX"]["mae"][str(k)] for k in HORIZONS}
     share = {name: {k: closed(row["mae"][str(k)], ridge[k], limits[k]) for k in HORIZONS} for name, row in rows.items()}
     lines = [

@@ -90,7 +90,7 @@ GOALS = {"tanks.toml": 0.25, "emps.toml": 3.0, "sjoberg.toml": 0.55}
 
 
 def machine(recording: Recording, which: LeagueSet) -> Recording:
-    """The recording with the channels of one actuator."""
+    """Return the recording with the channels of one actuator."""
     columns, channels = [recording.column(which.command)], [Channel("command", Kind.RATIO)]
     channels.append(Channel("velocity", Kind.VELOCITY))
     if which.velocity:
@@ -230,7 +230,7 @@ class Judged:
         return Judged(channels, task.series(estimation), task.series(test), which, minutes)
 
     def experiment(self, seed: int, quick: bool) -> TwinExperiment:
-        """The defaults, the budget, the prefix of the league, and the elements that the description names."""
+        """Return the default settings with the budget, the prefix of the league, and the named elements."""
         made = load_twin_experiment(None, (f"training.seed={seed}", *(QUICK if quick else ())))
         elements = self.which.elements
         if quick and elements is not None:
@@ -239,7 +239,7 @@ class Judged:
         return limit_processor_time(made, self.minutes) if self.minutes else made
 
     def chosen(self, seed: int, quick: bool) -> tuple[FittedFormulation, dict[str, Any], TwinExperiment]:
-        """The twin that the defaults choose, and what was tried."""
+        """Fit the twin that the defaults choose; return the twin, the candidates and the settings."""
         experiment, cut = self.experiment(seed, quick), round(ESTIMATION * self.estimation.samples)
         parts = [
             replace(self.estimation, inputs=self.estimation.inputs[rows], targets=self.estimation.targets[rows])
@@ -286,7 +286,7 @@ class Judged:
         return rows
 
     def measure(self, seed: int, quick: bool) -> dict[str, Any]:
-        """The chosen twin of a seed: error in the unit of the set, what was chosen, coverage, processor time."""
+        """Measure the chosen twin of a seed: error in the unit of the set, formulation, coverage, processor time."""
         began = time.process_time()
         result, facts, experiment = self.chosen(seed, quick)
         error = free_run_rmse(result.fitted.twin, self.test, self.which.target)
@@ -329,7 +329,7 @@ def show(title: str, found: dict[str, Any], published: dict[str, float]) -> None
 
 
 def check(bench: Bench, entry: dict[str, Any], found: dict[str, Any]) -> None:
-    """The median of the twin against each published rival that the entry names, its goal, and the best rival here."""
+    """Compare the twin's median with each published reference, the target and the best reference of this run."""
     title, ours, unit = entry["title"], found["median"], entry["unit"]
     for name in entry["rivals"]:
         bench.check(f"{title}, twin: against the published {name}", ours, entry["published"][name], "<= 1", unit)

@@ -77,7 +77,7 @@ SETS = {
 
 
 def machine(recording: Recording, which: MachineSet) -> Recording:
-    """The recording with the channels of the machine, their kinds told."""
+    """Return the recording with the channels of the machine and their kinds."""
     kinds = dict.fromkeys(which.commands, Kind.RATIO)
     kinds |= dict.fromkeys(which.positions, Kind.ANGLE if which.turning else Kind.POSITION)
     kinds |= dict.fromkeys(which.pressures, Kind.PRESSURE)
@@ -87,7 +87,6 @@ def machine(recording: Recording, which: MachineSet) -> Recording:
 
 
 def experiment_of(seed: int, quick: bool, prefix_ticks: int = 30) -> TwinExperiment:
-    """The defaults, with a seed."""
     experiment = load_twin_experiment(None, (f"training.seed={seed}", *(QUICK if quick else ())))
     return replace(experiment, twin=replace(experiment.twin, prefix_ticks=prefix_ticks))
 
@@ -134,7 +133,7 @@ def public_sets(seed: int, quick: bool) -> dict[str, dict[str, Any]]:
 
 
 def own_logs(given: Any) -> dict[str, dict[str, Any]]:
-    """A folder of logs, whole recordings judged."""
+    """Evaluate a folder of logs on complete held-out recordings."""
     recordings = source_of(given.logs, given.map, given.repair).read()
     experiment = replace(experiment_of(given.seed, given.quick), split=ByRecording(seed=given.seed))
     return {given.logs.name: measure(*cut_recordings(recordings, experiment), experiment)}

@@ -1,5 +1,6 @@
-"""The process that does jobs for a pool: ``python -m edp.jobs.worker`` with a socket; not for
-people.
+"""Process that runs the jobs of a pool: ``python -m edp.jobs.worker`` with a socket. Not for direct use.
+
+The process ends with its parent and returns one record for each job.
 
 It lives as long as its parent and not longer, and answers each job with one record.
 """

@@ -117,8 +117,10 @@ class OilRange:
 
 
 class FlowBalances(ResidualSource):
-    """Fitted balances, one a chamber: the velocity that is measured less the one that its flows make, over how far that
-    usually is off in such a situation.
+    """Fitted flow balances, one per chamber.
+
+    A residual is the measured velocity minus the velocity computed from the flows, divided by the usual deviation in
+    such a situation.
 
     Everything is that of `BACK` ticks ago, since the rate of a pressure needs ticks on either side. Where the oil is
     colder or hotter than it was learned, all are silent. A thermometer that fails silences nothing: its last value

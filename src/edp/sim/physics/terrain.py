@@ -188,8 +188,9 @@ def carry(numbers: Array, memory: Array, axes: Array) -> None:
 
 @compiled
 def look(row: Array, time_s: float, axes: Array, ground: tuple[Array, ...]) -> tuple[bool, bool]:
-    """Once a sample: spill, slide, carry. Returns whether the bucket may touch soil within the next sample, and
-    whether it may be its first touch.
+    """Advance spilling, sliding and carrying of soil by one sample.
+
+    Returns whether the bucket may touch soil within the next sample, and whether this may be its first contact.
 
     Args:
         row: the sample's log.

@@ -98,9 +98,7 @@ class _Fitted:
 
 @dataclass(frozen=True, eq=False)
 class _FittedMachine:
-    """The machine fitted through its grey box: that at the end of the fit, coordinates, where they ended, and what the
-    last rounds knew of them.
-    """
+    """Machine fitted through its grey box, with the final coordinates and the state of the last rounds."""
 
     twin: GreyTwin
     coordinates: MachineParametrisation

@@ -69,8 +69,10 @@ def train_twin(
     workers: Workers = IN_PROCESS,
     start: str | Path | None = None,
 ) -> TrainedTwin:
-    """Train a twin and write a run folder: ``twin/``, settings, history, ``free_run.json``, and where there was a
-    choice ``candidates.json``. A finished one is read, a stopped one goes on.
+    """Train a twin and write a run folder, or read a finished one, or continue an interrupted one.
+
+    The folder holds ``twin/``, settings, history and ``free_run.json``, and ``candidates.json`` if several formulations
+    were fitted.
 
     Args:
         source: source of the recordings.
