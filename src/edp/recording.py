@@ -21,7 +21,7 @@ MACHINE = "machine"
 MAX_ROWS = 1 << 22
 """Rows that screening and coverage hold at a time: eleven and a half hours at 100 Hz."""
 STRETCH_S = 120.0
-"""Of the stretches that a large data set is looked at by."""
+"""Of the segments that a large data set is looked at by."""
 HASHED_ROWS = 65_536
 """Of a block that is hashed at a time: samples that lie on disk do not all come into memory."""
 
@@ -59,7 +59,7 @@ class Recording:
         values: float32, shape ``(time, channel)``, SI units; NaN marks a missing value.
         rate_hz: samples per second.
         source: where it came from (file path, or ``sim:M22`` and the like).
-        meta: plain JSON facts (seed, scenario, machine, repairs made).
+        meta: plain JSON data (seed, scenario, machine, repairs made).
     """
 
     name: str
@@ -172,7 +172,7 @@ def spread_stretches(lengths: Sequence[int], length: int, most: int = MAX_ROWS) 
 
     Args:
         lengths: rows of each sequence.
-        length: rows of a stretch; shorter sequences are taken whole.
+        length: rows of a segment; shorter sequences are taken whole.
         most: rows in all, about; where the sequences hold no more, each is taken whole.
     """
     total = sum(lengths)

@@ -116,7 +116,7 @@ class PredictorAhead(VelocityModel):
 class TwinAhead(VelocityModel):
     """Velocity model from a twin, which simulates the commands from the present measurement.
 
-    What the plant does not measure, such as pump pressures, is a free port of the twin: it reads its own last answer.
+    What the plant does not measure, such as pump pressures, is a free port of the twin: it reads its own last output.
 
     Args:
         twin: twin with the channels of Table A.1.
@@ -124,7 +124,7 @@ class TwinAhead(VelocityModel):
         measured: names of the channels that the plant measures.
 
     Raises:
-        ConfigError: it answers other velocities, or other commands drive it.
+        ConfigError: it outputs other velocities, or other commands drive it.
     """
 
     def __init__(self, twin: Twin, ticks: int, measured: Collection[str]) -> None:

@@ -63,16 +63,16 @@ class Controller(ABC):
     """Levers for a reference, tick by tick.
 
     A subclass gives `begin` and `levers`. `step` guards it: where a channel of `reads` is missing or not finite, where
-    `levers` raises `ControlFault` or answers something that is not finite, the levers go back to neutral at the slew
+    `levers` raises `ControlFault` or outputs something that is not finite, the levers go back to neutral at the slew
     limit and an event is logged; nothing is raised in a loop. What a controller asks for is cut to the limits.
 
     Where a guard says so (`edp.control.guard`), a channel counts as missing though it has a value, but for those of
-    `spared`, and `fallback` answers in place of `levers`.
+    `spared`, and `fallback` outputs in place of `levers`.
 
     Args:
         plant: controlled plant.
         limits: limits of the levers.
-        reads: names of the measured channels without which it has no answer.
+        reads: names of the measured channels without which it has no output.
         spared: channels without which the controller still works if a guard does not trust them.
 
     Attributes:
@@ -111,7 +111,7 @@ class Controller(ABC):
             tick: row of the reference that belongs to now.
 
         Raises:
-            ControlFault: there is no answer.
+            ControlFault: there is no output.
         """
 
     def fallback(self, measured: Array, tick: int, reason: str) -> Array:
@@ -123,7 +123,7 @@ class Controller(ABC):
             reason: reason of the guard, for the log.
 
         Raises:
-            ControlFault: it has no answer without its model.
+            ControlFault: it has no output without its model.
         """
         raise ControlFault(f"it has no fallback where a guard asks for one{f' ({reason})' if reason else ''}")
 
@@ -131,7 +131,7 @@ class Controller(ABC):
         """Raise an error before any loop if the controller cannot work; the default accepts everything.
 
         Args:
-            measured: the channels of `reads` at a start, at rest.
+            measured: the channels of `reads` at a start, in steady state.
 
         Raises:
             ConfigError: it could not control this plant.

@@ -23,7 +23,7 @@ class GuardVerdict:
 
     Attributes:
         untrusted: names of measured channels whose values controllers must not read.
-        fall_back: whether the model of the controller is not to be trusted, so that its fallback has to answer.
+        fall_back: whether the model of the controller is not to be trusted, so that its fallback has to output.
         reason: reason for the log; one short sentence without a full stop.
     """
 

@@ -41,7 +41,7 @@ class LoopResult:
     Attributes:
         recording: a row a tick: observations, true values under names that end in `TRUE`, heights of the ground where
             there is one, reference, levers.
-        score: over the judged ticks.
+        score: over the evaluated ticks.
         events: events logged by the controller.
         solve_s: time of each step of the controller, shape (ticks,), s.
         infos: figures that the controller gave, by name, shape (ticks,) each; NaN where it gave none.
@@ -85,7 +85,7 @@ def run_loop(
         seed: seed of the environment.
         options: further options of the environment's reset.
         guard: guard that states at each sample which channels the controller may read, and whether it must fall back.
-        deadline_s: time of the clock after which an answer of the controller counts as missing: levers go towards
+        deadline_s: time of the clock after which an output of the controller counts as missing: levers go towards
             neutral in its place. 0: none. A loop with a deadline depends on what else the computer does.
 
     Raises:

@@ -27,17 +27,17 @@ TIP = ("TipX", "TipY", "TipAngle")
 
 
 class ModelBatch(PlantBatch):
-    """Plants whose levers become nominal pilot pressures, which a model answers without noise.
+    """Plants whose levers become nominal pilot pressures, which a model outputs without noise.
 
-    An observation holds the answers, then the pilot pressures. A learned model says nothing of the pressures of a pose
-    at rest, and its prefix must be measured: both are those of a simulated machine.
+    An observation holds the outputs, then the pilot pressures. A learned model says nothing of the pressures of a pose
+    in steady state, and its prefix must be measured: both are those of a simulated machine.
 
     Args:
         answers: channels of the model's outputs; the strokes are among them.
         commands: channels of the model's inputs, of those that levers command.
-        machine: name or file of the machine whose kinematics, nominal commands and pressures at rest are used.
+        machine: name or file of the machine whose kinematics, nominal commands and pressures in steady state are used.
         rate_hz: ticks per second.
-        prefix: ticks at rest before an episode.
+        prefix: ticks in steady state before an episode.
         duration_s: length of an episode.
         count: number of plants.
 
@@ -143,7 +143,7 @@ class ModelBatch(PlantBatch):
 
     @abstractmethod
     def _answer(self, pilots: Rows, active: Bools | None) -> Array | Rows:
-        """Return the outputs one tick later, shape (count, answer)."""
+        """Return the outputs one tick later, shape (count, output)."""
 
 
 class ModelEnvironment(SingleEnvironment):
@@ -173,7 +173,7 @@ def check_plant_channels(what: str, commands: Sequence[str], answers: Sequence[s
     Args:
         what: the plant, for the message.
         commands: names of what commands it.
-        answers: names of what it answers.
+        answers: names of what it outputs.
         change: advice for the message.
 
     Raises:

@@ -53,12 +53,12 @@ class LoopScore:
         position_p95_mm: its 95th percentile.
         position_max_mm: its largest value.
         attitude_rms_deg: error of the bucket's attitude.
-        arrived_s: seconds from the first judged tick until the tip stays within `ARRIVED_M` of the end; None where it
-            does not.
+        arrived_s: seconds from the first evaluated tick until the tip stays within `ARRIVED_M` of the end; None where
+            it does not.
         energy_kj: hydraulic energy of the pumps; None where the plant does not tell.
         lever_travel: sum of the changes of all levers, in full positions.
         violations: ticks at which each of `LIMITS` was violated.
-        missed: ticks at which the controller had no answer.
+        missed: ticks at which the controller had no output.
         finished: whether the loop ran to the end of the reference.
     """
 
@@ -84,7 +84,7 @@ def scored(trace: LoopTrace, reference: TipReference, limits: LoopLimits, missed
         trace: trace of the loop; it may be shorter than the reference, but must include its evaluated part.
         reference: reference of the loop.
         limits: limits of the loop.
-        missed: ticks at which the controller had no answer.
+        missed: ticks at which the controller had no output.
     """
     ticks, rate = len(trace.tip), reference.rate_hz
     judged = reference.judged[:ticks]

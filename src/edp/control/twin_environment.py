@@ -43,7 +43,7 @@ class TwinBatch(ModelBatch):
             self._grounded.begin()
 
     def _start(self, index: int, shares: Any) -> Rows:
-        """Begin with a prefix at rest, in which the memory of the twin forms."""
+        """Begin with a prefix in steady state, in which the memory of the twin forms."""
         rows, answers = self._rest_rows(shares), len(self.twin.channels.answers)
         state = self.twin.reset(rows[None, :-1, answers:], rows[None, :-1, :answers])
         if self.count == 1 or not self._state:
@@ -66,16 +66,16 @@ class TwinBatch(ModelBatch):
 class TwinEnvironment(ModelEnvironment):
     """An environment whose machine is a twin on commands alone.
 
-    Levers become nominal pilot pressures, one tick of the twin answers them, and the observation holds its velocities,
+    Levers become nominal pilot pressures, one tick of the twin outputs them, and the observation holds its velocities,
     strokes and pressures and the pilot pressures, without noise. ``info["truth"]`` holds strokes and tip. Its memory
-    forms in a prefix at rest, which the simulator's machine of the same name shows at the strokes of the start.
+    forms in a prefix in steady state, which the simulator's machine of the same name shows at the strokes of the start.
 
     Options of a reset are ``strokes``, shares of full to start from, and ``material``: of a twin with a ground, any
     name lets it act, uncut. A twin draws nothing.
 
     Args:
         twin: twin of an excavator with the channels of Table A.1 and strokes.
-        machine: name or file of the machine whose kinematics, nominal commands and pressures at rest are used.
+        machine: name or file of the machine whose kinematics, nominal commands and pressures in steady state are used.
         duration_s: length of an episode.
         ground: law of the ground that acts where a reset names a material; it stands for any.
 

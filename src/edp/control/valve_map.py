@@ -27,7 +27,7 @@ RUN_S, SETTLE_S = 0.9, 0.5
 BEGINS = 0.15
 """Distance of a run's start from mid stroke, as a share, on the side from which it moves away."""
 MOVES_M_S = 0.003
-"""Mean speed above which a lever moves its cylinder: three times what sensors show at rest."""
+"""Mean speed above which a lever moves its cylinder: three times what sensors show in steady state."""
 SIDES = (1.0, -1.0)
 CYLINDERS = ("boom", "arm", "bucket")
 NEARLY = 0.8

@@ -85,7 +85,7 @@ class WindowShift:
 class TimeWarp:
     """Time warping: inputs and targets are resampled with a varying speed; both ends of the segment stay in place.
 
-    The speed is one plus three sines of random phase, whose periods lie between a quarter of the stretch and the whole.
+    The speed is one plus three sines of random phase, whose periods lie between a quarter of the segment and the whole.
     Values are interpolated, not scaled: what changes is how fast the plant answers. So are teacher predictions.
 
     Attributes:

@@ -31,7 +31,7 @@ class ChunkSpec:
         burn_in: samples after a reset that give no loss (chunk regime).
         consecutive: windows that end at consecutive samples and are drawn together, for terms of the loss that
             compare neighbours (window regime).
-        carried: chunks that a stream is carried on before it starts anew (chunk regime); where the data do not fill
+        carried: chunks that a stream is carried on before it starts again (chunk regime); where the data do not fill
             all lanes they are walked again, cut elsewhere. 0: at least 8, and at most an even share of a lane.
 
     Raises:
@@ -87,7 +87,7 @@ class Batch:
         inputs: ``(batch, time, input)`` SI units.
         future: ``(batch, time, horizon, target)``: the target channels at t + k, SI units.
         valid: ``(batch, time)``: where a loss is taken.
-        reset: ``(batch,)``: streams that start anew with this chunk.
+        reset: ``(batch,)``: streams that start again with this chunk.
         strategy_columns: ``(batch, time, column)``: what a training strategy reads of each tick; None without.
     """
 
@@ -123,14 +123,14 @@ class ChunkSampler:
     """Batches of one epoch as a pure function of (seed, epoch), so that a resumed run sees the same ones.
 
     Args:
-        series: the training stretches.
+        series: the training segments.
         horizons: look-ahead samples.
         spec: chunk length, lanes, burn-in.
         seed: root of the random order.
-        augmentations: applied in order to each stretch from a reset to the next one.
+        augmentations: applied in order to each segment from a reset to the next one.
 
     Raises:
-        DataError: a stretch shorter than burn-in (or window) plus the largest horizon.
+        DataError: a segment shorter than burn-in (or window) plus the largest horizon.
     """
 
     def __init__(

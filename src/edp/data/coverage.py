@@ -362,7 +362,7 @@ def _range(values: Array) -> tuple[float, float]:
 def mutual_information(x: Array, y: Array, bins: int = QUANTILES) -> float:
     """Mutual information in nat of two signals in bins of equal content, less its expected value for independent ones.
 
-    A value held for long (a command at rest) takes a bin of its own, however many samples it has.
+    A value held for long (a command in steady state) takes a bin of its own, however many samples it has.
     """
 
     def ranked(values: Array) -> NDArray[np.intp]:

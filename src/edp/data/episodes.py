@@ -15,18 +15,18 @@ from edp.errors import ConfigError, DataError
 class EpisodeSampler:
     """Batches of episodes as a pure function of (seed, epoch). Each epoch has every machine once or nearly so.
 
-    The lanes of a batch are ``machines`` groups of ``2 * shots`` pieces of ``spec.length`` ticks, each from reset: the
+    A batch consists of ``machines`` groups of ``2 * shots`` segments of ``spec.length`` ticks, each from reset: the
     first half of a group is the support that a network adapts on, the second half the query. No tick is in both.
 
     Args:
-        series: training stretches that know their machine.
+        series: training segments that know their machine.
         horizons: look-ahead samples.
         spec: length of a piece, lanes of a batch, burn-in.
-        shots: pieces of support, and of query, of a machine.
+        shots: segments of support, and of query, of a machine.
         seed: root of the random order.
 
     Raises:
-        ConfigError: windows, a batch that is no multiple of ``2 * shots``, or pieces no longer than the burn-in.
+        ConfigError: windows, a batch that is no multiple of ``2 * shots``, or segments no longer than the burn-in.
         DataError: a series without a machine, or a machine with too few ticks for an episode.
     """
 

@@ -62,7 +62,7 @@ def is_even(
     Args:
         split: division of the recordings.
         recordings: the data set.
-        gap: ticks between neighbouring stretches of different parts.
+        gap: ticks between neighbouring segments of different parts.
         weights: samples of each recording that count.
     """
     try:
@@ -92,7 +92,7 @@ def most_unlike(
     Args:
         split: division of the recordings.
         recordings: the data set.
-        gap: ticks between neighbouring stretches of different parts.
+        gap: ticks between neighbouring segments of different parts.
         channels: channel names. If a recording lacks one, the others are used.
         spans: ticks over which changes are looked at.
 
@@ -173,7 +173,7 @@ def blocks_where_time_is_uneven(
 def rests_where_it_tests(
     recordings: Sequence[Recording], channels: Sequence[str], horizons: Sequence[int], by_time: ByTime
 ) -> bool:
-    """Return whether the machine stands still in most of the test or validation data of every possible split.
+    """Return whether the machine does not move in most of the test or validation data of every possible split.
 
     Args:
         recordings: the data set.

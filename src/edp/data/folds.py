@@ -48,9 +48,9 @@ def make_block_folds(lengths: Sequence[int], folds: int, gap: int, pieces: int =
     """Return folds of nearly equal size over the concatenated segments, each of `pieces` contiguous parts.
 
     Args:
-        lengths: rows of each stretch, in order.
+        lengths: rows of each segment, in order.
         folds: number of folds, 2 or more.
-        gap: rows beside a piece, in the same stretch, that share history or future with it and do not train.
+        gap: rows beside a piece, in the same segment, that share history or future with it and do not train.
         pieces: number of contiguous parts per fold. Consecutive parts belong to different folds.
 
     Raises:
@@ -94,7 +94,7 @@ def recording_folds(lengths: Sequence[int], recordings: Sequence[str], folds: in
     Each fold takes recordings until it has its share of the rows, the longest first.
 
     Args:
-        lengths: rows of each stretch, laid end to end.
+        lengths: rows of each segment, laid end to end.
         recordings: index of the recording of each segment.
         folds: number of folds at most.
 

@@ -20,7 +20,8 @@ SECOND_TEST_SET = "second test sessions"
 """Name of the second sealed test set of a search in ledgers."""
 SHARED_SHARE, SHARED_ROWS = 0.2, 50
 """A recording is a piece of another one where so large a share of its different rows, and so many, stand in both.
-Rows of a machine at rest repeat, but are few among the different ones; sensors that move never repeat all channels."""
+Rows of a machine in steady state repeat, but are few among the different ones; sensors that move never repeat all
+channels."""
 
 
 @dataclass(frozen=True, kw_only=True)

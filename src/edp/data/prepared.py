@@ -21,12 +21,12 @@ class Prepared:
 
     Attributes:
         task: channels to read and to predict.
-        train: training stretches; `validation` and `test` likewise.
+        train: training segments; `validation` and `test` likewise.
         inputs: the logged input channels.
         feature_kinds: kind of each feature, in order.
         target_kinds: kind of each target.
         descriptions: description of each target.
-        digest: blake2b over the recordings and stretches.
+        digest: blake2b over the recordings and segments.
     """
 
     task: Task
@@ -51,7 +51,7 @@ def prepare(recordings: Sequence[Recording], task: Task, split: SplitSpec, windo
         recordings: the data set, all at the rate of the task.
         task: channels to read and to predict.
         split: division of the recordings.
-        window: W; the gap between neighbouring stretches is ``W + k``.
+        window: W; the gap between neighbouring segments is ``W + k``.
 
     Raises:
         DataError: a channel is missing, a value is not finite, rates differ, or a part would be empty.

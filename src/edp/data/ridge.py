@@ -112,12 +112,12 @@ def cross_validate_ridge(
 ) -> RidgeSolution:
     """Ridge regression on all of `parts`; penalty and history by cross-validation over contiguous folds.
 
-    For little data, where one held-out stretch is too short to choose by and too dear to leave out of the fit.
+    For little data, where one held-out segment is too short to choose by and too dear to leave out of the fit.
 
     Args:
-        parts: all stretches that may be learned from.
+        parts: all segments that may be learned from.
         task: channels to read and to predict.
-        folds: pieces of nearly equal duration; neighbouring ones share the history and future of their ticks.
+        folds: segments of nearly equal duration; neighbouring ones share the history and future of their ticks.
         penalties: penalties to try, see `ridge_solution`.
         histories: histories to choose from, in samples; cut to the task's.
 

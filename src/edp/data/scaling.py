@@ -74,9 +74,9 @@ def feature_columns(task: Task, series: Series, places: Sequence[int], slot: Las
 
     Args:
         task: channels to read.
-        series: the stretch.
+        series: the segment.
         places: indices of the features, in the required order.
-        slot: shared by stretches that are gone through one after the other.
+        slot: shared by segments that are gone through one after the other.
     """
     if max(places, default=0) < len(task.features.channels):
         return some_columns(series.inputs, places)
@@ -91,7 +91,7 @@ def fit_scaler(task: Task, train: Sequence[Series], kinds: Sequence[Kind]) -> Sc
 
     Args:
         task: channels to read and to predict.
-        train: the training stretches, nothing else.
+        train: the training segments, nothing else.
         kinds: kind of each feature, in order.
     """
     features, changes = _moments(task, train)

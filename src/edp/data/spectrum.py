@@ -27,7 +27,7 @@ def hankel_gram(inputs: Sequence[Array], lags: int) -> tuple[Array, int]:
     products at one distance, so that each block follows from its neighbour by one product less and one more.
 
     Args:
-        inputs: stretches, shape ``(time, input)``; those shorter than `lags` are left out.
+        inputs: segments, shape ``(time, input)``; those shorter than `lags` are left out.
         lags: block rows.
 
     Returns:
@@ -60,7 +60,7 @@ def smallest_singular_values(inputs: Sequence[Array], lags: int = LAGS) -> dict[
     of an order as long as the value is above zero; a small one says which models the data cannot tell apart.
 
     Args:
-        inputs: stretches, shape ``(time, input)``; no column is constant.
+        inputs: segments, shape ``(time, input)``; no column is constant.
         lags: the largest number of block rows.
     """
     whole = np.concatenate(inputs)
@@ -79,7 +79,7 @@ def density(stretches: Sequence[Array], rate_hz: float) -> tuple[Array, Array]:
 
     Returns:
         frequencies in Hz without zero, shape ``(frequency,)``; density, shape ``(frequency, signal)``. Empty where no
-        stretch fills a segment.
+        segment fills a segment.
     """
     # A power of two for the transform, and 16 samples at least for a slow logger.
     size = 1 << round(np.log2(max(SEGMENT_S * rate_hz, 16)))

@@ -17,7 +17,7 @@ class StretchFold:
     """One division of segments into training and validation.
 
     Attributes:
-        train: stretches to learn from.
+        train: segments to learn from.
         validation: segments that are left out.
     """
 
@@ -33,7 +33,7 @@ def stretch_folds(series: Sequence[Series], count: int, gap: int, shortest: int,
             driving tasks.
         count: folds, at least 2.
         gap: ticks beside a fold that it does not learn from.
-        shortest: ticks of a stretch that says something; what is cut shorter is in neither part.
+        shortest: ticks of a segment that says something; what is cut shorter is in neither part.
         seed: random seed of the order.
 
     Raises:

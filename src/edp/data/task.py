@@ -75,7 +75,7 @@ class Task:
         mode: absolute or delta encoding.
         rate_hz: samples per second of every recording.
         derived_targets: derived channels that serve as targets only.
-        integrate: targets at horizon 0 whose running integral is judged too: a plant that integrates (a position
+        integrate: targets at horizon 0 whose running integral is evaluated too: a plant that integrates (a position
             behind a velocity) is predicted through its rate and integrated outside.
         physics: further logged channels that only a physics base reads: inputs, but neither features nor known to
             baselines.

@@ -17,7 +17,7 @@ from edp.networks.twin import Twin
 
 Array = NDArray[np.float32]
 EACH = 200
-"""Moments in each stretch: a few hundred in each of a dozen recordings settle a mean error to a per cent."""
+"""Moments in each segment: a few hundred in each of a dozen recordings settle a mean error to a per cent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class Ahead:
         channels: channels of the twin.
         ticks: prediction horizon in samples.
         moments: index of the last measured sample of each prediction, by segment ``(moment,)``.
-        answers: ``(moment, answer)``, SI units, stretch after stretch.
+        answers: ``(moment, output)``, SI units, segment after segment.
         truth: measured, of the same shape.
     """
 
@@ -46,10 +46,10 @@ def look_ahead(twin: Twin, series: Sequence[Series], ticks: int, first: int = 0)
         twin: any formulation.
         series: inputs are commands, targets are what it answers.
         ticks: prediction horizon in samples, at least one.
-        first: earliest moment in a stretch; never before the prefix.
+        first: earliest moment in a segment; never before the prefix.
 
     Raises:
-        DataError: no stretch is long enough.
+        DataError: no segment is long enough.
     """
     prefix, answers, truths, moments = twin.prefix_ticks, [], [], []
     for part in series:

@@ -56,7 +56,7 @@ class Situations:
     """Tells the situations of the axes whose velocities are targets, by measured channels alone.
 
     Velocity and command belong together as `edp.data.roles` has it. A position belongs to a velocity where it is of
-    the kind of its integral. Sizes are those of the series that are judged, ranges those of all series.
+    the kind of its integral. Sizes are those of the series that are evaluated, ranges those of all series.
 
     Args:
         data: evaluated series; their inputs contain strokes and commands.

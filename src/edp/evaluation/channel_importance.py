@@ -111,7 +111,7 @@ class ChannelImportances:
         rows: importance by group, horizon and target; the mean over targets comes first.
         error: mean absolute error with all channels, by horizon and target.
         units: report unit of each target; ``mean`` has that of the targets, where they share it.
-        recordings: names of the judged recordings.
+        recordings: names of the evaluated recordings.
     """
 
     rows: tuple[ChannelImportance, ...]
@@ -139,7 +139,7 @@ def measure_channel_importance(
 
     Args:
         predictor: the network; channels that only a physics base reads are taken away like the others.
-        data: prepared series: ``data.test`` is judged, ``data.train`` tells what channels say of each other.
+        data: prepared series: ``data.test`` is evaluated, ``data.train`` tells what channels say of each other.
         spec: settings.
         progress: receiver of the progress; its units are channels, or groups of them.
 

@@ -127,7 +127,7 @@ def collinear(parts: Sequence[NDArray[np.float32]], least: float = 0.9, rows: in
     """Return groups of two or more channels with at least this absolute rank correlation between every pair.
 
     Args:
-        parts: stretches, each ``(time, channel)``.
+        parts: segments, each ``(time, channel)``.
         least: bound.
         rows: about how many rows are looked at, evenly spread.
     """

@@ -41,7 +41,7 @@ ASTRAY = 0.5
 AT_FULL_SPEED_S = 1.0
 """Motion at the largest speed that counts as a range where no stroke is measured."""
 SHORTER = (2, 4, 8)
-"""Parts of the longest free run that calibrate intervals as well, where stretches are shorter than what is asked."""
+"""Parts of the longest free run that calibrate intervals as well, where segments are shorter than what is asked."""
 LANES = 64
 """Free runs side by side: all of a data set at once would need memory without bound."""
 
@@ -54,7 +54,7 @@ class FreeRunJudgeSpec:
         seconds: length of a free run; cut to what the longest recording has.
         starts: free runs in each recording, evenly spread.
         at_s: times after the start at which strokes are compared.
-        floors: formulations that are fitted to the same recordings and judged beside it; one that does not suit them
+        floors: formulations that are fitted to the same recordings and evaluated beside it; one that does not suit them
             is left out.
         coverage: share of free runs that an interval is meant to hold.
         covered_at_s: times after the start at which coverage is counted.
@@ -91,10 +91,10 @@ class FreeRuns:
     Attributes:
         channels: channels of the twin.
         names: recording of each run.
-        answers: ``(run, tick, answer)``, SI units; row t is tick t + 1 of the free run.
+        answers: ``(run, tick, output)``, SI units; row t is tick t + 1 of the free run.
         truth: measured, of the same shape.
-        before: measured at the last tick before the first answer ``(run, answer)``.
-        low: least value of each answer, of a stroke the closed end stop ``(answer,)``; `high` likewise.
+        before: measured at the last tick before the first output ``(run, output)``.
+        low: least value of each output, of a stroke the closed end stop ``(output,)``; `high` likewise.
         high: largest value.
     """
 
@@ -159,13 +159,13 @@ def free_runs(twin: Twin, series: Sequence[Series], seconds: float, starts: int)
 
     Args:
         twin: any formulation.
-        series: inputs are commands, targets are what it answers.
-        seconds: length of a run, cut to what the longest stretch has; shorter stretches, and starts
+        series: inputs are commands, targets are what it outputs.
+        seconds: length of a run, cut to what the longest segment has; shorter segments, and starts
             beyond an end stop of the twin, are left out.
-        starts: runs in each stretch.
+        starts: runs in each segment.
 
     Raises:
-        DataError: no stretch has a tick behind the prefix.
+        DataError: no segment has a tick behind the prefix.
     """
     prefix = twin.prefix_ticks
     length = _run_ticks(twin.channels, prefix, series, seconds)
@@ -193,10 +193,10 @@ def check_runs(
         prefix: its measured ticks before a free run.
         series: evaluated series.
         seconds: length of a run, see `free_runs`.
-        starts: runs in each stretch.
+        starts: runs in each segment.
 
     Raises:
-        DataError: no stretch has a tick behind the prefix, or all starts lie beyond an end stop.
+        DataError: no segment has a tick behind the prefix, or all starts lie beyond an end stop.
     """
     starts_within(channels, scales, series, _run_ticks(channels, prefix, series, seconds), starts)
 
@@ -220,8 +220,8 @@ def runs_of(twin: Twin, names: tuple[str, ...], answers: Array, truth: Array) ->
     Args:
         twin: twin that computed the outputs.
         names: recording of each run.
-        answers: ``(run, tick, answer)``.
-        truth: measured ``(run, tick + 1, answer)``, from the last tick before the first answer.
+        answers: ``(run, tick, output)``.
+        truth: measured ``(run, tick + 1, output)``, from the last tick before the first output.
     """
     return FreeRuns(twin.channels, names, answers, truth[:, 1:], truth[:, 0], twin.scales.low, twin.scales.high)
 
@@ -230,12 +230,12 @@ def calibrated(unseen: Sequence[tuple[Twin, Sequence[Series]]], spec: FreeRunJud
     """Return free-run intervals of a twin, calibrated on free runs outside its training data.
 
     Args:
-        unseen: the twin beside the validation part; or of a twin that is the mean of several, or that was fitted anew
-            to all of them, each fit beside the stretches that it left out (the residuals of CV+, Barber et al. 2021).
+        unseen: the twin beside the validation part; or of a twin that is the mean of several, or that was fitted again
+            to all of them, each fit beside the segments that it left out (the residuals of CV+, Barber et al. 2021).
         spec: their length and number, and the coverage.
 
     Raises:
-        DataError: no stretch has a tick behind the prefix.
+        DataError: no segment has a tick behind the prefix.
     """
     whole = _unseen_runs(unseen, spec.seconds, spec.calibration_starts)
     errors = [whole.answers - whole.truth]

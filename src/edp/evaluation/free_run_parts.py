@@ -28,7 +28,7 @@ Array = NDArray[np.float32]
 AT_STOP = 0.01
 """Fraction of a stroke: distance from an end stop within which an actuator is at the stop."""
 AT_REST = 0.01
-"""Fraction of a twin's maximum velocity below which an actuator stands still, unless it is at an end stop."""
+"""Fraction of a twin's maximum velocity below which an actuator does not move, unless it is at an end stop."""
 HORIZONS_A_DECADE = 6
 """Points of an error over the horizon: a line on a page with a logarithmic axis needs no more."""
 
@@ -74,7 +74,7 @@ def nrmse_by_channel(
 
     Args:
         channels: channels of the twin.
-        answers: ``(run, tick, answer)``, SI units; `truth` likewise.
+        answers: ``(run, tick, output)``, SI units; `truth` likewise.
         truth: measured.
         ticks: mask of samples that count ``(run, tick)``; all by default.
     """
@@ -97,7 +97,7 @@ def by_horizon(channels: TwinChannels, errors: Array, stroke_errors: NDArray[np.
 
     Args:
         channels: channels of the twin.
-        errors: ``(run, tick, answer)``, SI units.
+        errors: ``(run, tick, output)``, SI units.
         stroke_errors: errors of strokes, or of integrated velocities without measured strokes ``(run, tick,
             velocity)``.
     """
@@ -129,15 +129,15 @@ def situations(
 ) -> dict[str, MotionErrors]:
     """Return the errors at end stops, at standstill and in motion by the measurement; absent situations are omitted.
 
-    An actuator is at an end stop within `AT_STOP` of its stroke, at rest where it is slower than `AT_REST` of its
-    fastest velocity. The machine is at a stop where an actuator is, and at rest (idling) where all of them are:
-    that is what counts for pressures, whose pumps serve several actuators.
+    An actuator is at an end stop within `AT_STOP` of its stroke, in steady state where it is slower than `AT_REST` of
+    its fastest velocity. The machine is at a stop where an actuator is, and in steady state (idling) where all of them
+    are: that is what counts for pressures, whose pumps serve several actuators.
 
     Args:
         channels: channels of the twin.
-        answers: ``(run, tick, answer)``, SI units; `truth` likewise.
+        answers: ``(run, tick, output)``, SI units; `truth` likewise.
         truth: measured.
-        low: least value of each answer; `high` likewise.
+        low: least value of each output; `high` likewise.
         high: largest value.
     """
     velocities, strokes = channels.parts["velocities"], channels.parts["strokes"]

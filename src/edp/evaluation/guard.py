@@ -7,7 +7,7 @@ was made from):
 * *better*: the model has less error, and the 95 % interval over recordings excludes zero;
 * *not distinguishable*: the model has less error, but the interval holds zero, or the recordings are too few for one.
 
-Recordings are the independent units of every comparison; stretches of one recording count as one. The gains of a
+Recordings are the independent units of every comparison; segments of one recording count as one. The gains of a
 controller are compared on references, each with a seed of its own, which take the place of recordings.
 """
 
@@ -37,7 +37,7 @@ MACHINE_ADVICE = "more rounds or starts of the fit (twin.fit), a nearer --machin
 MEASURE = "rmse"
 """Metric for comparing models, here, in headlines and in tables. Trainings minimise squared errors, the preset auto
 selects and promises by them, and published references state them. The mean absolute error of a machine that mostly
-stands still depends on samples at rest, which persistence predicts exactly."""
+does not move depends on samples in steady state, which persistence predicts exactly."""
 MEASURE_NAME = "RMSE"
 ADVICE = "train with the preset auto, or on more recordings"
 LEAST = 1e-3
@@ -377,7 +377,7 @@ def change_verdict(change: float, by_unit: Mapping[str, float], reference: Error
     Args:
         change: error over that of the reference, less one, over all recordings.
         by_unit: error ratios of each recording, or of each reference of a controller.
-        reference: a verdict with the label of the reference, what is judged, the advice and the ground.
+        reference: a verdict with the label of the reference, what is evaluated, the advice and the ground.
     """
     mean = math.log1p(change)
     logs = [math.log1p(one) for one in by_unit.values()]

@@ -42,10 +42,11 @@ KEPT_RECORDINGS, KEPT_TICKS = 6, 60_000
 """Maximum number of recordings and samples whose predictions are stored for pictures: ten minutes at 100 Hz."""
 SHOWN_MODELS = ("network", "ridge_arx")
 MAX_VALIDATED = 1 << 20
-"""Ticks of the validation part that baselines are judged on, about; three hours at 100 Hz."""
+"""Ticks of the validation part that baselines are evaluated on, about; three hours at 100 Hz."""
 PART_TICKS, MAX_PARTS = 1 << 17, 64
-"""Ticks of a part of the test recordings that a worker judges the network on, 22 min at 100 Hz, which take far longer
-than to hand them out; and how many parts there are at most, as each brings back megabytes of what it measured."""
+"""Ticks of a part of the test recordings that a worker evaluates the network on, 22 min at 100 Hz, which take far
+longer than to hand them out; and how many parts there are at most, as each brings back megabytes of what it
+measured."""
 SKIP = integer(0, MOST_TICKS)
 """Ticks that are not scored: a slice that begins with a negative one would score the last ticks alone."""
 
@@ -57,7 +58,7 @@ class JudgeSpec:
     Attributes:
         baselines: names of registered baselines.
         history: samples of history that baselines may use.
-        skip: first ticks of each stretch that are not scored; None leaves out a whole window (start-up), and as many
+        skip: first ticks of each segment that are not scored; None leaves out a whole window (start-up), and as many
             as baselines need of history: all are measured on the same ticks.
         seed: seed of the baselines' row sampling and initial weights.
     """
@@ -202,7 +203,7 @@ def check_scored(data: Prepared, spec: JudgeSpec) -> None:
     """Refuse a stated `skip` that leaves no sample to evaluate, before a training begins.
 
     Raises:
-        ConfigError: no stretch of the test part is longer.
+        ConfigError: no segment of the test part is longer.
     """
     longest = max((part.samples for part in data.test), default=0) - data.task.max_horizon
     if spec.skip is not None and data.test and spec.skip >= longest:
@@ -357,7 +358,7 @@ def score_predictions(predictions: Iterable[NDArray[np.float32]], data: Prepared
     Args:
         predictions: predictions in SI units.
         data: series with truth.
-        skip: first ticks of each stretch that are not scored.
+        skip: first ticks of each segment that are not scored.
 
     Raises:
         DataError: no tick can be scored.

@@ -174,7 +174,7 @@ def macs_of(name: str, args: Any, result: Tensor) -> int:
 def arithmetic_of(name: str, args: Iterable[Any], result: Tensor) -> int:
     """Return the arithmetic operations of a physics base call that depend on inputs.
 
-    What the machine's numbers alone give, tensors of at most one dimension, is computed once.
+    What the machine's parameters alone give, tensors of at most one dimension, is computed once.
     """
     of_inputs = any(isinstance(entry, Tensor) and entry.dim() > 1 for entry in args)
     return result.numel() if name in ARITHMETIC and of_inputs else 0

@@ -25,11 +25,11 @@ CORE_COSTS = {
 """Cycles of a Cortex-M4F with zero-wait memory, which computes double precision by its compiler's library.
 
 Of a residual, of a driver of it and of an input at a tick, of a product with its sum in single and in double precision,
-of a summary of a residual at the end of a block, and of a tick besides. Fitted to counted code of chains of several
+of a summary of a residual at the end of a block, and of a sample. Fitted to counted code of chains of several
 sizes (``benchmarks/monitor_cycles.py --fit``)."""
 FLOW_COSTS = {"path": 110.0, "chamber": 450.0, "spool": 160.0}
 """Cycles of balances of flow at a tick, which are in single precision: of a curve with the root of what drives it (two
-square roots and a division at 14 cycles each, the search of a knot), of a chamber besides, and of a spool. Counted by
+square roots and a division at 14 cycles each, the search of a knot), of a chamber and of a spool. Counted by
 hand from the operations of the code, unlike those above."""
 DETECTOR = {"cusum": 2.0, "ewma": 2.5, "glr": 2.0, "separate_cusums": 2.5}
 """Products in double precision that take as long as a direction in a detector; of the likelihood ratio a length."""

@@ -38,7 +38,7 @@ class Ruler:
 
     Args:
         data: ``data.test`` has the truth.
-        skip: first ticks of each stretch that are not scored.
+        skip: first ticks of each segment that are not scored.
 
     Raises:
         DataError: no tick can be scored.

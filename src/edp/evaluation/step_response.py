@@ -36,7 +36,7 @@ def step_responses(twin: Twin, series: Sequence[Series]) -> StepResponses:
         Responses in units of reports.
 
     Raises:
-        DataError: no stretch is long enough.
+        DataError: no segment is long enough.
     """
     channels, prefix = twin.channels, twin.prefix_ticks
     starts = even_starts(twin, series, prefix + 1, MAX_STARTS)

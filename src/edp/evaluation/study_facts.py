@@ -328,4 +328,4 @@ FACTS: Mapping[str, Mapping[str, type]] = {
     "sound": _COMMON | {"screening": SoundScreening, "planning": SoundPlanning, "confirmation": SoundConfirmation},
     "thesis": _COMMON | {"screening": ThesisScreening, "planning": ThesisPlanning, "confirmation": ThesisConfirmation},
 }
-"""Class of the facts, by mode and phase."""
+"""Class of the data, by mode and phase."""

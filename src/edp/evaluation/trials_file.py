@@ -19,7 +19,7 @@ class PairedDifference:
 
 @dataclass(frozen=True)
 class FeatureSetTrial:
-    """Judged feature set.
+    """Evaluated feature set.
 
     Attributes:
         name: of the set.
@@ -51,7 +51,7 @@ class Trials(ResultFile):
         trials: the first one is what the others are compared with.
         persistence: error of taking the present value, by horizon.
         unit: report unit of the errors.
-        held_out: names of the recordings that judged.
+        held_out: names of the recordings that evaluated.
         notes: sets that could not be tried, and why; channels that had to be added.
     """
 

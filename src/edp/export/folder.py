@@ -35,7 +35,7 @@ def write_export(folder: str | Path, files: Mapping[str, bytes]) -> list[Path]:
         files: content by path in the folder, with ``/`` between its parts.
 
     Returns:
-        Paths of the files in their order; `LIST` is there besides.
+        Paths of the files in their order; plus `LIST`.
 
     Raises:
         BusyError: another process writes there; nothing was changed.

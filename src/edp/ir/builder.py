@@ -136,5 +136,5 @@ class Builder:
 
 
 def _is_real(value: Any) -> bool:
-    """Return whether an option is an array or tensor of real numbers."""
+    """Return whether an option is an array or tensor of real values."""
     return hasattr(value, "shape") and value.dtype != np.uint16

@@ -38,7 +38,7 @@ class HydraulicTick(Layer):
         valve_pump: pump of each valve; `NONE` for a supply at constant pressure.
         actuator_at: places of each actuator's numbers.
         pump_at: places of each pump's; without any, one entry `NONE`.
-        ports: velocity 0, stroke 1 or pressure 2, and which ``(answer, 2)``.
+        ports: velocity 0, stroke 1 or pressure 2, and which ``(output, 2)``.
         exponents: exponents of the load's monomials ``(term, actuator)``.
         load: places of the first coefficient of the inertia's root (of the first body of a linkage) and of the
             potential, and coefficients of each entry of the root between them.

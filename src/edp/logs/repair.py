@@ -29,10 +29,10 @@ class Repair:
 
     Attributes:
         nan: missing or infinite values: ``hold`` the last good value, or ``keep`` them as NaN.
-        gaps: gaps in time: ``hold`` the last sample, ``cut`` to the longest stretch without one, or ``keep`` NaN.
+        gaps: gaps in time: ``hold`` the last sample, ``cut`` to the longest segment without one, or ``keep`` NaN.
         duplicates: equal time stamps: keep the ``last`` row of each.
-        falling: time stamps that go back: ``sort`` rows by time, or ``cut`` to the longest stretch without one, for a
-            clock that begins anew.
+        falling: time stamps that go back: ``sort`` rows by time, or ``cut`` to the longest segment without one, for a
+            clock that begins again.
     """
 
     nan: str = "refuse"
@@ -48,7 +48,7 @@ class Repair:
 
 
 def repair_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Rows | None, list[dict[str, object]]]:
-    """Judge stamps and repair falling and duplicate ones where allowed.
+    """Evaluate stamps and repair falling and duplicate ones where allowed.
 
     Returns:
         the clock, the rows kept in their new order (None: all, as they are), and the repairs made.
@@ -119,7 +119,7 @@ def repair_gaps(missing: Mask, rate_hz: float, repair: Repair, where: str) -> tu
 
 
 def repairs_of(meta: Mapping[str, object]) -> list[object]:
-    """Return the repairs that the facts of a recording state."""
+    """Return the repairs that the data of a recording state."""
     repairs = meta.get("repairs")
     return list(repairs) if isinstance(repairs, list | tuple) else []
 

@@ -1,9 +1,9 @@
 """Server side in the sandbox: one log is read by its format, and its columns are sent on request.
 
 The messages are those of `edp.sandbox.protocol`. After the order come the layers of the sandbox (for each one why it
-is missing, empty where it holds), the log's facts, then answers to requests:
-``time`` and ``load`` (a header with the number of bytes, then the array), ``open`` and ``next`` for the pieces of a
-table, and with any of them the pieces that nobody wants any more (``drop``).
+is missing, empty where it holds), the log's data, then answers to requests:
+``time`` and ``load`` (a header with the number of bytes, then the array), ``open`` and ``next`` for the segments of a
+table, and with any of them the segments that nobody wants any more (``drop``).
 """
 
 from __future__ import annotations

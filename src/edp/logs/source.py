@@ -88,7 +88,7 @@ class DataSource:
             store in a bucket, and for logs to build one from.
         signal_map: columns to channels; None takes the vocabulary's names.
         repair: what may be repaired.
-        at_most_h: of a store, evenly spread stretches of at most so many hours, about, in place of all; None for all.
+        at_most_h: of a store, evenly spread segments of at most so many hours, about, in place of all; None for all.
         more: further logs and folders of logs; a log that is named twice is read once.
 
     Raises:

@@ -81,7 +81,7 @@ def uniform_clock(samples: int, rate_hz: float) -> Clock:
 
 
 def judge(stamps: Stamps, where: str) -> Clock:
-    """Judge time stamps in seconds, shape ``(time,)``.
+    """Evaluate time stamps in seconds, shape ``(time,)``.
 
     Raises:
         DataError: fewer than two stamps, a stamp that is no number, or all stamps equal.

@@ -133,7 +133,7 @@ def add_kinds(signal_map: SignalMap) -> SignalMap:
 
 
 def drop_derived_kinds(signal_map: SignalMap) -> SignalMap:
-    """Return a map with the meaning of earlier versions, which read a channel without a kind as plain numbers."""
+    """Return a map with the meaning of earlier versions, which read a channel without a kind as dimensionless values."""
     entries = (
         replace(entry, kind=Kind.GENERIC) if _add_kind(entry) != entry else entry for entry in signal_map.channels
     )

@@ -82,8 +82,8 @@ def calibrated(spec: DetectorSpec, sessions: Sequence[Array], rows_per_s: float,
         promised_hours: operating hours to one false alarm.
 
     Raises:
-        ConfigError: a number is out of its bounds, or there are too few hours for the promise; says for which there are
-            enough.
+        ConfigError: a number is out of its bounds, or there are too few hours for the expected error; says for which
+            there are enough.
         DataError: there are no sessions, or they have other numbers of residuals.
     """
     for name, value in (("rows_per_s", rows_per_s), ("promised_hours", promised_hours)):

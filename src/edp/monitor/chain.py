@@ -138,7 +138,7 @@ class MonitorChain:
             state: before it; its detectors go on in place.
 
         Returns:
-            A verdict a block, and the state behind the stretch.
+            A verdict a block, and the state behind the segment.
         """
         first = state.blocks
         z, gross, state = self.conditioned(residuals, rows, state)

@@ -1,4 +1,4 @@
-"""A chain from healthy sessions: scales, conditioning, views, and the limit for the promised rate of false alarms."""
+"""A chain from healthy sessions: scales, conditioning, views, and the limit for the expected rate of false alarms."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class ChainSpec:
         settle_s: start of every session that is not watched, s; at most a tenth of the shortest healthy session.
         clip: largest size of a conditioned summary, in healthy standard deviations.
         watches: views with their detectors.
-        folds: parts into which sessions are dealt, at most as many as there are; what judges a session was fitted
+        folds: parts into which sessions are dealt, at most as many as there are; what evaluates a session was fitted
             without its part. Of few parts each lacks much of what the monitor itself is fitted to: limits are too high.
         drift_per_hour: maximum drift per hour of a summary level that is followed, in healthy standard deviations.
         most_drift: maximum total drift, in healthy standard deviations.
@@ -134,7 +134,7 @@ def fit_chain(
         side_by_side: calls a function for each of some jobs, such as in processes.
 
     Raises:
-        ConfigError: too few hours for the promise; says for which there are enough.
+        ConfigError: too few hours for the expected error; says for which there are enough.
         DataError: too few sessions or blocks.
     """
     _check_sessions(spec, len(sessions))

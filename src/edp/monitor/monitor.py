@@ -61,7 +61,7 @@ class Verdict:
 
     Attributes:
         alarm: raised at this tick.
-        silent: channels that are missing, so that what judges or reads them says nothing.
+        silent: channels that are missing, so that what evaluates or reads them says nothing.
         statistics: statistic of each watch at the end of the last block divided by its scale; compare with the
             monitor's limit.
         block_ended: whether this tick ended a block.

@@ -30,7 +30,7 @@ SUMMARIES = ("mean", "spread", "gain", "lag", "peak")
 """Summaries of each residual and block, in this order, followed by one for each driver."""
 MAX_DRIVERS = 8
 NEAR_ZERO = 0.05
-"""Variance in healthy units that is added below `gain` and `lag`: a channel at rest tells neither."""
+"""Variance in healthy units that is added below `gain` and `lag`: a channel in steady state tells neither."""
 BLOCKS_AT_ONCE = 32
 """Side by side: their sums stay in the processor's cache."""
 MAX_BLOCK = 1_000_000
@@ -41,8 +41,8 @@ MAX_BLOCK = 1_000_000
 class BlockSummaries:
     """Summaries of a block.
 
-    r is a residual times one over its healthy scale, u the channel that it judges less its `centre`, times one over its
-    healthy deviation, d the change of u since the tick before, n the ticks of the block at which r is there::
+    r is a residual times one over its healthy scale, u the channel that it evaluates less its `centre`, times one over
+    its healthy deviation, d the change of u since the tick before, n the ticks of the block at which r is there::
 
         mean = sum r / n                      spread = sqrt(sqrt(max(sum r^2 / n - mean^2, 0)))
         gain = sum r u / (sum u^2 + 0.05 n)   lag    = sum r d / (sum d^2 + 0.05 n D)
@@ -58,7 +58,7 @@ class BlockSummaries:
         block: ticks of a block.
         scale: one over the healthy width of each residual, shape (residuals,): a controller multiplies faster than it
             divides.
-        channel: place of the channel that each residual judges among the raw inputs, shape (residuals,).
+        channel: place of the channel that each residual evaluates among the raw inputs, shape (residuals,).
         centre: centre of each raw input, shape (inputs,).
         spread: one over the healthy deviation of each, above zero.
         change: D, healthy variance of d of the channel of each residual, shape (residuals,).
@@ -111,7 +111,7 @@ class BlockSummaries:
             state: before it.
 
         Returns:
-            Summaries, shape (blocks, width); operating points, shape (blocks, points); the state behind the stretch.
+            Summaries, shape (blocks, width); operating points, shape (blocks, points); the state behind the segment.
         """
         summaries, points = [], []
         at, ticks = 0, len(residuals)

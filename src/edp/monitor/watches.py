@@ -31,7 +31,7 @@ class WatchSpec:
             clipped, over the largest size that it has on healthy machines: what is gross is seen at once, and a summary
             with rare large values is given its own measure.
         reserve: factor of the scale of its statistic. A view that is there for what is gross keeps away from the limit
-            by more than 1, so that of the false alarms that are promised it takes a small share.
+            by more than 1, so that of the false alarms that are expected it takes a small share.
 
     Raises:
         ConfigError: a value is out of its bounds.

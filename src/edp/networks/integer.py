@@ -53,7 +53,7 @@ class IntegerPredictor(Predictor):
         self.eval()
 
     def to_float_network(self) -> Predictor:
-        """Return the network in single precision from which it was quantised, for counting or further training."""
+        """Return the network in single precision from which it was quantised, for counting or fine-tuning."""
         offset, width = (part.double().numpy() for part in (self.front.offset, self.front.width))
         zero, unit = (part.double().numpy() for part in (self.code.offset, self.code.width))
         float_predictor = Predictor(self.task, self.spec, Scaler(offset, width, zero, unit))

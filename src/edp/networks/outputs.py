@@ -179,7 +179,7 @@ class Quantiles:
 
     Attributes:
         levels: increasing, between 0 and 1, symmetric about the median 0.5.
-        calibrated: stretch the intervals after training so that they hold their share of the validation part.
+        calibrated: segment the intervals after training so that they hold their share of the validation part.
 
     Raises:
         ConfigError: levels that are not as said.
@@ -252,7 +252,7 @@ class _Law:
 
     Attributes:
         coverages: coverages of the calibrated and evaluated intervals, decreasing.
-        calibrated: stretch the intervals after training so that they hold their share of the validation part.
+        calibrated: segment the intervals after training so that they hold their share of the validation part.
 
     Raises:
         ConfigError: coverages that are not decreasing between 1 and 0.

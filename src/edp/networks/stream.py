@@ -78,7 +78,7 @@ class Stream:
 
     The rules are those of the exported C (docs/export.md): inputs with a NaN, an infinite value or one beyond a
     million standard widths are rejected as a whole, counted, and the tick is held: the last accepted inputs are fed
-    again. After `HOLD_TICKS` held ticks in a row the memory is cleared, and the next accepted inputs start it anew.
+    again. After `HOLD_TICKS` held ticks in a row the memory is cleared, and the next accepted inputs start it again.
 
     Args:
         predictor: the network; it is put in evaluation mode.

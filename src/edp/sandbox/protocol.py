@@ -1,7 +1,8 @@
 """Message protocol: eight bytes of length, JSON, then the data of each array.
 
 Nothing that arrives is evaluated or unpickled. The receiving side states how many bytes of numbers it awaits; JSON and
-arrays beyond their bounds, and arrays of anything but plain numbers, are refused before memory is taken for them.
+arrays beyond their bounds, and arrays of anything but dimensionless values, are refused before memory is taken for
+them.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ KEPT_CODES = 1024
 """Maximum number of stored exit codes of forks, so that a data set of thousands of logs does not grow the list without
 end."""
 ORDER_BYTES = 1 << 16
-"""Read at once; longer orders come in several pieces."""
+"""Read at once; longer orders come in several segments."""
 Serve = Callable[[int, int], None]
 """Serves one log by what it reads from one pipe and writes to another."""
 

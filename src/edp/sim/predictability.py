@@ -1,7 +1,7 @@
 """The limit of predictability: how far off any predictor must be, found by branching moments of recordings.
 
 At a moment the whole simulation is kept. From there it runs on many times, each time with fresh randomness of the
-operator (what is done now goes on, how long it lasts and what follows is drawn anew), of the soil still to be met and
+operator (what is done now goes on, how long it lasts and what follows is drawn again), of the soil still to be met and
 of the sensors. Knowing the true state at that moment, and all the laws, the best guess of a later measured velocity is
 its median over these futures, which has the least mean absolute error of all guesses; that error is the limit. With
 the commands of the future given, only soil and sensors differ between the branches: the limit of a predictor that is

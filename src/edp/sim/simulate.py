@@ -61,7 +61,7 @@ class Simulation:
     def run(self, samples: int, progress: Callable[[float], None] | None = None) -> Array:
         """Run for `samples`; the rows that were logged in them, shape (samples, LOG_COLUMNS).
 
-        Running in pieces gives the same bits as running at once.
+        Running in segments gives the same bits as running at once.
 
         Raises:
             SimulationError: the state became non-finite.
@@ -141,7 +141,7 @@ class Simulation:
         return simulation
 
     def branch(self, seed: np.random.SeedSequence) -> None:
-        """Give operator and soil new random numbers from now on.
+        """Give operator and soil new random values from now on.
 
         The operator's present action continues, see `redraw`.
         """

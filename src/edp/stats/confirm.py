@@ -98,7 +98,7 @@ def confirm(
         modules: names of the arms after the baseline.
         registered: every module of the study, in the order of the answer; those not in `modules` were dropped
             before and enter the adjustment with p = 1.
-        tested: ``(run, session)``; None: every run is judged on every session.
+        tested: ``(run, session)``; None: every run is evaluated on every session.
         rule: acceptance criteria; None for the defaults.
         worst: ``(session,)``, the least that a failed cell costs; see `fill_worst`.
 

@@ -14,7 +14,7 @@ def repeated_folds(sessions: int, folds: int = 5, repeats: int = 1, seed: int = 
     The same seed and a larger number of repeats give the same first runs, so a study can go on where it stopped.
 
     Returns:
-        ``(run, session)``: on which sessions each run is judged; it trains on the others.
+        ``(run, session)``: on which sessions each run is evaluated; it trains on the others.
 
     Raises:
         ConfigError: fewer sessions than folds, fewer than two folds, or no repeat.
@@ -39,7 +39,7 @@ def repeated_splits(sessions: int, test_sessions: int, splits: int, seed: int = 
         ``(split, session)``.
 
     Raises:
-        ConfigError: no session left to train or to judge on, or no split.
+        ConfigError: no session left to train or to evaluate on, or no split.
     """
     if not 0 < test_sessions < sessions or splits < 1:
         raise ConfigError(

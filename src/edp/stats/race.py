@@ -54,8 +54,8 @@ def race(
 ) -> RaceResult:
     """Perform the interim analyses, then test the remaining modules over all runs.
 
-    They can only stop for futility. A module that none of them dropped is judged by the same test as without them, so
-    under the null the probability of confirming it can only fall: futility analyses spend no alpha.
+    They can only stop for futility. A module that none of them dropped is evaluated by the same test as without them,
+    so under the null the probability of confirming it can only fall: futility analyses spend no alpha.
 
     Args:
         differences: ``(..., run, session)`` in the order of the runs; values after the analysis that drops a

@@ -60,7 +60,7 @@ def adapt(
         net: the network.
         start: the weights that adapt, by name; all others stay.
         objective: the loss.
-        support: the pieces to adapt on.
+        support: the segments to adapt on.
         steps: the rate of each step.
         second_order: keep what a gradient through the steps needs, through their gradients too. Without it the
             result depends on `start` by nothing but the sum, as first-order methods take it.

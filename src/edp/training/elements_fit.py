@@ -19,7 +19,7 @@ from edp.wording import typed
 
 Doubles = NDArray[np.float64]
 NOISE = 0.02
-"""Plausible error of a free run, as a share of the spread of an answer: what the plausible numbers weigh against."""
+"""Plausible error of a free run, as a share of the spread of an output: what the plausible numbers weigh against."""
 APART = 0.5
 """Standard deviation of further starts, in prior standard deviations."""
 STEP = 1e-20
@@ -27,7 +27,7 @@ STEP = 1e-20
 MOST_TICKS = 4096
 """Of a run where no length is set: each tick of a pass is interpreted, some tenth of a millisecond."""
 MAX_VALUES = 20_000_000
-"""Complex answers of all lanes that are kept in a pass, 0.3 GB; with more runs, evenly chosen ones are fitted."""
+"""Maximum number of complex outputs in one pass (0.3 GB); evenly chosen runs are fitted if there are more."""
 FTOL = 1e-5
 """Relative decrease of the cost in the last step."""
 
@@ -104,7 +104,7 @@ class LumpedProblem:
         return NormalEquations(matrix, gradient, 0.5 * np.square(errors[:, 0].real).sum(axis=1))
 
     def _errors(self, theta: NDArray[np.inexact]) -> NDArray[np.inexact]:
-        """Return weighted errors ``(lane, tick * output)`` for coordinates ``(lane, own)``, several lanes per run."""
+        """Return weighted errors ``(run, tick * output)`` for coordinates ``(run, own)``, several per window."""
         repeats = len(theta) // len(self.first)
         parameters = self.priors.values(theta[:, : len(self.twin.table)])
         hidden = np.zeros((len(theta), 0), theta.dtype)

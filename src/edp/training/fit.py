@@ -97,7 +97,7 @@ def _rows_of_refit(history: list[dict[str, object]], best: int, spec: TrainingSp
 class Loop:
     """One training: network, average, optimiser, and position.
 
-    Where `refitted` holds the rows of an earlier training, all stretches train, for as many epochs as there are rows;
+    Where `refitted` holds the rows of an earlier training, all segments train, for as many epochs as there are rows;
     what the earlier one validated stands for what cannot be validated any more. With `windowed` what validates is
     predicted from reset over each window, and not as a stream.
     """

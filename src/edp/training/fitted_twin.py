@@ -74,7 +74,7 @@ class FitHistory:
 
     @property
     def seconds(self) -> float:
-        """Processor time so far."""
+        """Processor time until now."""
         return time.process_time() - self.began
 
     def add(self, row: Mapping[str, object], length_s: float, error: float, better: bool) -> None:

@@ -51,7 +51,7 @@ MAX_LENGTH_S = 600.0
 
 
 EXACT = 1e-12
-"""Error in deviations below which an answer is exact; a logarithm needs some number."""
+"""Error in deviations below which an output is exact; a logarithm needs some number."""
 
 
 class FreeRunDiverged(NotFiniteError):
@@ -69,8 +69,8 @@ class FreeRunSpec:
         lanes: free runs side by side in an update.
         lengths_s: lengths of the free runs, stage after stage.
         updates: updates of each stage.
-        measured_share: share of the lanes that are measured throughout, as a filter is.
-        mixed_share: share of the lanes in which each port is measured or free by chance, as with missing sensors.
+        measured_share: share of the batch that are measured throughout, as a filter is.
+        mixed_share: share of the batch in which each port is measured or free by chance, as with missing sensors.
         stroke_weight: weight of a standardised stroke error relative to a velocity error; small errors accumulate.
         pressure_weight: weight of a standardised pressure error.
         delta: weighted error above which the Huber loss is linear, in standard deviations.
@@ -125,7 +125,7 @@ class FreeRunSpec:
 
 
 def draw_measured_ports(spec: FreeRunSpec, shape: tuple[int, int, int], prefix: int, rng: np.random.Generator) -> Array:
-    """Return the measured ports ``(tick, lane, answer)``: 1 in the prefix, later by the fractions in the settings."""
+    """Return the measured ports ``(tick, run, output)``: 1 in the prefix, later by the fractions in the settings."""
     _, lanes, answers = shape
     kind = rng.random(lanes)
     ports = np.zeros(shape, np.float32)
@@ -150,15 +150,15 @@ def fit_free_runs(
 
     Args:
         twin: untrained, or trained before; it is changed.
-        train: training stretches.
-        validation: stretches that choose among the weights on the way.
+        train: training segments.
+        validation: segments that choose among the weights on the way.
         spec: settings of the training.
         on_event: called with progress, after each validation.
         run: folder and key of the run; where given, a checkpoint after each validation makes it resumable.
         trained: whether the twin was trained before: its weights as they are take part in the choice.
 
     Raises:
-        DataError: stretches that are too short.
+        DataError: segments that are too short.
         FreeRunDiverged: a gradient is not finite any more.
         StorageError: a checkpoint is damaged, or of another run.
     """
@@ -254,7 +254,7 @@ def _is_stalled(progress: TrainingPosition, spec: FreeRunSpec, total: int) -> bo
 
 
 def answer_weights(twin: Twin, spec: FreeRunSpec) -> Array:
-    """Return the weight of each output's error in standard deviations ``(answer,)``."""
+    """Return the weight of each output's error in standard deviations ``(output,)``."""
     channels = twin.channels
     counts = (len(channels.velocities), len(channels.strokes), len(channels.pressures))
     return np.repeat(np.array([1.0, spec.stroke_weight, spec.pressure_weight], np.float32), counts)
@@ -301,12 +301,12 @@ class FreeRunValidation:
 
     Args:
         twin: twin to evaluate.
-        series: validation stretches.
+        series: validation segments.
         ticks: length of a free run in samples; cut to the longest segment.
         lanes: number of runs at most.
 
     Raises:
-        DataError: no stretch is longer than the prefix.
+        DataError: no segment is longer than the prefix.
     """
 
     def __init__(self, twin: Twin, series: Sequence[Series], ticks: int, lanes: int) -> None:

@@ -27,7 +27,7 @@ class MemberTraining:
     Attributes:
         label: name in messages.
         twin: untrained.
-        train: stretches to learn from.
+        train: segments to learn from.
         validation: segments that select among its weights.
         training: settings with the seed of this member.
         folder: folder of its checkpoints, with the key of the run; None for a training that cannot continue.
@@ -134,7 +134,7 @@ def fit_members(
     Args:
         form: its options.
         parts: channels, scales, and the fitted static map that all members share, where there is one.
-        series: training stretches, and those that choose among the weights of each member.
+        series: training segments, and those that choose among the weights of each member.
         training: settings; the first member has this seed, the others have their own.
         on_event: called with progress of each member in turn.
         run: folder and key of the run; where given, each member's training is resumable.

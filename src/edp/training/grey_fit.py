@@ -147,7 +147,7 @@ def fit_grey_box(
 ) -> GreyFit:
     """Fit the parameters of a grey box to free runs; free runs on the validation data select the best round.
 
-    Where the settings leave the stretches of opening curves open, the fewest are fitted first. Then each one is halved,
+    Where the settings leave the segments of opening curves open, the fewest are fitted first. Then each one is halved,
     which changes no curve, and final rounds follow: as often as the validation part gains by it.
 
     Args:

@@ -33,7 +33,7 @@ class GroundFit(FittedTwin):
 def fit_ground(
     kind: str, twin: GreyTwin, train: Sequence[Series], validation: Sequence[Series], machine: str
 ) -> GroundFit:
-    """Fit the law to the training data. The facts have its R^2 in each part, None in a part without contact.
+    """Fit the law to the training data. The data have its R^2 in each part, None in a part without contact.
 
     Args:
         kind: name in `GROUNDS`.

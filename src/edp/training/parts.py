@@ -89,7 +89,7 @@ def _epochs(loop: Loop, until: int | None, start: bytes | None) -> tuple[Fitted,
 
 
 def _state_of_epochs(loop: Loop) -> dict[str, object]:
-    """Return the state for later epochs, which seed their own random numbers.
+    """Return the state for later epochs, which seed their own random values.
 
     Without times, equal parts give equal bytes.
     """
@@ -119,7 +119,7 @@ def _restore_epochs(loop: Loop, state: Table) -> None:
 
 
 def _state(loop: Loop) -> dict[str, object]:
-    """Return the state that the rest of a training depends on besides its settings.
+    """Return the state that the rest of a training depends on in addition to its settings.
 
     Without times, equal parts give equal bytes.
     """

@@ -58,14 +58,14 @@ def fit_residual(
     Args:
         twin: its network untrained; it is changed.
         form: formulation, which says how long is trained on what.
-        train: training stretches.
-        validation: stretches that choose among the weights on the way, and between network and none.
+        train: training segments.
+        validation: segments that choose among the weights on the way, and between network and none.
         training: settings that all twins share.
         on_event: called with progress, after each validation.
         run: folder and key of the run; where given, a stopped training goes on.
 
     Raises:
-        DataError: stretches that are too short.
+        DataError: segments that are too short.
         FreeRunDiverged: a gradient is not finite any more.
     """
     spec = residual_spec(form, training)

@@ -33,7 +33,7 @@ def start_bypass(predictor: Predictor, train: Sequence[Series], validation: Sequ
         Whether anything was set.
 
     Raises:
-        DataError: no training stretch is as long as the taps plus the largest horizon.
+        DataError: no training segment is as long as the taps plus the largest horizon.
     """
     bypass, task = predictor.bypass, predictor.task
     if not isinstance(bypass, Bypass) or bypass.spec.start == "zero":

@@ -60,7 +60,7 @@ class TrainingSpec:
         epochs: the longest training.
         updates: updates per epoch; 0 for one pass over the data.
         patience: epochs without a better validation score before an early stop; 0 never stops early.
-        refit: train anew on training and validation stretches together, for short data: ``best`` for as many epochs as
+        refit: train again on training and validation segments together, for short data: ``best`` for as many epochs as
             were best before, ``whole`` for all of them, to the end of the schedule, ``none`` not at all. The
             calibration of intervals stays that of the first training.
         bagging: train a committee on folds, by rows and not by chunks; of the other settings only `loss`, `seed` and

@@ -19,9 +19,9 @@ from edp.signals import KINDS
 from edp.training.spec import TrainingSpec
 
 MAX_VALIDATED = 1 << 20
-"""Ticks that judge an epoch and calibrate intervals, about; three hours at 100 Hz."""
+"""Ticks that evaluate an epoch and calibrate intervals, about; three hours at 100 Hz."""
 STARTS_A_STRETCH = 100
-"""Times the start-up of a network that a stretch is long: of its ticks one per cent are not judged."""
+"""Times the start-up of a network that a segment is long: of its ticks one per cent are not evaluated."""
 
 
 def validation_scores(
@@ -47,7 +47,7 @@ def validation_scores(
 def select_evaluated(net: Predictor, series: Sequence[Series], spec: TrainingSpec) -> list[Series]:
     """Return the data that evaluate epochs: the series, or evenly spaced segments beyond `MAX_VALIDATED` samples.
 
-    Else an epoch of a fixed number of updates would take hours to judge where the store is large.
+    Else an epoch of a fixed number of updates would take hours to evaluate where the store is large.
     """
     start_up = max(spec.chunks.burn_in, net.spec.window) + net.task.max_horizon
     return spread_series(series, STARTS_A_STRETCH * start_up, MAX_VALIDATED)

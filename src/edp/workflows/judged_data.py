@@ -1,4 +1,4 @@
-"""Judged data of a run: held-out recordings or other ones, whole or evenly spread stretches."""
+"""Evaluated data of a run: held-out recordings or other ones, whole or evenly spread segments."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from edp.training.bundle import Bundle
 def judged_data(
     bundle: Bundle, data: Prepared, others: Sequence[Recording] | None, at_most_h: float | None
 ) -> tuple[Prepared, Drawn | None]:
-    """Return a run's data with the judged ones as test part, and the drawn amount; None if all are judged.
+    """Return a run's data with the evaluated ones as test part, and the drawn amount; None if all are evaluated.
 
     Args:
         bundle: bundle of the run.
         data: data of the run.
         others: other recordings; None for the held-out ones.
-        at_most_h: evenly spread stretches of so many hours, about, where there are more; None for all.
+        at_most_h: evenly spread segments of so many hours, about, where there are more; None for all.
 
     Raises:
         EdpError: recordings that do not go with the run, or no positive number of hours.

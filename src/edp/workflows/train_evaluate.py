@@ -227,7 +227,7 @@ def evaluate(
     workers: Workers = IN_PROCESS,
     at_most_h: float | None = None,
 ) -> Path:
-    """Judge a run on its held-out recordings, or on others, with baselines trained on its training data.
+    """Evaluate a run on its held-out recordings, or on others, with baselines trained on its training data.
 
     Scores of the same weights, recordings and settings are kept, not computed again.
 
@@ -236,10 +236,11 @@ def evaluate(
         source: other recordings. Logs without a map are read with that of the run.
         baselines: names; None takes those of the settings.
         progress: receiver of the name of each model.
-        minutes: after which no further baseline is begun; a later call judges it. Not for several processes.
+        minutes: after which no further baseline is begun; a later call evaluates it. Not for several processes.
         workers: who runs the models; nodes see run and recordings under the same paths. What a stopped call measured is
             not measured again.
-        at_most_h: judge on evenly spread stretches of so many hours, about, where there are more; None judges on all.
+        at_most_h: evaluate on evenly spread segments of so many hours, about, where there are more; None evaluates on
+            all.
 
     Returns:
         The folder with ``scores.json`` and ``predictions.safetensors``: the run folder, or one in it for `source`.
@@ -422,7 +423,7 @@ def _floor_scores(folder: Path, data: Prepared, scores: ScoresFile) -> ModelScor
 
 
 def judge_bundle(bundle: Bundle, data: Prepared, spec: JudgeSpec | None = None) -> Evaluation:
-    """Judge a bundle on ``data.test`` without touching the disk."""
+    """Evaluate a bundle on ``data.test`` without touching the disk."""
     return judge(bundle.predictor, data, spec or JudgeSpec(), describe(bundle.predictor.spec))
 
 

@@ -46,8 +46,8 @@ SOFT = 8
 MIN_ANSWER, GOOD_ANSWER = 0.1, 0.5
 """Shares of a speed that must be there where a plan ends, and that better are: short of them it sees no effect."""
 ATTITUDE_M, LOADED_ATTITUDE_M = 1.0, 2.0
-"""Of most twins, and of those that are told of forces: on lines that were not judged 2 held the attitude in loam better
-on grey boxes of M22 and C14, and made both errors of a poor network larger (docs/findings.md)."""
+"""Of most twins, and of those that are told of forces: on lines that were not evaluated 2 held the attitude in loam
+better on grey boxes of M22 and C14, and made both errors of a poor network larger (docs/findings.md)."""
 FAST_TIP_M_S = 0.02
 """Reference speed above which a tip error has a direction along the path and one across."""
 
@@ -69,7 +69,7 @@ class PredictiveControl:
         window_s: time over which the twin's predictions are compared with what came, for the disturbance.
         smoothing: share of a new error that the disturbance takes over in a tick; 0: offsets stay.
         load: the fraction for forces against the cylinders, which only a twin with a load (`greybox`) has.
-        fallback: whether a PI loop answers where the program has no solution, or a guard asks for it; otherwise the
+        fallback: whether a PI loop outputs where the program has no solution, or a guard asks for it; otherwise the
             levers go to neutral.
     """
 

@@ -110,7 +110,7 @@ class FmuBatch(ModelBatch):
 class FmuEnvironment(ModelEnvironment):
     """An environment whose machine is an FMU for co-simulation, of version 2.0 or 3.0.
 
-    Levers become nominal pilot pressures; the observation holds the answers of the FMU and these. It begins at the
+    Levers become nominal pilot pressures; the observation holds the outputs of the FMU and these. It begins at the
     strokes of the task in one of three ways: by measured values (``CylVels_1`` and ``CylVels_1_measured``, as exported
     twins have them), by parameters ``CylStroke_1_start``, or where it begins by itself, if that is there.
     The option of a reset is ``strokes``, shares of full to start from.
@@ -119,7 +119,7 @@ class FmuEnvironment(ModelEnvironment):
 
     Args:
         path: the file.
-        machine: name or file of the machine whose kinematics, nominal commands and pressures at rest are used.
+        machine: name or file of the machine whose kinematics, nominal commands and pressures in steady state are used.
         duration_s: length of an episode.
         rate_hz: ticks per second.
 

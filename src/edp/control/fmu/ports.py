@@ -14,7 +14,7 @@ from edp.signals import VOCABULARY, Channel
 from edp.storage.archives import printable
 
 AHEAD = "_ahead_1"
-"""Behind the name of an answer one tick after the inputs, as exported twins write it."""
+"""Behind the name of an output one tick after the inputs, as exported twins write it."""
 START = "_start"
 """Behind the name of a stroke, for a parameter that holds it at the start."""
 BASES: Mapping[str, Mapping[str, float]] = {
@@ -37,7 +37,7 @@ class FmuPorts:
         answers: channels that it gives.
         inputs: value references of the commands.
         outputs: value references of the outputs.
-        measured: inputs that take a measured value of each answer, and their flags; empty where it has none.
+        measured: inputs that take a measured value of each output, and their flags; empty where it has none.
         starts: parameters of the strokes at the start; empty where it has none.
     """
 

@@ -27,9 +27,9 @@ class ReferenceNow:
     """Reference data for a policy at one sample, one row per environment.
 
     Attributes:
-        strokes: now, m, shape (lanes, 3).
-        tip: now: x, y (m), attitude (rad), shape (lanes, 3).
-        ahead: stroke velocities now and later, m/s, shape (lanes, previews, 3).
+        strokes: now, m, shape (environment, 3).
+        tip: now: x, y (m), attitude (rad), shape (environment, 3).
+        ahead: stroke velocities now and later, m/s, shape (environment, previews, 3).
     """
 
     strokes: Array
@@ -81,13 +81,14 @@ class TaskFeatures:
         return 0.0, SCALES.get(channel.kind, float(np.abs(KINDS[channel.kind].plausible).max()))
 
     def values(self, measured: Array, now: ReferenceNow, levers: Array, base: Array) -> NDArray[np.float32]:
-        """Return the observation of each environment, shape (lanes, value).
+        """Return the observation of each environment, shape (environment, value).
 
         Args:
-            measured: channels of `reads`, SI units, shape (lanes, channel).
+            measured: channels of `reads`, SI units, shape (environment, channel).
             now: the reference.
-            levers: past levers, the latest first, shape (lanes, depth, 3).
-            base: levers of the base controller for this sample, shape (lanes, 3); not read without a base controller.
+            levers: past levers, the latest first, shape (environment, depth, 3).
+            base: levers of the base controller for this sample, shape (environment, 3); not read without a base
+                controller.
         """
         lanes = len(measured)
         strokes = measured[:, self._strokes]
@@ -128,19 +129,19 @@ class ReferenceRows:
         self._speeds[lane], self._judged[lane] = reference.speeds()[rows], reference.judged[rows]
 
     def now(self, ticks: NDArray[np.int64]) -> ReferenceNow:
-        """Return the rows of each environment at its sample, shape (lanes,)."""
+        """Return the rows of each environment at its sample, shape (environment,)."""
         ahead = self._speeds[self._lane[:, None], ticks[:, None] + self._preview]
         return ReferenceNow(self._strokes[self._lane, ticks], self._tip[self._lane, ticks], ahead)
 
     def tip(self, ticks: NDArray[np.int64]) -> Array:
-        """Return the tip poses of each environment at its sample, shape (lanes, 3)."""
+        """Return the tip poses of each environment at its sample, shape (environment, 3)."""
         return np.asarray(self._tip[self._lane, ticks])
 
     def judged(self, ticks: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether each environment's sample is evaluated, shape (lanes,)."""
+        """Return whether each environment's sample is evaluated, shape (environment,)."""
         return self._judged[self._lane, ticks]
 
 
 def remembered(levers: Array, applied: Array) -> Array:
-    """Prepend levers, shape (lanes, 3), to the past levers, shape (lanes, depth, 3), latest first."""
+    """Prepend levers, shape (environment, 3), to the past levers, shape (environment, depth, 3), latest first."""
     return np.concatenate([applied[:, None], levers[:, :-1]], axis=1)

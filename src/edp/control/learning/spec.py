@@ -22,7 +22,8 @@ PRESSURES = tuple(name for name, channel in TABLE_A1.items() if channel.kind is 
 OBSERVED = (*VELOCITIES, *STROKES, *PRESSURES)
 """What both the simulator and a twin of a usual log measure."""
 FIRST_SEED = 1_000_000
-"""Of the references that an environment draws by itself; those that judge a controller count from 0, as in a tuning."""
+"""Of the references that an environment draws by itself; those that evaluate a controller count from 0, as in a
+tuning."""
 SIMULATOR = ("step_s", "sensor_noise", "hand", "loop_latency", "lost_frames", "sensors")
 """Settings of `EnvironmentSpec` that a task leaves open: the machine, soil and start are the task's."""
 MOST_TICKS = 1_000_000

@@ -26,14 +26,14 @@ class TwinModel:
     disturbance that every prediction is corrected by, so that no offset stays where the model is wrong.
 
     Args:
-        twin: commanded by pilot pressures of Table A.1; answers the strokes and velocities of three cylinders.
+        twin: commanded by pilot pressures of Table A.1; outputs the strokes and velocities of three cylinders.
         plant: controlled plant.
         window: ticks over which predictions are compared with what was measured.
         smoothing: share of an error that the disturbance takes over in a tick; 0: no disturbance.
         load: the fraction for forces against the cylinders, if the twin has a load.
 
     Attributes:
-        reads: channels of the plant that it reads, in the order of the twin's answers.
+        reads: channels of the plant that it reads, in the order of the twin's outputs.
         pressures: number of cylinder pressures that it predicts.
         disturbance: speeds (m/s), shape (3,), that the twin does not know of.
 

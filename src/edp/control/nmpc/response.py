@@ -16,7 +16,7 @@ SPEED_M_S = 0.1
 SETTLED_S, MEAN_S = 1.0, 0.2
 """After which a speed counts as reached, and the time before over which it is averaged."""
 MIN_OF_ASKED = 0.2
-"""Of what was asked for: a twin that reaches less has no answer whose time could be told."""
+"""Of what was asked for: a twin that reaches less has no output whose time could be told."""
 
 
 def response(model: TwinModel, measured: Array, valves: SpeedToLever, slew: Array) -> Array | None:

@@ -54,8 +54,8 @@ class TaskSpec(ABC):
         speed_m_s: top speed of the tip; None draws it from `SPEED_M_S`.
         law: time law, see `edp.control.tasks.time_law.LAWS`.
         ramp_s: time to speed up and to slow down, s.
-        lead_s: rest before the start, not judged.
-        hold_s: rest after the end, judged.
+        lead_s: rest before the start, not evaluated.
+        hold_s: rest after the end, evaluated.
         margin: share of the stroke at either end that a reference leaves free.
         material: soil; empty for free air.
         limits: limits of the loop.

@@ -61,11 +61,11 @@ def timed(
         rate_hz: ticks per second.
         ramp_s: see `progress`.
         law: time law, see `progress`.
-        lead_s: rest at the first point, not judged.
-        hold_s: rest at the last one, judged.
+        lead_s: rest at the first point, not evaluated.
+        hold_s: rest at the last one, evaluated.
 
     Returns:
-        Rows, shape (ticks, values), and which of them are judged, shape (ticks,).
+        Rows, shape (ticks, values), and which of them are evaluated, shape (ticks,).
     """
     ends = lead_s + np.concatenate(([0.0], np.cumsum(seconds)))
     ticks = round((ends[-1] + hold_s) * rate_hz) + 1

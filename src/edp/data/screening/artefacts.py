@@ -80,8 +80,8 @@ def changing_flags(
         lagged: covariances of every piece.
         judged: columns that may be flagged.
         trusted: columns that a channel is held against.
-        support: largest correlation of each channel with a target over all pieces, ``(channel,)``. Of two channels that
-            are both in question, the one that has less than half the other's is taken for the changing one.
+        support: largest correlation of each channel with a target over all segments, ``(channel,)``. Of two channels
+            that are both in question, the one that has less than half the other's is taken for the changing one.
     """
     squares = lagged.squares().astype(np.float64)
     usable = np.asarray((squares > 0).all(axis=0))
@@ -122,9 +122,9 @@ def flag_broken(
 ) -> list[Flag]:
     """Flag channels that follow another with one gain in some recordings, but with another sign or not in others.
 
-    Pieces may join recordings with different relations, so every stretch is looked at for itself, at lag 0. Natural
+    Pieces may join recordings with different relations, so every segment is looked at for itself, at lag 0. Natural
     relations change their gain where they change their sign or fade; a plug turned round or left out does not. A
-    stretch counts where the source moves so much that the gain and noise of the other stretches would show it.
+    segment counts where the source moves so much that the gain and noise of the other segments would show it.
 
     Args:
         table: the data.

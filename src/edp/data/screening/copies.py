@@ -25,7 +25,7 @@ from edp.wording import number, typed
 
 LEAKING, DETERMINED = 0.25, 0.5
 """Of what pasts leave unexplained of a channel, the share that may remain once the future is known, for a leak; the
-second where hardly anything remains, as from the ends of stretches."""
+second where hardly anything remains, as from the ends of segments."""
 HARDLY = 0.01
 """Share of the variance that counts as hardly anything."""
 DIFFERENCING = 2.5
@@ -74,10 +74,10 @@ def find_leaks(
 
     Args:
         names: channels.
-        correlations: ``[reach + lag, i, j]`` of ``x_i[t + lag]`` and ``x_j[t]``, over all pieces.
+        correlations: ``[reach + lag, i, j]`` of ``x_i[t + lag]`` and ``x_j[t]``, over all segments.
         trusted: columns of the channels that are known to be measured.
         targets: columns of the targets.
-        flagged: columns that need no judging, such as targets.
+        flagged: columns that need no evaluation, such as targets.
     """
     reach = len(correlations) // 2
     far, near = min(_FAR, reach // 3), [a for a in _NEAR_PAST if a <= reach // 3]
@@ -144,7 +144,7 @@ def find_copies(correlations: Array, least: float) -> list[CopiedChannel]:
     """Return pairs in which one channel may be a copy: its remainder is unrelated to all channels, at all lags.
 
     Args:
-        correlations: ``[reach + lag, i, j]``, over all pieces.
+        correlations: ``[reach + lag, i, j]``, over all segments.
         least: correlation from which a channel that is not ahead counts as a copy, whatever is left of it.
     """
     reach = len(correlations) // 2
@@ -243,7 +243,7 @@ def flag_explained(names: Sequence[str], correlations: Array, judged: Sequence[i
 
     Args:
         names: channels.
-        correlations: ``[reach + lag, i, j]``, over all pieces.
+        correlations: ``[reach + lag, i, j]``, over all segments.
         judged: columns in the order in which they may go.
         base: columns that explain; those of `judged` are among them until they go.
     """

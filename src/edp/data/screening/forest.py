@@ -1,7 +1,7 @@
 """Permutation importance of groups of channels for a random forest, on held-out recordings (eq. 2.14).
 
 The forest is scikit-learn's. To permute a group, only those rows are sent down a tree again whose way tests a channel
-of the group; for all others the prediction is known. The result is that of predicting everything anew.
+of the group; for all others the prediction is known. The result is that of predicting everything again.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ def importances(
         table: the data.
         columns: indices of the columns that the forest reads.
         groups: places in `columns` that are permuted together.
-        held_out: pieces held out.
+        held_out: segments held out.
         spec: sizes and seed.
         on_share: hears the share that is done.
     """
@@ -187,7 +187,7 @@ def importances(
     orders = [_shuffle_rows(tests.pieces, spec.seed + r) for r in range(forest.repeats)]
 
     def of_group(g: int) -> Array:
-        """Return the mean error increase in each left-out segment, ``(piece, target)``."""
+        """Return the mean error increase in each left-out segment, ``(segment, target)``."""
         more = np.mean([permuted.errors(g, order) for order in orders], axis=0) - plain
         return np.stack([more[tests.pieces == p].mean(axis=0) for p in held_out])
 
@@ -214,7 +214,7 @@ def _list_importances(
 ) -> list[GroupImportance]:
     """Return the entries for every group, for each target and for all targets.
 
-    The increases are ``(group, piece, target)``.
+    The increases are ``(group, segment, target)``.
     """
     columns = [("all", increases.mean(axis=2)), *((name, increases[:, :, j]) for j, name in enumerate(targets))]
     importances = []

@@ -1,6 +1,6 @@
 """Covariances of all channels with each other at all lags, computed per segment in the frequency domain.
 
-A stretch is cut into blocks. The spectrum of a block, padded by the largest lag, times that of the stretch around it
+A segment is cut into blocks. The spectrum of a block, padded by the largest lag, times that of the segment around it
 gives exactly the sums over its rows at all lags; blocks are added up before the way back. So all pairs at all lags cost
 one matrix product a frequency.
 """
@@ -31,8 +31,8 @@ class Lagged:
         live: columns of the table that the channels here are, ``(channel,)``.
         reach: largest lag.
         sums: ``[p, reach + lag, i, j]`` sums ``x_i[t + lag] x_j[t]`` over piece p, float32.
-        samples: rows of each piece, ``(piece,)``.
-        chance: correlations of channels with targets of other pieces, ``(piece, shift, lag, channel, target)``.
+        samples: rows of each piece, ``(segment,)``.
+        chance: correlations of channels with targets of other segments, ``(segment, shift, lag, channel, target)``.
     """
 
     live: NDArray[np.int64]
@@ -55,7 +55,7 @@ class Lagged:
         return result
 
     def by_piece(self, columns: NDArray[np.int64]) -> FloatArray:
-        """Return the correlation of all channels with some in each segment, ``(piece, lag, channel, column)``."""
+        """Return the correlation of all channels with some in each segment, ``(segment, lag, channel, column)``."""
         squares = self.squares()
         scale = np.sqrt(squares[:, None, :, None] * squares[:, None, None, columns])
         shown = self.sums[:, :, :, columns]
@@ -63,7 +63,7 @@ class Lagged:
         return result
 
     def squares(self) -> FloatArray:
-        """Return the sums of squares in each segment, ``(piece, channel)``."""
+        """Return the sums of squares in each segment, ``(segment, channel)``."""
         return np.ascontiguousarray(np.diagonal(self.sums[:, self.reach], axis1=1, axis2=2))
 
 

@@ -27,7 +27,7 @@ from edp.data.screening.table import CandidateTable
 NEGLIGIBLE = 0.002
 """Share of the remaining error that a channel must take away, held out, to be kept for that alone."""
 LARGE = 0.01
-"""The same, from which a channel that relates is not redundant even where the held-out pieces do not agree."""
+"""The same, from which a channel that relates is not redundant even where the held-out segments do not agree."""
 CLEAR = 0.2
 """Correlation from which a lag counts for the window."""
 STEP = 5
@@ -43,7 +43,7 @@ class ScreeningEvidence:
         live: columns of the table that change.
         correlations: correlations of live channels over all segments, ``[reach + lag, i, j]``.
         relations: tests of live channels against targets.
-        pieces: correlation of each piece at the best lag with the best target, ``(piece, live channel)``.
+        pieces: correlation of each piece at the best lag with the best target, ``(segment, live channel)``.
         curves: lag curves.
         importance: permutation importance in the forest, all entries.
         values: Granger gains in linear models.
@@ -201,8 +201,8 @@ def propose(
 def _scores(evidence: ScreeningEvidence) -> dict[str, float]:
     """Half the importance, a quarter each of correlation and information, each relative to the largest; 0 to 1.
 
-    Correlation and information are penalised where they spread among the pieces: times ``m / (m + s)``, with mean m and
-    deviation s.
+    Correlation and information are penalised where they spread among the segments: times ``m / (m + s)``, with mean m
+    and deviation s.
     """
     relations, count = evidence.relations, len(evidence.table.pieces)
     linear = (np.abs(relations.linear) * _steadiness(relations.linear_t, count)).max(axis=1)

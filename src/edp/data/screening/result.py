@@ -87,9 +87,9 @@ class LagCurve:
         correlation: shape ``(lag,)``.
         best: lag of the largest absolute correlation.
         value: correlation there, with its sign.
-        low, high: 95 % interval of the best lag over the pieces.
-        agreement: share of the pieces whose correlation at `best` has this sign.
-        certain: the correlation at `best` differs from chance over the pieces.
+        low, high: 95 % interval of the best lag over the segments.
+        agreement: share of the segments whose correlation at `best` has this sign.
+        certain: the correlation at `best` differs from chance over the segments.
         at_edge: the best lag is the end of the search, so that the true one may lie beyond.
     """
 
@@ -132,9 +132,9 @@ class Stability:
     Attributes:
         metric: ``pearson``, ``spearman``, ``kendall``, ``information`` or ``lag``.
         channel, target: names.
-        values: shape ``(piece,)``; NaN where the channel is constant in a piece.
-        mean, deviation: over the pieces.
-        agreement: share of the pieces with the sign of the mean (1 for information).
+        values: shape ``(segment,)``; NaN where the channel is constant in a piece.
+        mean, deviation: over the segments.
+        agreement: share of the segments with the sign of the mean (1 for information).
         chance: mean absolute value between a piece's channel and another piece's target, where nothing can relate.
     """
 
@@ -157,7 +157,7 @@ class GroupImportance:
         target: name, or ``all`` for the mean of the targets.
         increase: mean increase of the mean squared error of the target's change up to the horizon, as a share of
             that change's variance.
-        low, high: 95 % interval over the held-out pieces.
+        low, high: 95 % interval over the held-out segments.
         share: the group's part of all positive increases.
     """
 
@@ -178,7 +178,7 @@ class Value:
     Attributes:
         channel, target: names.
         gain: share of the remaining squared error at the horizon that the channel takes away; negative: it harms.
-        low, high: 95 % interval over the held-out pieces.
+        low, high: 95 % interval over the held-out segments.
     """
 
     channel: str
@@ -257,7 +257,7 @@ class ScreeningResult:
 
     Attributes:
         recordings: names of the recordings.
-        pieces: names of the stretches that were compared with each other.
+        pieces: names of the segments that were compared with each other.
         samples: rows of all recordings.
         rate_hz: samples per second.
         channels: candidates, targets among them, in the order of the recordings.

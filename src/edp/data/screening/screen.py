@@ -51,7 +51,7 @@ SHARES = {
 MAX_RANKED = 1 << 20
 """Rows that Spearman's correlation is of, evenly spread."""
 _SHIFTS = 6
-"""Other pieces with which each piece is paired for chance."""
+"""Other segments with which each piece is paired for chance."""
 
 
 @dataclass(eq=False)
@@ -262,7 +262,7 @@ def _clusters(
 
 
 def _select_best_lags(lagged: Lagged, targets: NDArray[np.int64], relations: stability.Relations) -> Array:
-    """Return the correlation in each segment at the target and lag with the largest mean, ``(piece, channel)``."""
+    """Return the correlation in each segment at the target and lag with the largest mean, ``(segment, channel)``."""
     pieces = lagged.by_piece(targets)[:, : lagged.reach + 1]
     target = np.abs(relations.linear).argmax(axis=1)
     chosen = pieces[:, :, np.arange(pieces.shape[2]), target]

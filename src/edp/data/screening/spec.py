@@ -29,7 +29,7 @@ class ForestSpec:
         repeats: permutations of each group.
         leaf: least number of rows in a leaf.
         share: share of the channels that a node may choose from.
-        held_out: share of the recordings (or pieces) held out.
+        held_out: share of the recordings (or segments) held out.
     """
 
     trees: int = 30
@@ -60,21 +60,21 @@ class ScreeningSpec:
 
     Attributes:
         targets: channels to be predicted; empty takes the cylinder velocities of Table A.1, else every velocity.
-        candidates: channels to judge; empty takes all of the recordings. Targets are always among them.
-        trusted: channels known to be measured on the machine, besides the targets and the names of Table A.1. Of a
-            channel and its copy, the trusted one is taken for the original.
+        candidates: channels to evaluate; empty takes all of the recordings. Targets are always among them.
+        trusted: channels known to be measured on the machine, in addition to the targets and the names of Table A.1. Of
+            a channel and its copy, the trusted one is taken for the original.
         horizon: prediction horizon of the model.
         max_lag: lags from -max_lag to max_lag are searched.
-        pieces: least number of stretches to compare; recordings are cut where there are fewer.
+        pieces: least number of segments to compare; recordings are cut where there are fewer.
         neighbours: k of the nearest-neighbour estimate of mutual information.
         information_samples: rows for that estimate, evenly spread over the data.
         rank_samples: number of samples for Kendall's tau.
-        piece_samples: rows of each piece for the metrics that are compared among pieces.
+        piece_samples: rows of each piece for the metrics that are compared among segments.
         collinear: rank correlation from which channels form a cluster.
         copy: correlation at the best lag from which one channel is a copy of another.
         level: chance of a false alarm of each test of significance, shared among the channels.
         forest: the forest.
-        seed: seed of all random numbers.
+        seed: seed of all random values.
     """
 
     targets: tuple[str, ...] = ()

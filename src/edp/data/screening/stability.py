@@ -1,7 +1,7 @@
 """Check that a relation exists in every segment of the data and exceeds chance.
 
 Chance is what a channel of one piece shows with the targets of another: both keep their own course, so that slow
-signals, which go together now and then without any reason, are judged fairly.
+signals, which go together now and then without any reason, are evaluated fairly.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from edp.recording import FloatArray
 
 METRICS = ("pearson", "spearman", "kendall", "information")
 _SHIFTS = 2
-"""Other pieces for the chance of a metric: each costs as much as all pieces by themselves."""
+"""Other segments for the chance of a metric: each costs as much as all segments by themselves."""
 _DRAWS = 200
 """Bootstrap draws for the interval of a lag, which is a whole number of samples."""
 
@@ -36,8 +36,8 @@ class Metrics:
     """Metrics of live channels at t and targets at t + horizon.
 
     Attributes:
-        own: metrics of each segment, ``(metric, piece, channel, target)``.
-        crossed: channels of a piece with targets of others, ``(metric, shift, piece, channel, target)``.
+        own: metrics of each segment, ``(metric, segment, channel, target)``.
+        crossed: channels of a piece with targets of others, ``(metric, shift, segment, channel, target)``.
     """
 
     own: Array
@@ -103,7 +103,7 @@ def _pearson(values: FloatArray, width: int) -> Array:
 
 
 def stability_of(names: Sequence[str], targets: Sequence[str], metrics: Metrics, lags: Array) -> list[Stability]:
-    """Return one entry per metric, channel and target; `lags` are the best lags, ``(piece, channel, target)``."""
+    """Return one entry per metric, channel and target; `lags` are the best lags, ``(segment, channel, target)``."""
     own = np.concatenate([metrics.own, lags[None]])
     chance = np.concatenate([_mean(np.abs(metrics.crossed), (1, 2)), np.full((1, *lags.shape[1:]), np.nan)])
     stabilities = []
@@ -142,10 +142,10 @@ class Relations:
     """Whether live channels relate to targets, each array ``(channel, target)``.
 
     Attributes:
-        linear: correlation at the best lag at which the channel is not later than the target, mean over the pieces.
+        linear: correlation at the best lag at which the channel is not later than the target, mean over the segments.
         linear_chance: largest linear relation between different segments.
-        linear_t: mean over its standard error among the pieces.
-        information: mutual information at the horizon less that between pieces, mean over the pieces, nat.
+        linear_t: mean over its standard error among the segments.
+        information: mutual information at the horizon less that between segments, mean over the segments, nat.
         information_t: mean over its standard error.
         related: whether either is more than chance.
     """
@@ -159,13 +159,13 @@ class Relations:
 
 
 ABOVE_CHANCE = 1.5
-"""A correlation counts from this multiple of the largest one between unrelated pieces."""
+"""A correlation counts from this multiple of the largest one between unrelated segments."""
 MIN_INFORMATION = 0.02
 """Mutual information below this many nat is not worth a channel, however certain."""
 MIN_CORRELATION = 0.03
 """The same for the correlation at the best lag."""
 CLEARLY = 3.0
-"""Times the largest correlation between unrelated pieces at which a relation is clear."""
+"""Times the largest correlation between unrelated segments at which a relation is clear."""
 
 
 def relations_of(lagged: Lagged, places: NDArray[np.int64], metrics: Metrics, level: float) -> Relations:
@@ -206,7 +206,7 @@ def relations_of(lagged: Lagged, places: NDArray[np.int64], metrics: Metrics, le
 
 
 def _t(values: Array) -> Array:
-    """Return the absolute mean over its standard error among segments, ``(piece, ...)`` to ``(...)``.
+    """Return the absolute mean over its standard error among segments, ``(segment, ...)`` to ``(...)``.
 
     NaN counts as 0.
     """
@@ -220,9 +220,9 @@ def _t(values: Array) -> Array:
 def lag_curves(
     table: CandidateTable, lagged: Lagged, names: Sequence[str], targets: Sequence[str], spec: ScreeningSpec
 ) -> tuple[list[LagCurve], Array]:
-    """Return the lag curve of every channel and target, and the best lag per segment, ``(piece, channel, target)``.
+    """Return the lag curve of every channel and target, and the best lag per segment, ``(segment, channel, target)``.
 
-    The interval comes from pieces drawn again and again with replacement.
+    The interval comes from segments drawn again and again with replacement.
     """
     places = np.searchsorted(lagged.live, table.targets)
     pooled = lagged.pooled()[:, :, places]

@@ -18,7 +18,7 @@ from edp.signals import TABLE_A1, Kind
 from edp.wording import typed
 
 MIN_LAGS, LAGS_A_STRETCH = 5, 40
-"""Largest lags that a recording is long at least, and that a stretch of a large data set is."""
+"""Largest lags that a recording is long at least, and that a segment of a large data set is."""
 MAX_PIECES = 24
 """Beyond, several recordings form a piece."""
 _GROUPS = {
@@ -70,7 +70,7 @@ class CandidateTable:
 
     @cached_property
     def sums(self) -> tuple[Array, Array]:
-        """Mean and variance of each segment and channel, float64, each ``(piece, channel)``."""
+        """Mean and variance of each segment and channel, float64, each ``(segment, channel)``."""
         means, variances = [], []
         for piece in self.pieces:
             mean = sum(s.sum(axis=0, dtype=np.float64) for s in piece.stretches) / piece.samples

@@ -1,7 +1,7 @@
 """Granger gain: improvement by the past of a channel in a linear prediction from all other pasts, on left-out segments.
 
-The models are solved and judged on lagged covariances alone. Leaving a channel out of a solved model costs one small
-system, so that every channel is left out in turn and the rest solved anew, exactly.
+The models are solved and evaluated on lagged covariances alone. Leaving a channel out of a solved model costs one small
+system, so that every channel is left out in turn and the rest solved again, exactly.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def linear_values(
         used: columns that a model may read; targets too, unless the horizon is 0.
         targets: columns of the targets.
         horizon: samples ahead.
-        held_out: pieces that judge; the others train.
+        held_out: segments that evaluate; the others train.
         on_share: hears the share that is done.
     """
     train = _correlations(lagged, np.setdiff1d(np.arange(len(lagged.samples)), held_out))
@@ -146,7 +146,7 @@ def window_needed(
         used: columns that a model may read.
         targets: columns of the targets.
         horizon: samples ahead.
-        held_out: pieces that judge.
+        held_out: segments that evaluate.
 
     Returns:
         The window in samples, and for each window tried the held-out error as a share of the change's variance.

@@ -13,7 +13,7 @@ from edp.networks.twin.greybox import GreyTwin
 
 Array = NDArray[np.float32]
 GOLDEN_TICKS = 160
-"""Of the self-test: the observer settles, and a few stretches teach."""
+"""Of the self-test: the observer settles, and a few segments teach."""
 WORN = 0.2
 """Logarithm by which the groups of the self-test's machine differ from those of the grey box, up and down by turns."""
 
@@ -26,7 +26,7 @@ class GoldenTicks:
         inputs: commands, measured values and predictions ``(tick, number)``.
         forecasts: velocities ``(tick, horizon and velocity)``, NaN where there is none.
         factors: factors of the groups at the end ``(group,)``.
-        taught: stretches that have taught.
+        taught: segments that have taught.
     """
 
     inputs: Array

@@ -11,7 +11,7 @@ from edp.export.monitor.parts import MonitorParts
 from edp.monitor.chain import MonitorChain
 
 JUDGED_BLOCKS = 80
-"""Blocks of the self-test behind those that are not judged; in the second half residuals are shifted."""
+"""Blocks of the self-test behind those that are not evaluated; in the second half residuals are shifted."""
 MOST_TICKS = 200_000
 """Of the self-test; longer blocks are fewer."""
 SHIFT = 2.0

@@ -32,7 +32,7 @@ class NetworkPart:
         bundle: the network.
         reads: inputs of the monitor that it is fed, in its order.
         middle: substitute for each input that was never received, shape (reads,).
-        judged: input of the monitor that each residual judges.
+        judged: input of the monitor that each residual evaluates.
         results: place of each prediction among those of the network, horizon by horizon.
         delays: ticks by which each prediction is older than what it is compared with; 0 for a virtual sensor.
         scaled: whether residuals are divided by half the width of the first interval.
@@ -61,7 +61,7 @@ class TwinPart:
         bundle: bundle of its plant, which maps commands, measured outputs and flags to outputs one sample ahead.
         reads: inputs of the monitor that are its commands and measured answers.
         middle: substitute for each input that was never received, shape (reads,).
-        groups: answers that are judged together, by their place.
+        groups: answers that are evaluated together, by their place.
         prefix: ticks at which all is measured.
         period: ticks from one measured tick of a group to the next.
     """

@@ -20,7 +20,7 @@ FEATURE_LIMIT = 6.0
 CLIP = 3.0
 """Units beyond which an innovation teaches no more."""
 MOST_ERROR = 20.0
-"""Units beyond which an error counts no more when the correction is judged."""
+"""Units beyond which an error counts no more when the correction is evaluated."""
 BOUND = 4.0
 """Coefficients are held within so many prior spreads."""
 BETTER = 0.01
@@ -38,8 +38,8 @@ class AdaptationSpec:
             large, because errors of neighbouring ticks are nearly the same one: it sets how fast is learned.
         prior: spread of the coefficients, in units for one standard width of a feature.
         limit: largest correction, in units.
-        dead_zone: share of the targets' spread from the middle within which the machine counts as at rest.
-        judged_s: seconds of motion over which the correction is judged against the prediction without it.
+        dead_zone: share of the targets' spread from the middle within which the machine counts as in steady state.
+        judged_s: seconds of motion over which the correction is evaluated against the prediction without it.
         margin: share by which it must be worse to be taken back.
 
     Raises:
@@ -70,7 +70,7 @@ class Adaptation:
     The features of a horizon are ``phi = [1, (v - middle) / spread, (y - v) / change, e, Q (x - offset) / scale]``,
     each of them cut off at `FEATURE_LIMIT`: the measured targets v, what is predicted of them y, the errors e in units
     of the predictions that come due now (0 where none does), and directions Q of the inputs x. While nothing moves,
-    by what is measured and by what is predicted, all of them are 0: so nothing is corrected or learned at rest.
+    by what is measured and by what is predicted, all of them are 0: so nothing is corrected or learned in steady state.
 
     Attributes:
         spec: options.

@@ -18,7 +18,7 @@ class RlsStatus(IntEnum):
     NONE = 0
     """Nothing: there is no prediction to correct."""
     HOLDING = 1
-    """The prediction is corrected; nothing was learned: at rest, frozen, or too few ticks in a row."""
+    """The prediction is corrected; nothing was learned: in steady state, frozen, or too few ticks in a row."""
     LEARNING = 2
     """The prediction is corrected, and the error of an earlier one has taught."""
     FALLBACK = 3
@@ -64,7 +64,7 @@ class RlsCorrector:
         theta: coefficients ``(H, J, n)``.
         covariance: P of each horizon ``(H, n, n)``.
         fallback: numbers whose correction is taken back ``(H, J)``.
-        repairs: times that coefficients or a covariance were found damaged and started anew; 0 in health.
+        repairs: times that coefficients or a covariance were found damaged and started again; 0 in health.
     """
 
     def __init__(self, adaptation: Adaptation) -> None:
@@ -116,7 +116,7 @@ class RlsCorrector:
             inputs: inputs of this sample ``(I,)``, SI units.
             prediction: the network's from them ``(H, J)``, SI units.
             fresh: whether they are this tick's own, and the prediction rests on a whole window.
-            learn: False freezes what was learned; it is judged all the same.
+            learn: False freezes what was learned; it is evaluated all the same.
 
         Returns:
             The corrected prediction ``(H, J)`` in SI units, and what was done. Numbers that are not finite are given
@@ -189,7 +189,7 @@ class RlsCorrector:
         return _clip(correction, self._numbers["limit"])
 
     def _due(self, h: int, error: Array, learn: bool) -> bool:
-        """Judge, and learn from, the prediction that has come due; returns whether something was learned."""
+        """Evaluate, and learn from, the prediction that has come due; returns whether something was learned."""
         n, row = self.adaptation.features, self._rows[h][self._at[h]]
         # The constant feature is 1 in motion, so a zero there says that the row was made at rest.
         if row[0] == 0:  # at rest

@@ -59,7 +59,7 @@ def saturated(x: Any, largest: int = LARGEST) -> Fixed:
 
 
 def to_fixed(values: Any, frac: int, largest: int = LARGEST) -> Fixed:
-    """Convert real numbers to integers, rounded half up and limited to the range."""
+    """Convert real values to integers, rounded half up and limited to the range."""
     scaled = np.floor(np.asarray(values, dtype=np.float64) * 2.0**frac + 0.5)
     return np.clip(scaled, -largest, largest).astype(np.int64)
 

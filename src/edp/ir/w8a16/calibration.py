@@ -34,9 +34,10 @@ def calibrate(
 ) -> Formats:
     """Choose formats of all values and 8-bit weights from recordings.
 
-    What is computed before the first weights is seen at every tick, since clipped inputs cost most; the rest on pieces
-    of `PIECE` ticks spread evenly over all recordings. All inputs share one format: where a few of them are very large
-    at rare moments (derivatives), a finer one that clips these may cost less than a coarse one costs the others.
+    What is computed before the first weights is seen at every tick, since clipped inputs cost most; the rest on
+    segments of `PIECE` ticks spread evenly over all recordings. All inputs share one format: where a few of them are
+    very large at rare moments (derivatives), a finer one that clips these may cost less than a coarse one costs the
+    others.
 
     Args:
         graph: the float network.

@@ -28,7 +28,7 @@ class ColumnTable(Protocol):
         """Yield the rows ``start <= row < stop`` of the named columns in order, in chunks of rows.
 
         Yields:
-            one array of numbers a name, all of the same length, shape ``(rows of the piece,)``.
+            one array of numbers a name, all of the same length, shape ``(rows of the segment,)``.
 
         Raises:
             DataError: a column is damaged or holds text.
@@ -99,7 +99,7 @@ class RawLog:
         rate_hz: the rate the file itself states; its rows are then uniform.
         name: the recording's name as the file states it.
         source: origin of the recording as stated in the file.
-        meta: facts the file carries.
+        meta: data the file carries.
         aliases: further names of columns, each with its name in `signals` (the whole path of a signal).
         repeated: names that several columns have, with the names in `signals` that tell them apart.
         digest: hash of the values that EDP wrote (`Recording.digest`), if the file states it.

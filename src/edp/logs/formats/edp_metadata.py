@@ -43,7 +43,7 @@ LONGEST_FACTS = 1 << 24
 LONGEST_TEXT = 4096
 """Characters of a name, a source or a description."""
 DEEPEST = 32
-"""Lists and tables within one another; EDP's own facts have four."""
+"""Lists and tables within one another; EDP's own data have four."""
 KNOWN = frozenset({"name", "rate_hz", "source", "meta", "channels", "digest", "truth", "truth_digest"})
 
 

@@ -32,7 +32,7 @@ class LogEvent:
         comment: a sentence about it.
 
     Raises:
-        DataError: times that are no stretch.
+        DataError: times that are no segment.
     """
 
     name: str

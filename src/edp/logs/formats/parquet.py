@@ -50,7 +50,7 @@ RATIO = 1100
 SPARE = 1 << 28
 """And so many beyond that: columns of one value throughout are usual, an hour at 1 kHz takes 29 MB."""
 _COPIES = 2
-"""A column is in memory in pieces and in one."""
+"""A column is in memory in segments and in one."""
 
 
 class ParquetFormat:

@@ -31,7 +31,7 @@ from edp.signals import VOCABULARY, SignalMap
 from edp.storage.paths import is_file_at, is_folder_at
 
 KEPT_BYTES = 1 << 29
-"""Wanted columns up to this size are read in one go through the file; beyond, each topic in pieces."""
+"""Wanted columns up to this size are read in one go through the file; beyond, each topic in segments."""
 _STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 """Both parts of a header's time, as the library names them for ROS 1 and ROS 2."""
 _LOG_TIME, _HEADER_TIME = "log_time", "header.stamp"

@@ -46,7 +46,7 @@ class Behaviour:
         low: smallest value.
         high: largest value.
         constant: one value throughout.
-        whole: whole numbers only.
+        whole: integers only.
         levels: distinct values.
         holds: share of rows that repeat the row before.
         rises: no row is below the one before.
@@ -55,7 +55,7 @@ class Behaviour:
         even: nearly all steps have one size.
         steady: nearly all steps are between half and twice their median, as those of a clock that waits for others.
         spanned: share of rows between the first and the last one that hold a number.
-        restarts: rows at which an even rise begins anew.
+        restarts: rows at which an even rise begins again.
         coarse: many levels, but hardly a step of more than one: a slow signal that its sensor rounds.
         falls: rows below the one before.
         lossy: steps are one size or a few times it, as those of a clock whose logger loses rows.
@@ -81,7 +81,7 @@ class Behaviour:
 
     @property
     def counts(self) -> bool:
-        """Whether the column is a counter: whole numbers that rise by one."""
+        """Whether the column is a counter: integers that rise by one."""
         return self.whole and self.rises and not self.constant and abs(self.step - 1.0) < 1e-9
 
     @property

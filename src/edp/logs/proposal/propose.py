@@ -363,7 +363,7 @@ def _place(name: str) -> int:
 
 
 def plain_map(look: LogLook) -> SignalMap:
-    """Return a map of all numeric columns for inspection: proposed kinds, otherwise plain numbers."""
+    """Return a map of all numeric columns for inspection: proposed kinds, otherwise dimensionless values."""
     proposal = propose_map(look)
     # A column without any number is a delimiter too many, not a sensor.
     unmapped = [g for g in proposal.columns if not g.channel and g.role in ("constant", "counter") and g.why != _EMPTY]

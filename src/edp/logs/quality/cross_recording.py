@@ -92,7 +92,8 @@ def compare(reports: Sequence[QualityReport], sketches: Sketches, more: Sequence
 def _two_units(reports: Sequence[QualityReport]) -> list[Finding]:
     """Find channels whose size and noise in one recording both differ from the others by the ratio of two units.
 
-    A machine at rest makes a channel small, but not its noise; a weaker sensor makes noise large, but not the size.
+    A machine in steady state makes a channel small, but not its noise; a weaker sensor makes noise large, but not the
+    size.
     """
     sizes: dict[tuple[str, str], list[tuple[str, float, float]]] = {}
     for report in reports:

@@ -43,7 +43,7 @@ class Measures:
     Attributes:
         quantum: step of the lattice on which all values lie, None where there is none coarser than float32.
         levels: distinct values, of at most `MAX_UNIQUE` samples.
-        noise: deviation of the white part at rest, 0 for a state of up to three levels.
+        noise: deviation of the white part in steady state, 0 for a state of up to three levels.
         every: samples between new values; 1 where each sample is new.
         busy: sensor noise moves the last digit all the time, so that equal samples in a row mean something.
         at_low: share of the samples at the minimum.

@@ -41,7 +41,7 @@ class ChannelFacts:
         constant: one value throughout.
         step: distance between neighbouring values of a quantised channel, None where there is none.
         levels: distinct values, of at most 500,000 samples.
-        noise: deviation of its white noise at rest.
+        noise: deviation of its white noise in steady state.
         snr_db: deviation over noise in decibels, None without noise.
         new_hz: rate of new values, Hz.
         stuck_s: longest time at exactly one value between the ends of the range.
@@ -129,7 +129,7 @@ def inspect(
     Args:
         recording: values float32, shape ``(time, channel)``, SI units; NaN marks missing values.
         extra: findings about the file made before (time stamps, columns).
-        clocks: facts of the file's time columns.
+        clocks: data of the file's time columns.
     """
     findings = list(extra)
     facts = []

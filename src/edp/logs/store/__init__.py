@@ -1,7 +1,7 @@
 """Data-set stores: recordings in SI units on one grid, stored so that any segment can be read alone.
 
-A store is a folder: ``store.json`` says what is in it, ``rows/KEY.f32`` hold the samples as plain numbers, float32,
-little end first, one recording after the other, row by row.
+A store is a folder: ``store.json`` says what is in it, ``rows/KEY.f32`` hold the samples as dimensionless values,
+float32, little end first, one recording after the other, row by row.
 """
 
 from edp.logs.store.building import build_store

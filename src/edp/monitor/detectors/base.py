@@ -30,9 +30,9 @@ class Detector(ABC):
         self.channels, self.lanes = channels, lanes
 
     def step(self, residuals: Array) -> Array:
-        """Process one row per stream, shape (lanes, channels).
+        """Process one row per stream, shape (streams, channels).
 
-        Return the statistics, shape (lanes,), large for a fault.
+        Return the statistics, shape (streams,), large for a fault.
 
         Raises:
             DataError: the rows have another shape.
@@ -48,7 +48,7 @@ class Detector(ABC):
 
     @abstractmethod
     def reset(self, lanes: Bools | None = None) -> None:
-        """Reset the given streams, shape (lanes,); all by default."""
+        """Reset the given streams, shape (streams,); all by default."""
 
 
 class DetectorSpec(ABC):
@@ -63,7 +63,7 @@ DETECTORS: Registry[type[DetectorSpec]] = Registry("detector")
 
 
 def statistics(detector: Detector, sessions: Array) -> Array:
-    """Return statistics of whole sessions, without alarms: shape (time, lanes) for (time, lanes, channels)."""
+    """Return statistics of whole sessions, without alarms: shape (time, streams) for (time, streams, channels)."""
     detector.reset()
     return np.array([detector.step(rows) for rows in sessions]).reshape(len(sessions), detector.lanes)
 
@@ -86,7 +86,7 @@ class Alarm:
 
 
 def alarms(detector: Detector, sessions: Array, limit: float | Array) -> list[Alarm]:
-    """Return the alarms of sessions with shape (time, lanes, channels); a stream is reset at each of its alarms.
+    """Return the alarms of sessions with shape (time, streams, channels); a stream is reset at each of its alarms.
 
     Args:
         detector: is reset first.

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 AFTER_S = 60.0
 """Time after an alarm whose rows name its cause where a log has them: a change at once is alarmed within a block."""
 MAX_ROWS = 180
-"""Blocks that name a cause: of a longer stretch the last ones, and no onset."""
+"""Blocks that name a cause: of a longer segment the last ones, and no onset."""
 
 
 def diagnosed(alarm: MonitorAlarm, dictionary: Dictionary, rows: Array, start: datetime | None = None) -> MonitorAlarm:

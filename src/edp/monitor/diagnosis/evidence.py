@@ -57,7 +57,7 @@ def check_stretches(lengths: Sequence[int]) -> None:
     """Raise an error if healthy sessions have too few blocks for a diagnosis.
 
     Raises:
-        DataError: too few stretches of `LONG` blocks.
+        DataError: too few segments of `LONG` blocks.
     """
     count = sum(length // LONG for length in lengths)
     if count < MIN_SESSIONS:

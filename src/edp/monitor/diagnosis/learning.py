@@ -55,7 +55,7 @@ def check_healthy_blocks(lengths: Sequence[int]) -> None:
         lengths: blocks of each session.
 
     Raises:
-        DataError: too few stretches, or no session as long as what an alarm looks at.
+        DataError: too few segments, or no session as long as what an alarm looks at.
     """
     check_stretches(lengths)
     if max(lengths) < ONSET + WINDOW:
@@ -75,7 +75,7 @@ def fit_dictionary(
 ) -> Dictionary:
     """Fit signatures to all sessions; choose temperature, change fraction and bounds on left-out sessions.
 
-    A left-out session is judged as an alarm would be: its change on top of a stretch of a healthy session.
+    A left-out session is evaluated as an alarm would be: its change on top of a segment of a healthy session.
 
     Args:
         summaries: names of the monitor's summaries.

@@ -39,7 +39,7 @@ class FitMaterial:
         rate_hz: ticks per second.
         predictors: look-ahead networks of this machine.
         twins: plant models of this machine.
-        groups: names of channels that are judged together; empty where names and kinds are to tell.
+        groups: names of channels that are evaluated together; empty where names and kinds are to tell.
         seed: root of every random choice.
         minutes: processor time that fits may take, all together.
         progress: receiver of what begins.
@@ -96,17 +96,17 @@ class ResidualSource(ABC):
     """A fitted source.
 
     State is explicit: ticks, chunks and one call over everything give the same numbers. A missing input (NaN or
-    infinite) silences the residuals that judge or read it at its ticks, and for what is read the last value that was
+    infinite) silences the residuals that evaluate or read it at its ticks, and for what is read the last value that was
     there stands in, so that it never spoils the memory.
 
     Attributes:
         names: one a residual, such as ``virtual:CylVels_1``.
         judged: channels whose fault shows as a bias of each residual.
-        reads: all inputs that each residual depends on, those that are judged among them.
+        reads: all inputs that each residual depends on, those that are evaluated among them.
         units: SI unit of each residual.
         inputs: raw channels, SI units.
         middle: substitute for an input that has not been received yet, shape (inputs,).
-        delay: ticks after which an offset of a judged channel shows at the latest.
+        delay: ticks after which an offset of a evaluated channel shows at the latest.
     """
 
     names: tuple[str, ...]
@@ -330,8 +330,8 @@ def source_arrays(parts: SourceParts, rules: Mapping[str, ArrayRule], **sizes: i
 
     Args:
         parts: of the source.
-        rules: declarations of the arrays besides ``middle``.
-        sizes: of dimensions besides ``inputs``.
+        rules: declarations of the arrays in addition to ``middle``.
+        sizes: of dimensions in addition to ``inputs``.
 
     Raises:
         ValueError: values that cannot be.

@@ -51,7 +51,7 @@ class Cycles(ResidualSource):
     """Measured less the mean of healthy cycles at the same tick of the cycle, over the scatter of those there.
 
     A stream begins at the start of a cycle. Where cycles repeat, each follows the one before without a gap; else the
-    stream is one cycle, and what comes behind it is not judged.
+    stream is one cycle, and what comes behind it is not evaluated.
 
     Args:
         inputs: channels, SI units.

@@ -292,7 +292,7 @@ class FlowBalancesSpec(ResidualSpec):
         rows: ticks that curves are fitted to, at most.
         trials: numbers of trials for dead times, frequencies and play of the spools of an axis.
         least: share of the mean size of the velocity that a balance must tell on sessions that did not train it; of
-            less it judges nothing.
+            less it evaluates nothing.
 
     Raises:
         ConfigError: a value is out of its bounds.

@@ -22,7 +22,7 @@ class Group:
     Attributes:
         name: name for messages.
         judged: the channels.
-        unread: channels that would tell what is judged and must not be read, those that are judged left out.
+        unread: channels that would tell what is evaluated and must not be read, those that are evaluated left out.
     """
 
     name: str

@@ -36,7 +36,7 @@ class TwinPorts(ResidualSource):
 
     Args:
         bundle: the twin.
-        groups: names of answers that are judged together.
+        groups: names of answers that are evaluated together.
         period: ticks from one measured tick of a group to the next.
         inputs: raw channels, SI units.
         middle: mean of each on healthy sessions.

@@ -46,7 +46,7 @@ MAX_EVERY = 1000
 
 @dataclass(frozen=True, eq=False)
 class _Turn:
-    """Schedule of one network: samples until its next run, its last residuals (streams, judged), its state."""
+    """Schedule of one network: samples until its next run, its last residuals (streams, evaluated), its state."""
 
     due: int
     residuals: Rows
@@ -140,7 +140,7 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
 
     Attributes:
         least: share of a channel's mean deviation that a virtual sensor must explain on the sessions that choose; a
-            channel that the others say less about is not judged.
+            channel that the others say less about is not evaluated.
         every: ticks from one run of a network to the next, 1 by default. Networks take turns, are trained at that
             slower rate (spans in `lags_s` shorter than it are one run), and residuals hold in between: a controller
             has one of n networks to run at a tick where it is n or more.

@@ -34,7 +34,7 @@ class AdaptiveWeights:
 
     With r_i the running mean absolute error of output i in standard deviations and ``a_i`` proportional to ``1 / r_i``,
     cut where it exceeds `max_ratio` times the smallest and with mean one, output i is weighted by
-    ``1 - blend + blend a_i``, besides its fixed weight. Each horizon has its own.
+    ``1 - blend + blend a_i``, in addition to its fixed weight. Each horizon has its own.
 
     Attributes:
         blend: share of the adaptive part; 0 leaves the fixed weights alone.

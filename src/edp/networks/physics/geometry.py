@@ -1,7 +1,8 @@
 """Linkage and rigid bodies of a machine as differentiable tensor operations, with the parameters stored as buffers.
 
-The same mechanism as `edp.sim.physics.linkage` and `edp.sim.physics.dynamics`, written anew for tensors: every quantity
-is a rational function of cosines and sines of the relative joint angles, with a square root where two circles meet.
+The same mechanism as `edp.sim.physics.linkage` and `edp.sim.physics.dynamics`, written again for tensors: every
+quantity is a rational function of cosines and sines of the relative joint angles, with a square root where two circles
+meet.
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ class TunedCorrection:
 
         Args:
             command: commands of the twin ``(command,)``; a missing value stops the correction.
-            measured: measured outputs of the twin ``(answer,)``, NaN for a missing sensor.
+            measured: measured outputs of the twin ``(output,)``, NaN for a missing sensor.
             prediction: the network's ``(horizon, target)``, SI units; as it is where it is not finite.
             oil_c: temperature of the oil (degC); NaN: not measured.
         """

@@ -1,12 +1,12 @@
 """Grey box with on-board adaptation: wear and temperature are learned from its own free runs, within bounds.
 
-An observer follows the machine as in `edp.networks.twin.forecast`. Every `learn_ticks` ticks the stretch that has just
+An observer follows the machine as in `edp.networks.twin.forecast`. Every `learn_ticks` ticks the segment that has just
 been measured is run again, freely, from the observer's state at its beginning with the commands that came: once with
 the present numbers, and once for each *group* of numbers a little grown. With e the errors of the velocities in units
 of what they lately were (root mean square), S the slopes of the runs by the logarithms x of the groups, and P their
 covariance::
 
-    P = (P^-1 + S' S / n)^-1,  x = x + P S' clip(e) / n,   n ticks of the stretch, whose errors count as one tick's
+    P = (P^-1 + S' S / n)^-1,  x = x + P S' clip(e) / n,   n ticks of the segment, whose errors count as one tick's
     x = a x,  P = a^2 P + (1 - a^2) prior,                 a = exp(-learn_ticks / forgetting)
 
 which is a Kalman filter on numbers that fade to what they were. Forces that no number stands for, as those of soil, are
@@ -46,9 +46,9 @@ LATELY = 30
 HOTTEST_C = 150.0
 """Maximum oil temperature, degC. A thermometer that reads more is broken."""
 WARMER = 0.02
-"""Change of a logarithm by temperature from which numbers are made anew: about a kelvin."""
+"""Change of a logarithm by temperature from which numbers are made again: about a kelvin."""
 REST = 1e-3
-"""Speed (m/s or rad/s) below which a stretch tells nothing of valves and friction."""
+"""Speed (m/s or rad/s) below which a segment tells nothing of valves and friction."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +84,7 @@ class TunedSpec:
 
     Attributes:
         groups: names in `NUMBER_GROUPS` of the groups to adapt.
-        learn_ticks: length of a stretch that is run again.
+        learn_ticks: length of a segment that is run again.
         forgetting_s: seconds of motion after which what was learned has 1/e of its weight.
         gain: gain of the observer, as a fraction of the innovation.
         load_share: fraction of a new force that the estimate adopts per sample; 0 to estimate no forces.
@@ -157,7 +157,7 @@ class AdaptiveTwin:
         logs: logarithms of the groups' factors, less `by_oil` ``(group,)``; 0 where nothing has changed.
         by_oil: factor of the oil temperature for each group ``(group,)``.
         learn: False freezes them.
-        learned: stretches that have taught.
+        learned: segments that have taught.
 
     Raises:
         ConfigError: a twin that is no grey box, or a group that it has no number of.
@@ -212,7 +212,7 @@ class AdaptiveTwin:
 
         Args:
             command: ``(command,)``; one that is missing interrupts, since nothing is known of what moves then.
-            measured: ``(answer,)``, NaN where a sensor is missing: that port runs free.
+            measured: ``(output,)``, NaN where a sensor is missing: that port runs free.
             oil_c: temperature of the oil (degC); NaN, or beyond what oil can have: not measured.
         """
         self._warm(oil_c)

@@ -41,7 +41,7 @@ class Arx:
         check_bounds("arx", self, lags=integer(1, MOST_TICKS), prefix_ticks=PREFIX)
 
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> Twin:
-        """Fit by least squares; no random numbers are used."""
+        """Fit by least squares; no random values are used."""
         solved, commands = list_solved_columns(channels), len(channels.commands)
         rows = [Series(s.name, np.concatenate([s.inputs, s.targets], axis=1), s.targets[:, solved]) for s in train]
         task = LagTask((1,), tuple(commands + column for column in solved), self.lags)

@@ -30,11 +30,11 @@ BEYOND = 0.05
 class Twin(ABC):
     """A causal map from commands and feedback to the state of the machine one tick later.
 
-    Every answer is a *feedback port*: at each tick it reads what was measured, or where nothing was measured (NaN)
-    its own last answer. Measured mode (a filter), free mode (a plant model) and any mixture are the same numbers::
+    Every output is a *feedback port*: at each tick it reads what was measured, or where nothing was measured (NaN)
+    its own last output. Measured mode (a filter), free mode (a plant model) and any mixture are the same numbers::
 
         state = twin.reset(commands[:, :50], measured[:, :50])
-        answers, state = twin.rollout(commands[:, 50:], state)  # answers[:, t] is the machine after commands[:, 50 + t]
+        outputs, state = twin.rollout(commands[:, 50:], state)  # outputs[:, t] is the machine after commands[:, 50 + t]
 
     State is explicit: ticks, chunks and one call over everything give the same numbers, and so does a run that goes on
     from a kept state. Arrays are float32 in SI units; nothing here needs torch.
@@ -50,7 +50,7 @@ class Twin(ABC):
 
     @abstractmethod
     def initial_state(self, command: Array, measured: Array) -> TwinState:
-        """Return the steady state of machines for this command ``(batch, command)`` and state ``(batch, answer)``."""
+        """Return the steady state of machines for this command ``(batch, command)`` and state ``(batch, output)``."""
 
     @abstractmethod
     def _run(self, commands: Array, measured: Array, state: TwinState) -> tuple[Array, TwinState]:
@@ -66,7 +66,7 @@ class Twin(ABC):
         Args:
             build: the layers in the making.
             commands: scaled ``(command,)``.
-            fed: scaled feedback inputs ``(answer,)``.
+            fed: scaled feedback inputs ``(output,)``.
 
         Raises:
             ExportError: the formulation has no form as layers; that of this class always.
@@ -96,7 +96,7 @@ class Twin(ABC):
 
         Args:
             commands: ``(batch, tick, command)``, at least `prefix_ticks` of them.
-            measured: ``(batch, tick, answer)``; NaN where a sensor is missing, but not at the first tick.
+            measured: ``(batch, tick, output)``; NaN where a sensor is missing, but not at the first tick.
 
         Raises:
             DataError: too few ticks, a port about which nothing is known, or a start beyond an end stop.
@@ -118,10 +118,10 @@ class Twin(ABC):
         Args:
             command: ``(batch, command)``.
             state: before it.
-            measured: ``(batch, answer)``, NaN where a port is free; None frees all.
+            measured: ``(batch, output)``, NaN where a port is free; None frees all.
 
         Returns:
-            Answers ``(batch, answer)``, and the state after them.
+            Outputs ``(batch, output)``, and the state after them.
         """
         row = None if measured is None else np.asarray(measured)[:, None]
         answers, state = self.rollout(np.asarray(command)[:, None], state, row)
@@ -133,10 +133,10 @@ class Twin(ABC):
         Args:
             commands: ``(batch, tick, command)``.
             state: before the first tick.
-            measured: ``(batch, tick, answer)``, NaN where a port is free; None frees all.
+            measured: ``(batch, tick, output)``, NaN where a port is free; None frees all.
 
         Returns:
-            Answers ``(batch, tick, answer)`` within the bounds of the twin, and the state after them.
+            Outputs ``(batch, tick, output)`` within the bounds of the twin, and the state after them.
 
         Raises:
             DataError: other shapes, or a command that is missing.
@@ -165,11 +165,11 @@ class Twin(ABC):
         Args:
             commands: ``(run, tick, command)``, those of a run the first one's before it branches off.
             state: state of one machine, a batch of one.
-            measured: feedback inputs at the first sample ``(answer,)``, NaN for outputs that run free.
+            measured: feedback inputs at the first sample ``(output,)``, NaN for outputs that run free.
             first: tick at which each run branches off the first one ``(run,)``, ascending, its own zero.
 
         Returns:
-            Answers ``(run, tick, answer)``.
+            Outputs ``(run, tick, output)``.
         """
         fed = np.full((*commands.shape[:2], len(measured)), np.nan, np.float32)
         fed[:, 0] = measured
@@ -180,7 +180,7 @@ class Twin(ABC):
         return TwinRunner(self)
 
     def scaled(self, answers: Array) -> Array:
-        """Answers in SI units as a network reads them."""
+        """Outputs in SI units as a network reads them."""
         return np.asarray((answers - self.scales.answer_offset) / self.scales.answer_width, dtype=np.float32)
 
     def scale_commands(self, commands: Array) -> Array:
@@ -192,13 +192,13 @@ class Twin(ABC):
         return self.scale_commands(commands)
 
     def bounded(self, feedback: Array, velocity: Array, pressure: Array) -> Array:
-        """Return outputs ``(batch, answer)`` limited to the bounds, SI units.
+        """Return outputs ``(batch, output)`` limited to the bounds, SI units.
 
         A stroke is the integral of its velocity by the trapezoidal rule; at an end stop it stays, and the velocity
         into the stop is zero.
 
         Args:
-            feedback: feedback inputs ``(batch, answer)``.
+            feedback: feedback inputs ``(batch, output)``.
             velocity: proposed velocities ``(batch, velocity)``; `pressure` likewise.
             pressure: proposed pressures.
         """
@@ -242,7 +242,7 @@ class Twin(ABC):
             )
 
     def is_within_stops(self, start: Array) -> NDArray[np.bool_]:
-        """Return whether a twin can start at ``(batch, answer)``: no stroke is far beyond an end stop."""
+        """Return whether a twin can start at ``(batch, output)``: no stroke is far beyond an end stop."""
         return np.asarray((self._measure_excess(start) <= BEYOND).all(axis=1))
 
     def _measure_excess(self, start: Array) -> Array:
@@ -284,7 +284,7 @@ class TwinRunner:
         Args:
             command: ``(command,)``, finite.
             state: before it, a batch of one; it stays as it is.
-            measured: ``(answer,)``, NaN where a port is free.
+            measured: ``(output,)``, NaN where a port is free.
         """
         return self.twin.step(command[None], state, measured[None])[1]
 
@@ -314,7 +314,7 @@ TWINS: Registry[type] = Registry("twin")
 
 
 def list_solved_columns(channels: TwinChannels) -> list[int]:
-    """Answers that a regression solves for: all but the strokes, which are integrals."""
+    """Outputs that a regression solves for: all but the strokes, which are integrals."""
     velocities, strokes = len(channels.velocities), len(channels.strokes)
     return [i for i in range(len(channels.answers)) if not velocities <= i < velocities + strokes]
 

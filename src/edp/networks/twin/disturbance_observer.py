@@ -28,7 +28,7 @@ def force_slopes(
 
     Args:
         runner: runner of a model with a load; its `resistance` is restored.
-        velocities: columns of its answers.
+        velocities: columns of its outputs.
         tick: command, row that its ports read, and state before it.
         expected: the velocities with its present resistance.
     """
@@ -52,7 +52,7 @@ class DisturbanceObserver:
 
     Args:
         runner: runner of a model with a load; the observer writes its `resistance`.
-        velocities: columns of its answers, which begin with all velocities.
+        velocities: columns of its outputs, which begin with all velocities.
         share: fraction of a new error that the estimate adopts per sample; 0 to switch the observer off.
     """
 
@@ -76,7 +76,7 @@ class DisturbanceObserver:
 
         Args:
             command: command of the sample ``(command,)``.
-            row: feedback inputs of the sample ``(answer,)``.
+            row: feedback inputs of the sample ``(output,)``.
             before: state before it.
             after: state after it.
         """

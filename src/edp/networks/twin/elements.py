@@ -150,7 +150,7 @@ class ElementsTwin(Twin):
         return self.rollout(np.asarray(commands, np.float32), start, np.asarray(measured, np.float32))[1]
 
     def free_run(self, numbers: Values, commands: Doubles, answer: Values, hidden: Values) -> Values:
-        """Simulate outputs ``(batch, tick, answer)`` for parameters ``(number,)`` or ``(batch, number)``.
+        """Simulate outputs ``(batch, tick, output)`` for parameters ``(number,)`` or ``(batch, number)``.
 
         Complex ones give derivatives.
         """

@@ -4,8 +4,8 @@ The observer is Luenberger's with one gain. Before tick t every port reads
 
     z[t] = a[t] + g (m[t] - a[t])
 
-a the twin's own answer for tick t, m what was measured; a missing measurement leaves the port free. From the state
-that this gives, the commands of tick t are held and the twin runs free: ``f[t, k]`` is its answer for tick t + k. It
+a the twin's own output for tick t, m what was measured; a missing measurement leaves the port free. From the state
+that this gives, the commands of tick t are held and the twin runs free: ``f[t, k]`` is its output for tick t + k. It
 reads nothing after tick t.
 """
 
@@ -62,7 +62,7 @@ def choose_gain(twin: Twin, series: Sequence[Series], horizons: Sequence[int]) -
 
     Args:
         twin: any formulation.
-        series: inputs are commands, targets are what the twin answers; the first ones are used.
+        series: inputs are commands, targets are what the twin outputs; the first ones are used.
         horizons: horizons in samples.
     """
     ends, parts = sorted({min(horizons), max(horizons)}), list(series)[:CHOICE_LOGS]
@@ -90,12 +90,12 @@ def forecast(twin: Twin, commands: Array, measured: Array, horizons: Sequence[in
     Args:
         twin: any formulation.
         commands: ``(tick, command)``, finite.
-        measured: ``(tick, answer)``, NaN where a sensor is missing.
+        measured: ``(tick, output)``, NaN where a sensor is missing.
         horizons: horizons in samples.
         gain: gain of the observer; see `choose_gain`.
 
     Returns:
-        ``(tick, horizon, answer)``, SI units; NaN in the ticks before the observer has settled: `Twin.prefix_ticks`
+        ``(tick, horizon, output)``, SI units; NaN in the ticks before the observer has settled: `Twin.prefix_ticks`
         from the first tick on at which the twin can start.
 
     Raises:
@@ -134,7 +134,7 @@ def _begin(twin: Twin, measured: Array) -> int:
 
 
 def _simulate_ahead(twin: Twin, commands: Array, states: TwinState, ports: Array, ticks: int) -> Array:
-    """Simulate from each state with its command held constant, ``(moment, tick, answer)``."""
+    """Simulate from each state with its command held constant, ``(moment, tick, output)``."""
     constant_commands = np.repeat(commands[:, None], ticks, axis=1)
     fed = np.full((len(commands), ticks, ports.shape[1]), np.nan, np.float32)
     fed[:, 0] = ports

@@ -29,7 +29,7 @@ class FreeRunIntervals:
     Attributes:
         coverage: share of runs that an interval is meant to hold at any horizon.
         ticks: horizons of the knots, growing.
-        half_width: ``(knot, answer)``, SI units, never shrinking with the horizon.
+        half_width: ``(knot, output)``, SI units, never shrinking with the horizon.
         runs: free runs that calibrated them.
 
     Raises:
@@ -53,7 +53,7 @@ class FreeRunIntervals:
             raise ValueError("the widths of its intervals shrink with the horizon, or are no numbers")
 
     def at(self, ticks: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return half widths ``(tick, answer)`` at these horizons, SI units.
+        """Return half widths ``(tick, output)`` at these horizons, SI units.
 
         Tick 1 is the first output of a free run.
         """
@@ -88,7 +88,7 @@ def calibrate(errors: Array, coverage: float) -> FreeRunIntervals:
     that is above 1. Widths are then made to grow with the horizon by isotonic regression.
 
     Args:
-        errors: of free runs ``(run, tick, answer)``, SI units, tick 1 first; NaN behind the end of a run. At least one
+        errors: of free runs ``(run, tick, output)``, SI units, tick 1 first; NaN behind the end of a run. At least one
             run goes to the last tick.
         coverage: share of runs that an interval is meant to hold.
     """

@@ -23,8 +23,8 @@ MEASURED = 0.5
 def plant_graph(twin: Twin) -> Graph:
     """Return one sample of a twin as a graph, from SI inputs to SI outputs.
 
-    Inputs are the commands, a measured value for each answer, and a flag for each: 1 where the port reads what was
-    measured, 0 where it reads the last answer. A measured value must be finite even where nobody reads it. After a
+    Inputs are the commands, a measured value for each output, and a flag for each: 1 where the port reads what was
+    measured, 0 where it reads the last output. A measured value must be finite even where nobody reads it. After a
     reset the plant rests at the means of its training data.
 
     Raises:
@@ -63,7 +63,7 @@ def _ports(build: Builder, twin: Twin, commands: int) -> tuple[str, str]:
 
 
 def add_bounds(build: Builder, twin: Twin, fed: str, proposed: str) -> str:
-    """Answers within the bounds, scaled: `Twin.bounded` in layers."""
+    """Outputs within the bounds, scaled: `Twin.bounded` in layers."""
     scales, channels = twin.scales, twin.channels
     count, strokes = len(channels.velocities), len(channels.strokes)
     low, high = ((end - scales.answer_offset) / scales.answer_width for end in (scales.low, scales.high))

@@ -4,7 +4,7 @@
 
 The column space of the observability matrix is that of future outputs, freed from future commands, as far as the past
 tells them: PO-MOESP, with past commands and outputs as instruments (Verhaegen 1994; Van Overschee and De Moor 1996,
-ch. 2 to 4). The answer to the command of tick t is the machine at t + 1, so nothing feeds through.
+ch. 2 to 4). The output to the command of tick t is the machine at t + 1, so nothing feeds through.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ CHUNK = 4096
 SLOWEST = 0.999
 """Largest modulus of a pole: 10 s at 100 Hz. Slower ones are drifts that the strokes, which are integrals, have."""
 FARTHEST = 1e4
-"""Bound of a state, which is of the size of 1: whatever is commanded, answers stay finite numbers."""
+"""Bound of a state, which is of the size of 1: whatever is commanded, outputs stay finite numbers."""
 STRETCHES, STRETCH_TICKS = 128, 150
 """Stretches from which B is solved, each with an own start, and their length."""
 JUDGED_S, JUDGED_EACH = 10.0, 4
@@ -61,7 +61,7 @@ class N4sid:
     The order is the one whose free runs on a fifth of the training recordings, kept back meanwhile, have the least
     error; a single order is taken as it is. Poles outside the unit circle are reflected into it, and those slower than
     a modulus of 0.999 are shrunk to it, so the model is stable. B is solved for by least squares on simulated
-    stretches, K from the covariance of what is left by a Riccati equation.
+    segments, K from the covariance of what is left by a Riccati equation.
 
     Attributes:
         orders: numbers of states to choose from; those beyond what the rows of outputs can tell are cut to that.
@@ -82,7 +82,7 @@ class N4sid:
         check_count("n4sid", "orders", self.orders, 100, least=1)
 
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> Twin:
-        """Fit by projections; no random numbers are used.
+        """Fit by projections; no random values are used.
 
         Raises:
             DataError: recordings that are too short for `horizon`.
@@ -125,7 +125,7 @@ class N4sid:
 class N4sidTwin(Twin):
     """State: ``answer`` (outputs) in SI units, and ``states`` of the model ``(batch, order)``.
 
-    What a port reads corrects the states by the Kalman gain; a free port reads its own last answer, which lies where
+    What a port reads corrects the states by the Kalman gain; a free port reads its own last output, which lies where
     the model put it but for its bounds, and then corrects nothing.
     """
 
@@ -181,7 +181,7 @@ class N4sidTwin(Twin):
 
 
 Pair = tuple[Doubles, Doubles]
-"""Commands, behind them a one, and solved answers of a stretch, scaled ``(tick, command + 1)``, ``(tick, answer)``."""
+"""Commands, behind them a one, and solved outputs of a segment, scaled ``(tick, command + 1)``, ``(tick, output)``."""
 
 
 def _append_ones(commands: Array) -> Doubles:
@@ -197,10 +197,10 @@ class _Projections:
 
     Attributes:
         horizon: rows of past and of future.
-        pairs: the stretches.
-        left: left singular vectors of what the past tells of the freed future ``(horizon * answer, rank)``.
+        pairs: the segments.
+        left: left singular vectors of what the past tells of the freed future ``(horizon * output, rank)``.
         sizes: their singular values.
-        by_past: future outputs by past commands and outputs ``(horizon * answer, horizon * (command + answer))``.
+        by_past: future outputs by past commands and outputs ``(horizon * output, horizon * (command + output))``.
     """
 
     horizon: int
@@ -327,7 +327,7 @@ def _inputs_of(pairs: Sequence[Pair], a: Doubles, c: Doubles) -> Doubles:
 
 
 def _gain(a: Doubles, c: Doubles, process: Doubles, output: Doubles) -> Doubles:
-    """Return the steady Kalman gain for the residual noise of states ``(row, state)`` and outputs ``(row, answer)``."""
+    """Return the steady Kalman gain for the residual noise of states ``(row, state)`` and outputs ``(row, output)``."""
     # Here, since every command with a network imports this module, and scipy.linalg takes time.
     from scipy.linalg import solve_discrete_are
 

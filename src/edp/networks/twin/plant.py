@@ -76,7 +76,7 @@ class TwinPlant(Predictor):
         return self.twin.initial_state(command, answer)
 
     def predict(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        """Return outputs in SI units, ``(batch, time, 1, answer)``, and the next state."""
+        """Return outputs in SI units, ``(batch, time, 1, output)``, and the next state."""
         rows = x.detach().cpu().numpy()
         if x.dtype == torch.float64:
             new = deepcopy(state)

@@ -37,7 +37,7 @@ MEMBER_SEED = 1000
 class Recurrent:
     """GRU with feedback ports, trained on its own free runs (`edp.training.free_run`).
 
-    Several members are networks that are trained apart; the twin answers with the mean of their changes. As they read
+    Several members are networks that are trained apart; the twin outputs with the mean of their changes. As they read
     the same ports, they are one network, whose weights between members are zero.
 
     Attributes:
@@ -122,11 +122,11 @@ class RecurrentTwin(Twin):
     State: ``answer`` scaled, ``h`` ``(batch, units)``, and with a static map the ``commands`` of its delay.
 
     Args:
-        channels: what commands it and what it answers.
-        scales: of its numbers, and the bounds of its answers.
+        channels: what commands it and what it outputs.
+        scales: of its numbers, and the bounds of its outputs.
         prefix_ticks: least number of measured ticks before a free run.
         network: the cell.
-        static: the map to which its answers are pulled; None where the network has no pull.
+        static: the map to which its outputs are pulled; None where the network has no pull.
         members: networks that it is the average of.
     """
 
@@ -156,11 +156,11 @@ class RecurrentTwin(Twin):
         return np.concatenate([self.scale_commands(commands), self._scale_map(self.static.along(commands))], axis=1)
 
     def free_run(self, commands: Tensor, measured: Tensor, port: Tensor) -> Tensor:
-        """Simulate scaled outputs ``(time, batch, answer)`` from measured starts, with gradients by the weights.
+        """Simulate scaled outputs ``(time, batch, output)`` from measured starts, with gradients by the weights.
 
         Args:
             commands: what `drive` made of them ``(time, batch, number)``.
-            measured: scaled ``(time, batch, answer)``, any finite number where `port` is 0.
+            measured: scaled ``(time, batch, output)``, any finite number where `port` is 0.
             port: 1 where a port reads what was measured; all of the first tick.
         """
         count = len(self.channels.commands)
@@ -200,11 +200,11 @@ class RecurrentTwin(Twin):
         return RecurrentRunner(self)
 
     def map_along(self, commands: Array, state: TwinState) -> tuple[Array, Array]:
-        """Return the scaled outputs of the static map for commands ``(tick, lane, command)``, and its next memory.
+        """Return the scaled outputs of the static map for commands ``(tick, run, command)``, and its next memory.
 
         Args:
             commands: SI units.
-            state: of one machine, that of all lanes.
+            state: of one machine, that of all batch.
         """
         if self.static is None:
             return np.zeros((0, 0, 0), np.float32), np.zeros((0, 0, 0), np.float32)
@@ -213,7 +213,7 @@ class RecurrentTwin(Twin):
         return np.ascontiguousarray(self._scale_map(solved).swapaxes(0, 1)), memory[:1]
 
     def _scale_map(self, solved: Array) -> Array:
-        """Scale map outputs ``(..., all but strokes)`` to ``(..., answer)``, zero for strokes."""
+        """Scale map outputs ``(..., all but strokes)`` to ``(..., output)``, zero for strokes."""
         columns, scales = list_solved_columns(self.channels), self.scales
         answers = np.zeros((*solved.shape[:-1], len(self.channels.answers)), np.float32)
         answers[..., columns] = (solved - scales.answer_offset[columns]) / scales.answer_width[columns]
@@ -257,7 +257,7 @@ class RecurrentTwin(Twin):
         )
 
     def member_rows(self) -> list[slice]:
-        """Return the rows of h of each member; a single range if members are connected by further training."""
+        """Return the rows of h of each member; a single range if members are connected by fine-tuning."""
         units, weight = self.network.units, self.network.h_weight.detach().numpy()
         width = units // self.members
         rows = [slice(first, first + width) for first in range(0, units, width)]
@@ -305,7 +305,7 @@ class RecurrentRunner(TwinRunner):
         return after
 
     def _run(self, rows: Array, state: TwinState, measured: Array, first: NDArray[np.int64]) -> tuple[Array, TwinState]:
-        """Simulate ``(lane, tick, answer)`` for commands ``(tick, lane, command)``.
+        """Simulate ``(run, tick, output)`` for commands ``(tick, run, command)``.
 
         Also return the final state of run 0.
         """
@@ -330,8 +330,8 @@ def member_seed(seed: int, which: int) -> int:
 def averaged(twins: Sequence[RecurrentTwin]) -> RecurrentTwin:
     """Return one twin whose state change is the mean of those of equally wide twins over the same channels.
 
-    All of them read the same ports, and what an answer adds up from h is linear: so their mean is one network, whose
-    gates are theirs side by side and whose answers have their weights over the number of twins.
+    All of them read the same ports, and what an output adds up from h is linear: so their mean is one network, whose
+    gates are theirs side by side and whose outputs have their weights over the number of twins.
 
     Args:
         twins: at least one; none with a static map, or all, with the same corners and delay.

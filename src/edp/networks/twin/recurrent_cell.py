@@ -55,7 +55,7 @@ class TwinNetwork(CellWeights):
         commands: number of them.
         answers: number of them.
         units: width of the memory.
-        pulled: answers that a static map pulls, all but the strokes; 0 without a map.
+        pulled: outputs that a static map pulls, all but the strokes; 0 without a map.
     """
 
     def __init__(self, commands: int, answers: int, units: int, pulled: int = 0) -> None:
@@ -72,15 +72,15 @@ class TwinNetwork(CellWeights):
         bounds: Bounds,
         mapped: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Return outputs ``(time, batch, answer)`` and the final h ``(batch, units)``.
+        """Return outputs ``(time, batch, output)`` and the final h ``(batch, units)``.
 
         Args:
             commands: ``(time, batch, command)``.
-            measured: ``(time, batch, answer)``, any finite number where `port` is 0.
-            port: 1 where a port reads what was measured, 0 where it reads the last answer.
-            start: last answer ``(batch, answer)`` and h ``(batch, units)``.
-            bounds: of the answers.
-            mapped: what a static map says ``(time, batch, answer)``, strokes zero; None without one.
+            measured: ``(time, batch, output)``, any finite number where `port` is 0.
+            port: 1 where a port reads what was measured, 0 where it reads the last output.
+            start: last output ``(batch, output)`` and h ``(batch, units)``.
+            bounds: of the outputs.
+            mapped: what a static map says ``(time, batch, output)``, strokes zero; None without one.
         """
         projected = nn.functional.linear(commands, self.command_weight, self.bias)
         mapped = torch.zeros(0, 0, 0) if mapped is None else mapped
@@ -102,7 +102,7 @@ class TwinNetwork(CellWeights):
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """Bounds of scaled outputs: change per unit of output, low, high ``(answer,)``, trapezoid ``(stroke,)``.
+    """Bounds of scaled outputs: change per unit of output, low, high ``(output,)``, trapezoid ``(stroke,)``.
 
     Velocities.
     """

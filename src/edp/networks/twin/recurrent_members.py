@@ -38,7 +38,7 @@ def scales_for(twin: RecurrentTwin, own: TwinScales, train: list[Series]) -> Twi
     Args:
         twin: trained before.
         own: fitted to these recordings.
-        train: stretches of these recordings.
+        train: segments of these recordings.
     """
     before, count = twin.scales, len(twin.channels.velocities)
     low, high = np.minimum(before.low, own.low), np.maximum(before.high, own.high)
@@ -58,7 +58,7 @@ def _is_stop(there: Sequence[np.ndarray], pushes: Sequence[np.ndarray], rate_hz:
     """Whether an outermost place is an end stop.
 
     Args:
-        there: of each stretch, tick by tick, whether it is there.
+        there: of each segment, tick by tick, whether it is there.
         pushes: the lever towards that place, as a share of its largest value; empty: nothing tells which lever it is.
         rate_hz: of the ticks.
     """
@@ -107,7 +107,7 @@ def replace_scales(twin: RecurrentTwin, scales: TwinScales) -> RecurrentTwin:
 def separated(twin: RecurrentTwin) -> list[RecurrentTwin]:
     """Return the members of an averaged twin; the twin itself if it is a single network.
 
-    What the average keeps of all members alone (constants of the answers, pulls, the map) each of them has.
+    What the average keeps of all members alone (constants of the outputs, pulls, the map) each of them has.
     """
     if len(twin.member_rows()) < twin.members or twin.members == 1:
         return [replace_scales(twin, twin.scales)]

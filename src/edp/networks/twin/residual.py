@@ -125,8 +125,8 @@ class ResidualTwin(GreyTwin):
         """Return the network for compiled code, in units of the grey box; see `edp.networks.twin.grey.correction.Cell`.
 
         Args:
-            projected: the commands' part of the gates ``(tick, lane, 3 units)``.
-            h: ``(lane, units)``; a run moves it.
+            projected: the commands' part of the gates ``(tick, run, 3 units)``.
+            h: ``(run, units)``; a run moves it.
         """
         solved = np.array(list_solved_columns(self.channels), dtype=np.int64)
         read, state, inner_bias, out, out_bias = (weight.detach().numpy() for weight in self.network.looped)
@@ -146,11 +146,11 @@ class ResidualTwin(GreyTwin):
         return answers, after | {"h": h}
 
     def free_run(self, commands: Tensor, measured: Tensor, port: Tensor) -> Tensor:
-        """Simulate scaled outputs ``(time, batch, answer)`` from measured starts, with gradients by the weights.
+        """Simulate scaled outputs ``(time, batch, output)`` from measured starts, with gradients by the weights.
 
         Args:
             commands: scaled ``(time, batch, command)``.
-            measured: scaled ``(time, batch, answer)``, any finite number where `port` is 0.
+            measured: scaled ``(time, batch, output)``, any finite number where `port` is 0.
             port: 1 where a port reads what was measured; all of the first tick.
         """
         network, scales = self.network, self.scales

@@ -15,7 +15,7 @@ from edp.signals import KINDS
 
 Array = NDArray[np.float32]
 FASTEST = 1.25
-"""Bound of a velocity, as a multiple of the fastest that was seen: beyond it an answer can only be wrong."""
+"""Bound of a velocity, as a multiple of the fastest that was seen: beyond it an output can only be wrong."""
 HIGHEST = 1.1
 """Bound of a pressure, as a multiple of the highest that was seen, which a relief valve set."""
 
@@ -27,11 +27,11 @@ class TwinScales:
     Attributes:
         command_offset: ``(command,)``.
         command_width: ``(command,)``, positive.
-        answer_offset: ``(answer,)``; zero for velocities, so that a scaled sign is a direction.
-        answer_width: ``(answer,)``, positive.
-        change_width: ``(answer,)``: deviation of the change from tick to tick, positive.
-        low: ``(answer,)``: least value of an answer; of a stroke the closed end stop.
-        high: ``(answer,)``: largest value; of a stroke the open end stop.
+        answer_offset: ``(output,)``; zero for velocities, so that a scaled sign is a direction.
+        answer_width: ``(output,)``, positive.
+        change_width: ``(output,)``: deviation of the change from tick to tick, positive.
+        low: ``(output,)``: least value of an output; of a stroke the closed end stop.
+        high: ``(output,)``: largest value; of a stroke the open end stop.
     """
 
     command_offset: Array

@@ -49,7 +49,7 @@ class StaticMap:
         check_count("static map", "delays", self.delays, 100, least=1)
 
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> StaticTwin:
-        """Fit by least squares; no random numbers are used."""
+        """Fit by least squares; no random values are used."""
         low = np.min([series.inputs.min(axis=0) for series in train], axis=0)
         high = np.max([series.inputs.max(axis=0) for series in train], axis=0)
         # A command that never moved has no range; its polygon is flat.
@@ -108,7 +108,7 @@ class StaticTwin(Twin):
 
         Args:
             maps: at least one.
-            weights: of each map and answer ``(map, all answers but strokes)``, their sum over maps 1.
+            weights: of each map and output ``(map, all answers but strokes)``, their sum over maps 1.
         """
         first = maps[0]
         if all(one is first for one in maps):
@@ -139,7 +139,7 @@ class StaticTwin(Twin):
             before: commands of the delay before them ``(batch, delay, command)``.
 
         Returns:
-            All answers but the strokes ``(batch, tick, answer)``, and the commands of the delay behind the last tick.
+            All outputs but the strokes ``(batch, tick, output)``, and the commands of the delay behind the last tick.
         """
         numbers, ticks = self.numbers, commands.shape[1]
         earlier = np.concatenate([before, commands], axis=1)
@@ -183,7 +183,7 @@ def polygon(commands: Array, corners: Array) -> Array:
     """How much of the way from each corner ``(knot, command)`` to the next a command has gone, 0 to 1.
 
     Shares and not distances: sums of what each of them adds have no large parts that cancel, also with weights of
-    eight bits, and a command beyond all that was seen answers what the farthest one did.
+    eight bits, and a command beyond all that was seen outputs what the farthest one did.
 
     Args:
         commands: ``(row, command)``.

@@ -3,14 +3,14 @@
 One loop over the ticks, without Python and without a graph. What does not wait is left to the caller: the commands'
 part of the gates before it, the gradients of the weights after it. Everything is in scaled numbers, float32.
 
-The cell is PyTorch's GRU with feedback ports: at each tick it reads f, measured values or the last answers, and answers
+The cell is PyTorch's GRU with feedback ports: at each tick it reads f, measured values or the last outputs, and outputs
 with f plus its change::
 
     r, k = sigmoid(a + W f + U h),  n = tanh(a + W f + r (U h + b)),  h' = n + k (h - n)
     velocity = clip(f + c o + p (m - f)),  pressure likewise,  o = V h' + d
     stroke = clip(f + trapezoid (velocity before + velocity)), and no velocity into an end stop
 
-Where a twin has a static map, m is what it says of the commands, and p the share of the way to it that an answer is
+Where a twin has a static map, m is what it says of the commands, and p the share of the way to it that an output is
 pulled in a tick; else p is zero.
 
 All compiled code of a twin is in this file, whose content is the fingerprint of the code that is kept on disk.
@@ -70,7 +70,7 @@ def gates_of(into: Array, up: Array, bias: Array, h: Array, gates: Array, inner:
 
 @compiler.compiled
 def _answer(fed: Array, change: Array, bounds: tuple[Array, ...], velocities: int, answer: Array, free: Array) -> None:
-    """Compute outputs within the bounds, and a mask of inactive bounds ``(batch, answer)``."""
+    """Compute outputs within the bounds, and a mask of inactive bounds ``(batch, output)``."""
     batch, answers = fed.shape
     _, low, high, trapezoid = bounds
     strokes = len(trapezoid)
@@ -107,15 +107,15 @@ def run_forward(
 
     Args:
         inputs: the commands' part of the gates ``(time, batch, 3 units)``, biases included; measured values ``(time,
-            batch, answer)``, any finite number where a port is free; ports of that shape, 1 where one reads what was
-            measured, 0 where it reads the last answer; and what the static map says, of that shape, empty without one.
-        weights: of feedback ``(answer, 3 units)``, of h ``(units, 3 units)``, bias of n's inner sum ``(units,)``, of
-            the answers ``(units, answer)`` and their bias ``(answer,)``, and p ``(answer,)``, zero for strokes; without
+            batch, output)``, any finite number where a port is free; ports of that shape, 1 where one reads what was
+            measured, 0 where it reads the last output; and what the static map says, of that shape, empty without one.
+        weights: of feedback ``(output, 3 units)``, of h ``(units, 3 units)``, bias of n's inner sum ``(units,)``, of
+            the outputs ``(units, output)`` and their bias ``(output,)``, and p ``(output,)``, zero for strokes; without
             a map p is empty.
-        bounds: scale of changes, low, high ``(answer,)``, and the trapezoid ``(stroke,)``.
-        velocities: number of velocities, the first answers.
-        start: last answer ``(batch, answer)`` and h ``(batch, units)``.
-        saved: written: answers, fed values, and where no bound acts, each ``(time, batch, answer)``; gates ``(time,
+        bounds: scale of changes, low, high ``(output,)``, and the trapezoid ``(stroke,)``.
+        velocities: number of velocities, the first outputs.
+        start: last output ``(batch, output)`` and h ``(batch, units)``.
+        saved: written: outputs, fed values, and where no bound acts, each ``(time, batch, output)``; gates ``(time,
             batch, 3 units)``; inner ``(time, batch, units)``; h ``(time + 1, batch, units)``.
     """
     projected, measured, port, mapped = inputs
@@ -171,15 +171,15 @@ def run_branches(
     """Simulate branches of one run in free run; the common part before each branch is computed once.
 
     Args:
-        inputs: commands in SI units ``(time, lane, command)``, and what the static map says ``(time, lane, answer)``,
+        inputs: commands in SI units ``(time, run, command)``, and what the static map says ``(time, run, output)``,
             empty without one.
-        weights: of commands in SI units and feedback ``(command + answer, 3 units)`` and bias of the gates
-            ``(3 units,)``; of h, bias of n's inner sum, of the answers, their bias, and p as in `run_forward`, those of
-            the answers already scaled; offset and width of the answers ``(answer,)``.
-        bounds: of the answers.
+        weights: of commands in SI units and feedback ``(command + output, 3 units)`` and bias of the gates
+            ``(3 units,)``; of h, bias of n's inner sum, of the outputs, their bias, and p as in `run_forward`, those of
+            the outputs already scaled; offset and width of the outputs ``(output,)``.
+        bounds: of the outputs.
         velocities: number of them.
-        start: what the ports read at the first tick ``(answer,)``, and h ``(units,)``, of all lanes.
-        first: tick at which each lane branches off lane 0 ``(lane,)``, ascending, that of lane 0 zero.
+        start: what the ports read at the first tick ``(output,)``, and h ``(units,)``, of all batch.
+        first: tick at which each lane branches off lane 0 ``(run,)``, ascending, that of lane 0 zero.
         results: written.
     """
     answers = results.outputs
@@ -239,7 +239,7 @@ def gates_back(
 
     Args:
         by_h: gradient by the next h ``(batch, units)``; written: by h, but for its part in the products.
-        from_out: gradient by the next h that its answers add.
+        from_out: gradient by the next h that its outputs add.
         gates: of the forward run; `inner` and `h` likewise.
         inner: sums of n.
         h: before.
@@ -277,15 +277,15 @@ def run_backward(
     """Compute the adjoint of `run_forward`, from the last sample to the first.
 
     Args:
-        grad_answers: gradient by the answers ``(time, batch, answer)``.
+        grad_answers: gradient by the outputs ``(time, batch, output)``.
         port: as in the forward run; `weights`, `bounds`, `velocities` and `saved` likewise.
         weights: of the cell.
-        bounds: of the answers.
+        bounds: of the outputs.
         velocities: number of them.
         saved: what the forward run wrote.
         grads: written: by the gates' pre-activations ``(time, batch, 3 units)``, by n's inner sum ``(time, batch,
-            units)``, by o ``(time, batch, answer)``; and by the start: last answer and h. The last one comes in as the
-            gradient by the final h, the one before it as that by the final answer.
+            units)``, by o ``(time, batch, output)``; and by the start: last output and h. The last one comes in as the
+            gradient by the final h, the one before it as that by the final output.
     """
     feedback_weight, h_weight, _, out_weight, _, pull = weights
     scale, _, _, trapezoid = bounds

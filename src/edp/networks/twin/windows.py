@@ -52,7 +52,7 @@ def random_windows(series: Sequence[Series], ticks: int, count: int, rng: np.ran
         series: segments, of which one at least has more than `ticks` samples.
         ticks: length of the windows.
         count: number of windows.
-        rng: random numbers.
+        rng: random values.
     """
     starts = np.array([max(part.samples - ticks, 0) for part in series])
     ends = np.cumsum(starts)

@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 JOINTS = ("boom", "arm", "bucket")
 FRAMES_PER_S = 25.0
 LONGEST_S = 600.0
-"""Longest stretch on one page; longer ones would make it slow to open."""
+"""Longest segment on one page; longer ones would make it slow to open."""
 OUTSIDE = 0.03
 """How far (m) beyond its stops a stroke may be logged: stops give way, and sensors err."""
 
@@ -99,7 +99,7 @@ def scene_of(
 
     Raises:
         DataError: neither angles nor strokes, or strokes that this machine does not have.
-        ConfigError: a machine is needed and not known, or the stretch lies outside the recording.
+        ConfigError: a machine is needed and not known, or the segment lies outside the recording.
     """
     # The simulator brings Numba, a second of every command that writes a page of another kind.
     from edp.sim import load_machine

@@ -108,7 +108,7 @@ class Page:
     Attributes:
         title: subject of the page, such as the name of a run.
         kind: kind of page, in words, for the title of the window.
-        about: further facts above the headline.
+        about: further data above the headline.
         headline: the result in a sentence.
         verdict: sentences below the headline.
         tiles: value, unit and meaning of each key figure.

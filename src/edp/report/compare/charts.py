@@ -31,7 +31,7 @@ MAX_ROWS = 40
 
 
 def compare_charts(comparison: Comparison) -> list[Chart]:
-    """Return the charts for which facts are present."""
+    """Return the charts for which data are present."""
     makers = (change_chart, horizon_chart, recording_chart, learning_chart, cost_chart)
     return [chart for chart in (maker(comparison) for maker in makers) if chart is not None]
 

@@ -130,14 +130,14 @@ class Comparison:
 
 
 def compare_runs(folders: Sequence[str | Path]) -> Comparison:
-    """Compare judged runs on their common recordings and measures.
+    """Compare evaluated runs on their common recordings and measures.
 
     Args:
         folders: run folders; the others are measured against the first.
 
     Raises:
         ConfigError: too few, too many, or one twice.
-        StorageError: a folder holds no judged run, or something damaged.
+        StorageError: a folder holds no evaluated run, or something damaged.
         DataError: twins beside networks, no common recording or error, or recordings of one name that differ.
     """
     runs = read_runs(folders)
@@ -209,7 +209,7 @@ def _enough(change: Array, over: str) -> bool:
 
 
 def _blocks(first: ComparedRun, second: ComparedRun, measure: Measure, names: Sequence[str]) -> NDArray[np.float64]:
-    """Return differences of the mean absolute error ``(block,)`` in stretches of `BLOCK_S` of common predictions."""
+    """Return differences of the mean absolute error ``(block,)`` in segments of `BLOCK_S` of common predictions."""
     if first.kind == FREE or first.rate_hz != second.rate_hz or not first.rate_hz:
         return np.empty(0)
     length = max(round(BLOCK_S * first.rate_hz), 1)

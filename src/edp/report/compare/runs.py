@@ -112,7 +112,7 @@ def read_runs(folders: Sequence[str | Path]) -> list[ComparedRun]:
 
     Raises:
         ConfigError: fewer than two, more than `MAX_RUNS`, or one twice.
-        StorageError: a folder holds no judged run, or something damaged.
+        StorageError: a folder holds no evaluated run, or something damaged.
         DataError: some of them look ahead and others run free.
     """
     paths = [Path(folder) for folder in folders]

@@ -59,7 +59,7 @@ def recordings_table(quality: DataQuality) -> Table:
 
 
 def channels_table(quality: DataQuality) -> Table:
-    """Return the sensor facts of each channel, the worst over all recordings."""
+    """Return the sensor data of each channel, the worst over all recordings."""
     columns = (
         Column("Channel"),
         Column("Unit"),

@@ -61,7 +61,7 @@ class FleetFacts:
         unit: unit of errors.
         ahead_ms: time that is looked ahead.
         rows: machines, the worst first.
-        failed: machines that could not be judged, and why.
+        failed: machines that could not be evaluated, and why.
         report: content of ``fleet_report.json``.
     """
 
@@ -74,7 +74,7 @@ class FleetFacts:
 
     @property
     def median(self) -> float:
-        """Return the median error of the machines; NaN if none was judged."""
+        """Return the median error of the machines; NaN if none was evaluated."""
         return float(np.median([row.mae for row in self.rows])) if self.rows else float("nan")
 
 
@@ -232,5 +232,5 @@ def machine_table(facts: FleetFacts) -> Table:
 
 
 def tabulate_failures(facts: FleetFacts) -> Table:
-    """Return the machines without a judgement, with the reasons."""
+    """Return the machines without an evaluation, with the reasons."""
     return Table("Machines that could not be judged", (Column("Machine"), Column("Why", is_text=True)), facts.failed)

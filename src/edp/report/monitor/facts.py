@@ -21,7 +21,7 @@ MAX_ALARMS = 40
 """With evidence each on a page, alarms that say the same as one; all of them stand in the log."""
 MAX_CAUSES = 5
 MAX_ENTRIES = 64
-"""Maximum number of causes, and of pieces of evidence, per alarm."""
+"""Maximum number of causes, and of segments of evidence, per alarm."""
 MAX_SILENT = 6
 MAX_REMARKS = 6
 OUTSIDE = "no alarm, but "

@@ -74,7 +74,7 @@ def prediction_figure(lines: Sequence[BandLine], rate_hz: float, title: str) -> 
 
 
 def score_figure(facts: Facts) -> go.Figure:
-    """Return the root-mean-square error of every judged model, against the horizon if there are several."""
+    """Return the root-mean-square error of every evaluated model, against the horizon if there are several."""
     chart = horizon_chart(facts)
     if chart is None:
         raise ConfigError("there are no scores to draw; judge the predictor first")
@@ -82,7 +82,7 @@ def score_figure(facts: Facts) -> go.Figure:
 
 
 def study_figure(study: StudyFile, name: str | None = None) -> go.Figure:
-    """Return a figure of a study by name; the default is the first one with facts.
+    """Return a figure of a study by name; the default is the first one with data.
 
     Raises:
         ConfigError: there is no such figure, or no phase is decided yet.

@@ -79,7 +79,7 @@ def _break_words(words: Sequence[str], width: int) -> list[str]:
 
 
 def score_tables(facts: Facts) -> list[Table]:
-    """Return one table per horizon: every judged model, the best first."""
+    """Return one table per horizon: every evaluated model, the best first."""
     return comparison_tables(facts)
 
 

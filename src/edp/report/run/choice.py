@@ -1,4 +1,4 @@
-"""Choice of `edp train --preset auto`: promised error on left-out data and error on the test recordings."""
+"""Choice of `edp train --preset auto`: expected error on left-out data and error on the test recordings."""
 
 from __future__ import annotations
 
@@ -184,8 +184,8 @@ def candidates_table(choice: AutoChoice) -> Table:
 def model_tables(facts: Facts, choice: AutoChoice) -> list[Table]:
     """Return one table per output: every candidate and baseline, on left-out data and on the test recordings.
 
-    A candidate's error on left-out data is its cross-validated promise, a baseline's is that on the validation part,
-    which also chose its sizes. Only the model that is kept has met the test recordings.
+    A candidate's error on left-out data is its cross-validated expected error, a baseline's is that on the validation
+    part, which also chose its sizes. Only the model that is kept has met the test recordings.
     """
     return [table for table in (_tabulate_output(facts, choice, target) for target in facts.targets) if table.rows]
 
@@ -226,7 +226,7 @@ def _tabulate_output(facts: Facts, choice: AutoChoice, target: ScoredTarget) -> 
 
 
 def promise_table(facts: Facts, choice: AutoChoice) -> Table | None:
-    """Return promised and test errors by output and horizon, each with that of a simple model."""
+    """Return expected and test errors by output and horizon, each with that of a simple model."""
     promised, unknown = choice.candidates[choice.chosen].promise, ErrorBounds(low={}, high={})
     interval = choice.interval or unknown
     skill = choice.skill or Skill(against=FLOOR, promise={}, interval=unknown)
@@ -273,7 +273,7 @@ def promise_table(facts: Facts, choice: AutoChoice) -> Table | None:
 
 
 def promise_line(choice: AutoChoice) -> str:
-    """State the promise against the errors on the test recordings; empty before they were judged."""
+    """State the expected error against the errors on the test recordings; empty before they were evaluated."""
     tested = choice.results[NETWORK].test if NETWORK in choice.results else {}
     skill = choice.skill
     if choice.interval is None or not tested:

@@ -28,7 +28,7 @@ class Line:
 
     Attributes:
         horizon: Samples ahead; None for the truth, which every horizon shares.
-        target: Place of the output among the facts' targets.
+        target: Place of the output among the data' targets.
         x: (point,) seconds, or samples where the rate is unknown.
         y: (point,) report units; NaN breaks the line.
         start: First sample and `step`: set instead of `x` where every sample is shown.
@@ -92,11 +92,11 @@ def downsample(y: Array, points: int) -> NDArray[np.intp]:
 
 
 def busiest_start(truth: Array, length: int) -> int:
-    """Return the first sample of the stretch of `length` samples with the largest movement of the outputs.
+    """Return the first sample of the segment of `length` samples with the largest movement of the outputs.
 
     Args:
         truth: (time, target); each output counts in units of its own standard deviation.
-        length: Samples in the stretch.
+        length: Samples in the segment.
     """
     if len(truth) <= length:
         return 0
@@ -108,7 +108,7 @@ def busiest_start(truth: Array, length: int) -> int:
 
 
 def prediction_lines(facts: Facts, budget: int = POINT_BUDGET) -> list[Line]:
-    """Return truth and predictions of a few recordings: each whole, downsampled, and its busiest stretch in full.
+    """Return truth and predictions of a few recordings: each whole, downsampled, and its busiest segment in full.
 
     All traces together hold about `budget` points, so that the page stays small whatever the run holds.
     """

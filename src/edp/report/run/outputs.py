@@ -40,7 +40,7 @@ def losses_line(scores: ScoresFile) -> str:
 
 
 def describe_evaluation(scores: ScoresFile, provenance: Provenance | None) -> str:
-    """Name the judged logs, with a warning if they are few or of one kind; empty if the scores name none.
+    """Name the evaluated logs, with a warning if they are few or of one kind; empty if the scores name none.
 
     Args:
         scores: the content of ``scores.json``.
@@ -69,7 +69,7 @@ def minutes_of(folder: Path) -> float | None:
 
 
 def situation_line(scores: ScoresFile) -> str:
-    """State how the situation of the judged recordings differs from training; empty without a difference."""
+    """State how the situation of the evaluated recordings differs from training; empty without a difference."""
     situation = scores.situation or DataSituation(outside=(), changes=())
     most = sorted(situation.changes, key=lambda row: abs(math.log(row.ratio)))
     changes = {row.target: row for row in most}  # of each target the horizon that differs most

@@ -169,7 +169,7 @@ def _strongest(screening: ScreeningResult, channel: str) -> LagCurve | None:
 
 
 def stability_views(screening: ScreeningResult) -> tuple[BarView, ...]:
-    """Return for each metric and target the channels with the largest mean over pieces; bars span one deviation."""
+    """Return for each metric and target the channels with the largest mean over segments; bars span one deviation."""
     views = []
     for metric, title in METRICS.items():
         for target in screening.targets:

@@ -47,7 +47,7 @@ from edp.wording import decimals_for, number
 
 
 def study_charts(study: StudyFile) -> list[Chart]:
-    """Return the figures for which there are facts."""
+    """Return the figures for which there are data."""
     views = forests(study)
     charts = [
         variance_chart(arm_views(study), study.unit),

@@ -1,4 +1,4 @@
-"""Access of pages, pictures and tables to the facts of a model search (`edp.evaluation.study`)."""
+"""Access of pages, pictures and tables to the data of a model search (`edp.evaluation.study`)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Absent = TypeVar("Absent")
 def require_phase(
     kind: type[Facts], absent: Absent
 ) -> Callable[[Callable[[StudyFile, Facts], Made]], Callable[[StudyFile], Made | Absent]]:
-    """Make a function of a study from one of a study and a phase's facts; it returns `absent` before the decision."""
+    """Make a function of a study from one of a study and a phase's data; it returns `absent` before the decision."""
 
     def wrap(function: Callable[[StudyFile, Facts], Made]) -> Callable[[StudyFile], Made | Absent]:
         @wraps(function)

@@ -19,7 +19,7 @@ from edp.wording import count_text, duration, moment, number, percent
 
 
 def study_tables(study: StudyFile) -> dict[str, Table]:
-    """Return the tables for which there are facts, by name."""
+    """Return the tables for which there are data, by name."""
     tables = (
         variance_table(study),
         features_table(study),

@@ -74,7 +74,7 @@ def titled(backbone: str) -> str:
 
 @dataclass(frozen=True)
 class PointView:
-    """Network of phase 1, 4 or 5; all are judged on the same folds with the same seeds.
+    """Network of phase 1, 4 or 5; all are evaluated on the same folds with the same seeds.
 
     Attributes:
         group: phase and, in phase 1, backbone.

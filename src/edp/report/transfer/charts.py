@@ -118,7 +118,7 @@ def error_chart(facts: Transfer, methods: Sequence[str]) -> Chart:
 
 
 def method_chart(facts: Transfer) -> Chart:
-    """Return the MAE of every method by target, in each judged domain."""
+    """Return the MAE of every method by target, in each evaluated domain."""
     panels = []
     for domain in facts.domains:
         marks: list[Mark] = []

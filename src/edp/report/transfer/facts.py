@@ -68,7 +68,7 @@ class Transfer:
 
     @property
     def domains(self) -> list[str]:
-        """Return the judged domains: the target, and the source if its recordings are available."""
+        """Return the evaluated domains: the target, and the source if its recordings are available."""
         return list(self.methods[self.content.method].domains)
 
     def score(self, method: str, horizon: str, target: str = MEAN, domain: str = TARGET) -> Metrics:
@@ -145,7 +145,7 @@ def pair_table(facts: Transfer, horizon: str) -> Table:
 
 
 def method_table(facts: Transfer, horizon: str) -> Table:
-    """Return all methods on the same ticks, sorted by error, in each judged domain."""
+    """Return all methods on the same ticks, sorted by error, in each evaluated domain."""
     direct = facts.mae(facts.content.before, horizon)
     both = SOURCE in facts.domains
     rows: list[tuple[Value, ...]] = []

@@ -52,7 +52,7 @@ def twin_charts(facts: FreeRunFacts) -> list[Chart]:
 
 
 def runs_chart(facts: FreeRunFacts, part: str) -> Chart:
-    """Return measured channels and the twin's answers with their intervals; one row per channel of a part."""
+    """Return measured channels and the twin's outputs with their intervals; one row per channel of a part."""
     seconds, half = facts.shown["seconds"], facts.shown.get("half_width")
     # Shown runs are thinned out evenly, so a start and a step are all that a line needs.
     time_s = Evenly(round(float(seconds[0]), 6), round(float((seconds[-1] - seconds[0]) / (len(seconds) - 1)), 6))
@@ -114,7 +114,7 @@ def horizon_chart(facts: FreeRunFacts) -> Chart:
 
 
 def steps_chart(steps: StepResponses) -> Chart | None:
-    """Return the response of each answer to a step of the chosen command; None without steps."""
+    """Return the response of each output to a step of the chosen command; None without steps."""
     if not steps.steps:
         return None
     seconds, panels = steps.seconds, []
@@ -143,7 +143,7 @@ def write_rollout_plots(rollout: Recording, suffix: str, start_s: float, folder:
     """Write ``velocities``, ``strokes`` and ``pressures`` as SVG and PNG, a row for each channel.
 
     Args:
-        rollout: measured channels, answers under the same names with `suffix` behind, and the ends of their intervals
+        rollout: measured channels, outputs under the same names with `suffix` behind, and the ends of their intervals
             with ``_low`` and ``_high`` behind that, where there are some.
         suffix: suffix of the names of outputs.
         start_s: time of the log at the first row.

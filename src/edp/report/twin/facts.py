@@ -1,4 +1,4 @@
-"""Judgement of a twin as tables, key figures and sentences; kinds of channels stay apart."""
+"""Evaluation of a twin as tables, key figures and sentences; kinds of channels stay apart."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class FreeRunFacts:
     Attributes:
         title: title of the page.
         content: content of the file.
-        shown: ``seconds``, ``half_width`` where known, and ``NAME/answers``, ``NAME/truth`` ``(tick, answer)``, SI.
+        shown: ``seconds``, ``half_width`` where known, and ``NAME/answers``, ``NAME/truth`` ``(tick, output)``, SI.
         provenance: provenance of the twin; empty if unknown.
         candidates: formulations that it was chosen among, see `read_candidates`; empty where it was not chosen.
         steps: responses to steps of its commands, see `read_steps`; None where they are not at hand.
@@ -66,7 +66,7 @@ class FreeRunFacts:
 
     @property
     def models(self) -> Mapping[str, FreeRunScores]:
-        """Return the scores of the twin, followed by those of its floors."""
+        """Return the scores of the twin, followed by those of its baselines."""
         return self.content.models
 
     @property
@@ -80,7 +80,7 @@ class FreeRunFacts:
         return channels
 
     def columns(self, part: str) -> range:
-        """Return the columns of a part in arrays of all answers."""
+        """Return the columns of a part in arrays of all outputs."""
         first = sum(len(self.channels(earlier)) for earlier in PARTS[: PARTS.index(part)])
         return range(first, first + len(self.channels(part)))
 
@@ -91,7 +91,7 @@ class FreeRunFacts:
 
 
 def holds_free_runs(folder: str | Path) -> bool:
-    """Test whether a folder is the run of a twin, or a folder in it with the judgement of other recordings."""
+    """Test whether a folder is the run of a twin, or a folder in it with the evaluation of other recordings."""
     return any(is_file_at(Path(folder) / name) for name in (FreeRunFile.NAME, "twin/twin.json"))
 
 
@@ -139,7 +139,7 @@ def read_steps(folder: Path) -> StepResponses | None:
 
 
 def headline(facts: FreeRunFacts) -> str:
-    """State the error of the strokes at the end of the runs; of the answers if they have no unit."""
+    """State the error of the strokes at the end of the runs; of the outputs if they have no unit."""
     judged = twin_verdict(facts.models)
     figures = _figures(facts)
     return figures if judged is None else judged.headline(figures)
@@ -158,14 +158,14 @@ def _figures(facts: FreeRunFacts) -> str:
 
 
 def _plain_answers(facts: FreeRunFacts) -> str:
-    """Return the names of answers without a unit, whose integral is no stroke; empty if answers have units."""
+    """Return the names of outputs without a unit, whose integral is no stroke; empty if outputs have units."""
     if facts.twin.velocity_mae.unit != PLAIN_UNIT or facts.twin.velocity_mae.mean is None:
         return ""
     return listed(short_labels(channel.name for channel in facts.channels("velocities")))
 
 
 def verdict(facts: FreeRunFacts) -> list[str]:
-    """Describe the runs and the errors of the floors."""
+    """Describe the runs and the errors of the baselines."""
     twin = facts.twin
     lines = [
         f"{count_of(twin.runs, 'free run')} of {figure(twin.seconds)} s in "

@@ -154,7 +154,7 @@ class ExcavatorEnv(SingleEnvironment):
         return self._batch.observation(0)
 
     def branch(self, seed: int) -> None:
-        """Give sensors and soil new random numbers from now on; the present state stays.
+        """Give sensors and soil new random values from now on; the present state stays.
 
         Raises:
             ConfigError: no episode has begun.

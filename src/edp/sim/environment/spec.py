@@ -24,7 +24,7 @@ OBSERVED = (*TABLE_A1, "CylStroke_1", "CylStroke_2", "CylStroke_3")
 """What is shown unless told otherwise: Table A.1, and the strokes, which have no model of a sensor."""
 MAX_LATENCY = 1000
 MAX_SAMPLES = 10_000_000
-"""Of an episode: its random numbers are drawn at reset, 152 bytes a tick."""
+"""Of an episode: its random values are drawn at reset, 152 bytes a tick."""
 
 
 @dataclass(frozen=True)

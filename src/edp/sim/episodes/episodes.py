@@ -176,7 +176,7 @@ class Episodes:
         ended[index] = self.ended(index)
 
     def redraw(self, index: int, seed: np.random.SeedSequence) -> None:
-        """Draw new random numbers of sensors and soil from now on; the present observation and soil contact stay."""
+        """Draw new random values of sensors and soil from now on; the present observation and soil contact stay."""
         start = self.starts[index]
         if start is None:
             raise ConfigError(f"episode {index} has not begun; reset it first")
@@ -248,7 +248,7 @@ def _shares_of(plans: Sequence[tuple[tuple[FaultSpec, ...], float]], ticks: NDAr
 
 
 def _sensor_draws(start: EpisodeStart, noise: np.random.SeedSequence, chance: np.random.SeedSequence) -> Array:
-    """Return the random numbers of the sensors of an episode and of their faults, shape (samples, columns)."""
+    """Return the random values of the sensors of an episode and of their faults, shape (samples, columns)."""
     scenario = start.scenario
     rng = np.random.default_rng(noise) if scenario.sensor_noise else None
     healthy = draws.draw(start.machine, scenario.samples, scenario.rate_hz, rng)

@@ -32,7 +32,7 @@ class Aprbs(Excitation):
     CHIRP_SHARE = 0.35
     """Fraction of the time with chirps; more of it made the commands no flatter (findings)."""
     PIECE_S = 0.1
-    """A chirp is given in such pieces, since its sign must turn soon after a cylinder nears an end."""
+    """A chirp is given in such segments, since its sign must turn soon after a cylinder nears an end."""
     TURN = (0.22, 0.78)
     """Shares of the stroke at which a chirp turns."""
 

@@ -47,7 +47,7 @@ class Excitation:
     def redraw(self, unused: int) -> None:
         """Discard the last `unused` samples of the latest block, and redraw the duration of the present action.
 
-        A branch of the future calls this: what the operator does now stays, for how much longer is drawn anew from
+        A branch of the future calls this: what the operator does now stays, for how much longer is drawn again from
         what the time held so far leaves possible.
         """
 

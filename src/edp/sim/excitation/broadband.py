@@ -14,7 +14,7 @@ class Broadband(Excitation):
     """Multisine on all levers at once with equal amplitudes from `LOW_HZ` to `HIGH_HZ` and independent phases.
 
     A course lasts `COURSE_S`, in which every sine completes whole periods; phases, sizes and the pose that the levers
-    lean to are then drawn anew. Of `DRAWS` draws of phases that with the least peak is taken, so that most of the
+    lean to are then drawn again. Of `DRAWS` draws of phases that with the least peak is taken, so that most of the
     lever's range is used by power and not by rare peaks (Pintelon and Schoukens, System Identification, 2.3).
     """
 

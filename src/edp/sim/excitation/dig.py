@@ -22,9 +22,9 @@ class Dig(Tracked):
     """Dig cycles in four phases, closed loop on depth; without swing, dumped where the bucket was lifted.
 
     The operator lowers the open bucket to the surface and below it, drags it towards the machine at a chosen depth
-    while closing it somewhat, curls and lifts, stretches out and dumps, and returns. Where the drag stalls the
+    while closing it somewhat, curls and lifts, reaches out and dumps, and returns. Where the drag stalls the
     bucket is raised, as an operator does; a full bucket ends it. Without ground the same is mimed over a surface
-    that is drawn anew for each cycle.
+    that is drawn again for each cycle.
     """
 
     works_ground = True

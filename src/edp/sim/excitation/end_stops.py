@@ -16,7 +16,7 @@ class EndStops(Excitation):
     """Runs one cylinder into its cushion and stop, holds it there, and lets the others move in between."""
 
     STRETCH_S = 0.4
-    """A push is given in stretches, so that the end is noticed soon after it is reached."""
+    """A push is given in segments, so that the end is noticed soon after it is reached."""
     HOLD_S = (0.5, 1.0)
     MAX_STRETCHES = 13
     """Pushes (5.2 s) after which a cylinder that does not reach its end is left alone."""

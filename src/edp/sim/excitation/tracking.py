@@ -41,7 +41,7 @@ class Tracked(Excitation):
     REST_SPEED = 0.004
     """Wanted speeds below this (m/s) leave the lever centred."""
     WAITS_BEHIND = 0.12
-    """Stroke error (m) at which the reference stands still."""
+    """Stroke error (m) at which the reference does not move."""
     PATIENCE_S = 1.5
     """A leg that is blocked for so long is given up: the boom is raised instead."""
     RESCUE = 0.15

@@ -142,7 +142,7 @@ class SensorFault(FaultKind):
     Attributes:
         operation: operation on the value, one of `edp.sim.sensors.alterations`.
         channels: affected channels by site, as indices of `edp.sim.sensors.chain.SENSED`; for noise, columns of the
-            random numbers. The site is empty for kinds without sites.
+            random values. The site is empty for kinds without sites.
     """
 
     operation: int

@@ -158,10 +158,10 @@ class SensorCourse:
         self.table = np.array(rows, dtype=float).reshape(len(rows), alterations.COLUMNS)
 
     def drawn(self, healthy: Array, rate_hz: float, chance: np.random.Generator) -> Array:
-        """Return the random numbers of a recording with the faults' noise, then one column per row of the table.
+        """Return the random values of a recording with the faults' noise, then one column per row of the table.
 
         Args:
-            healthy: random numbers of `edp.sim.sensors.draws.draw`, shape (time, draws).
+            healthy: random values of `edp.sim.sensors.draws.draw`, shape (time, draws).
             rate_hz: sample rate.
             chance: random generator of the faults.
         """

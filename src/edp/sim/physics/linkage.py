@@ -88,7 +88,7 @@ def _tabulate(psi: Array, selected: NDArray[np.bool_], plant: Array, length: Arr
 def bucket_branch(closed: float, full: float, plant: Array) -> tuple[Array, Array]:
     """Return angles (rad, rising) and lengths (m, falling) of the working range of the bucket cylinder.
 
-    Of all stretches of angles on which the linkage closes and the cylinder shortens as the angle grows, the one that
+    Of all segments of angles on which the linkage closes and the cylinder shortens as the angle grows, the one that
     covers most of the lengths from `closed` to `full`; empty when there is none.
     """
     # One full turn in steps of 0.2 deg.

@@ -142,7 +142,7 @@ class Plant:
         step_s: integration step; a whole number of them must fill a sample.
         ground: ground that the bucket digs in; None in free air.
         spare_s: dead time that may be added while it runs, s.
-        moves: whether swing and travel move, too; without them both stand still and take no oil.
+        moves: whether swing and travel move, too; without them both do not move and take no oil.
 
     Raises:
         ConfigError: the step does not divide the sample time, or the machine has no motors that could move.
@@ -261,7 +261,7 @@ class Plant:
     def place(self, strokes: Array, velocities: Array, pressures: Array) -> None:
         """Set cylinders and oil to measured values; valves, displacements and friction keep their state.
 
-        Oil in long lines begins at rest, at the chambers' pressures.
+        Oil in long lines begins in steady state, at the chambers' pressures.
 
         Args:
             strokes: m, shape (3,); held within the stroke.
@@ -298,7 +298,7 @@ class Plant:
         return self._advance_samples(demands, self.motors.demands_of(others, hand_s))
 
     def _advance_samples(self, demands: Array, motor_demands: Array | None = None) -> Array:
-        """Run with demands appended to the past ones; without motor demands swing and travel stand still."""
+        """Run with demands appended to the past ones; without motor demands swing and travel do not move."""
         setup = (self.axes, self.plant, self.work, self._ground)
         samples = len(demands) - self._past
         log = np.empty((samples, at.LOG_COLUMNS if self.ground is None else at.LOG_GROUND + at.GROUND_POINTS))

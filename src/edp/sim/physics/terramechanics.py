@@ -352,7 +352,7 @@ def torques(c: Array, w1: float, w2: float, w3: float) -> tuple[float, float, fl
 def hold(w1: float, w2: float, w3: float, c: Array) -> None:
     """Turn forces of a size into dampers for one step, from the velocities at its beginning.
 
-    Force over speed stands still within a step: both stages of the integrator see the linear damper that its
+    Force over speed does not move within a step: both stages of the integrator see the linear damper that its
     Jacobian knows. A force that keeps its size while the velocity turns round is what ROS2 would amplify, by 2.4 a
     step where soil is stiff against the mass of the bucket.
     """

@@ -160,7 +160,7 @@ def sense(
 ) -> None:
     """Write the 24 signals of Table A.1 and the additional observed values at one sample to `out`, shape (SENSED,).
 
-    Ticks must be taken in order from 0, which starts everything at rest.
+    Ticks must be taken in order from 0, which starts everything in steady state.
 
     Args:
         sample: the tick's row of the log, shape (1, columns).

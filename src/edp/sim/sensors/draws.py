@@ -46,7 +46,7 @@ def instance_of(machine: Machine) -> Instance:
 
 
 def draw(machine: Machine, samples: int, rate_hz: float, rng: np.random.Generator | None) -> Array:
-    """Return the random numbers of a recording, shape (samples, chain.DRAWS); zeros without `rng`.
+    """Return the random values of a recording, shape (samples, chain.DRAWS); zeros without `rng`.
 
     Args:
         machine: machine with the ``[sensors]`` to use.
@@ -89,7 +89,7 @@ def depth(drawn: Array) -> int:
 
 
 def _bus(machine: Machine, samples: int, rate_hz: float, rng: np.random.Generator) -> list[can.Frames]:
-    """Return the frames of each of `ECUS`, with independent random numbers."""
+    """Return the frames of each of `ECUS`, with independent random values."""
     own, instance = machine.sensors, instance_of(machine)
     bus = can.Bus(own.can_period, own.can_latency, own.can_jitter, own.can_loss)
     # A generator each: what one ECU draws does not move the noise of the others.

@@ -55,6 +55,6 @@ def derivative_numbers(bandwidth_hz: float, rate_hz: float) -> Array:
 def filtered_derivative(values: Array, bandwidth_hz: float, rate_hz: float) -> Array:
     """Causal derivative along time by the filter of `derivative_numbers`, shape ``(time, channel)``.
 
-    The filter starts at rest at the first value.
+    The filter starts in steady state at the first value.
     """
     return lfilter(derivative_numbers(bandwidth_hz, rate_hz), values - values[:1])

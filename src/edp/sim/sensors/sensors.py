@@ -56,7 +56,7 @@ def observe_signals(
         machine: machine with the ``[sensors]`` to use.
         rate_hz: rate of the log.
         noisy: False for the truth.
-        drawn: random numbers of `draws.draw`, followed by one column per fault.
+        drawn: random values of `draws.draw`, followed by one column per fault.
         oil_temperature: oil temperature, K, shape (time,).
         faults: sensor faults, one row each; see `edp.sim.sensors.alterations`.
     """

@@ -1,7 +1,7 @@
 """The ledger of trainings: one checksummed record a training, found by the content of what decides its result.
 
 A training is never done twice, whatever is killed: a record is whole or absent, damaged ones are set apart and trained
-again, and a search that starts anew reads here what was done.
+again, and a search that starts again reads here what was done.
 """
 
 from edp.storage.ledger.claims import Claim, claim, known, leave_arrival

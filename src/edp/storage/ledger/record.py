@@ -111,7 +111,7 @@ class TrainingIdentity:
         job: the function that trains, as ``package.module:name``.
         config: settings of network, task and training.
         split: recordings for training, validation and scores.
-        seed: seed of all random numbers.
+        seed: seed of all random values.
         epochs: number of epochs; a rung of a race is a separate training.
         code: see `code_version`.
         data: hash of the recordings.

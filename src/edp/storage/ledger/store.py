@@ -258,7 +258,7 @@ class Ledger:
 
         Args:
             name: name of the sealed test set.
-            judged: keys of what is judged on it.
+            judged: keys of what is evaluated on it.
             why: a sentence for the report.
             again: allow a further opening for other models; it is recorded and weakens what the set can show.
 

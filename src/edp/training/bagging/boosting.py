@@ -32,7 +32,7 @@ GRID = 2.0**-12
 threshold comes to lie between them, where single precision on another machine could go to the other side."""
 
 PENALTY = 1.0
-"""Rows of zero that each leaf counts besides its own, as in the baseline; its effect alone was not measured."""
+"""Rows of zero that each leaf counts in addition to its own, as in the baseline; its effect alone was not measured."""
 
 
 @dataclass(frozen=True, eq=False)

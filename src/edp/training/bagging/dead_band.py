@@ -1,7 +1,8 @@
 """Dead band of predictions: threshold below which a prediction counts as zero, chosen on left-out rows.
 
-A least-squares model says of a machine at rest what will be on average: a little more than nothing, where sensors count
-in steps and mostly nothing happens. Its squared error is least, its absolute error is larger than that of 'no change'.
+A least-squares model says of a machine in steady state what will be on average: a little more than nothing, where
+sensors count in steps and mostly nothing happens. Its squared error is least, its absolute error is larger than that of
+'no change'.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from edp.data.lags import DoubleArray
 WIDTHS = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.56)
 """To choose from, in standard deviations of the change."""
 PRICE = 20.0
-"""Per cent of absolute error that a per cent of root-mean-square error must buy: squared errors are what is promised
+"""Per cent of absolute error that a per cent of root-mean-square error must buy: squared errors are what is expected
 and compared, so that they may hardly rise."""
 DEAREST = 1.003
 """Root-mean-square error, over that without a band, that is never exceeded."""
@@ -34,7 +35,7 @@ def dead_bands(predicted: DoubleArray, truth: DoubleArray, owner: NDArray[np.int
         predicted: predictions of left-out rows, standardised, ``(row, output)``.
         truth: measured changes, same shape; zero is no change.
         owner: the fold that left out each row, ``(row,)``. A band must lower the absolute error of every fold: the gain
-            of one stretch may be chance.
+            of one segment may be chance.
     """
     each = zip(predicted.T, truth.T, strict=True)
     return np.array([_dead_band(values, changes, owner) for values, changes in each])

@@ -34,7 +34,7 @@ class BaggingSpec:
         tree_models: models of each output that share its trees: of what the linear model leaves, of the target by few
             columns (present values and changes over powers of two ticks), of the target by all columns.
         tree_folds: parts that trees leave out, each a run of neighbouring folds; fewer parts than `folds` take less
-            time, for trees are grown anew for each.
+            time, for trees are grown again for each.
         tree_rows: rows that trees are grown on at most, drawn at random.
 
     Raises:

@@ -22,8 +22,8 @@ def stacking_weights(
 ) -> DoubleArray:
     """Non-negative weight of each model in the sum, ``(model, output)``.
 
-    Whether an output has further models is judged by weights that left out one more fold: all folds' weights have seen
-    the rows that they would be judged by.
+    Whether an output has further models is evaluated by weights that left out one more fold: all folds' weights have
+    seen the rows that they would be evaluated by.
 
     Args:
         models: addition of each model to the linear prediction of left-out rows, ``(row, output)`` each.
@@ -48,7 +48,7 @@ def _weights(columns: DoubleArray, truth: DoubleArray, owner: NDArray[np.int64])
     """Non-negative least squares, in which a fold counts by the root of the mean square that its best model leaves.
 
     With squares alone the fold with the liveliest motion would choose. Over eight sets of recordings weights that did
-    not see the fold they are judged by have 0.8 % less error this way, 2 % less in the mean over folds.
+    not see the fold they are evaluated by have 0.8 % less error this way, 2 % less in the mean over folds.
     """
     # Here, since every command that trains imports this module, and scipy.optimize takes a second.
     from scipy.optimize import nnls

@@ -22,7 +22,7 @@ from edp.training.bagging.spec import BaggingSpec
 from edp.training.validation import standard_targets
 
 PIECE = 4096
-"""Ticks of a stretch that go through the front end in one call."""
+"""Ticks of a segment that go through the front end in one call."""
 FLOAT, DOUBLE = 4, 8
 PRESENT_BEYOND, CHANGE_BEYOND = 1.0, 10.0
 """How far beyond what trained a column may go, in ranges of it. A position or temperature that leaves its range by more
@@ -42,7 +42,7 @@ class BaggingTable:
         targets: standardised, ``(row, output)``; outputs are horizons times targets.
         folds: who is left out when.
         stride: ticks from row to row.
-        starts: first row of each stretch, those of the training part first, and the tick that it stands for.
+        starts: first row of each segment, those of the training part first, and the tick that it stands for.
     """
 
     columns: NDArray[np.float32]
@@ -68,7 +68,7 @@ class BaggingTable:
 
 
 def committee_of(net: Predictor) -> Committee:
-    """Return the backbone of a network trained on folds.
+    """Return the backbone of a network trained with cross-validation folds.
 
     Raises:
         TypeError: it is another one; `check_training` refuses this before.
@@ -83,7 +83,7 @@ def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> BaggingTable:
 
     Raises:
         ConfigError: more rows than the memory takes.
-        DataError: no stretch is longer than the largest horizon.
+        DataError: no segment is longer than the largest horizon.
     """
     reach = data.task.max_horizon
     stretches = [part for part in (*data.train, *data.validation) if part.samples > reach]
@@ -176,8 +176,8 @@ def bank_rows(net: Predictor, part: Series, chosen: range | None = None) -> NDAr
 
     Args:
         net: network with a committee.
-        part: the stretch.
-        chosen: rows that are wanted; all where it is None. Of a long stretch all would fill the memory.
+        part: the segment.
+        chosen: rows that are wanted; all where it is None. Of a long segment all would fill the memory.
     """
     chosen_rows = range(part.samples) if chosen is None else chosen
     bank = committee_of(net).bank

@@ -48,7 +48,7 @@ class Components:
 def hint_error(hidden: Tensor, teacher_components: Tensor, valid: Tensor) -> Tensor:
     """Return the mean square residual of the best linear map from the student's hidden features to the wanted ones.
 
-    The map (ridge regression with a constant) is found anew in each batch and held fixed for the gradient, which is
+    The map (ridge regression with a constant) is found again in each batch and held fixed for the gradient, which is
     then that of the error with the best map; it adds nothing to train or to store. Zero where fewer than four ticks a
     feature count.
 

@@ -43,7 +43,7 @@ them."""
 RATE, RISE, DECAY = 6e-3, 0.1, 1e-4
 """Largest learning rate of SOAP, the share of the updates over which it rises, and its weight decay: there is no noise
 that weights should be held down for. On left-out rows the students of the EMPS axis came nearer to their teacher in
-2,000 of its updates than in 4,000 of AdamW at 3e-3, 0.58 in place of 0.84 of the error that the teacher promised."""
+2,000 of its updates than in 4,000 of AdamW at 3e-3, 0.58 in place of 0.84 of the error that the teacher expected."""
 POINTS = 40_000
 """Points beside the recorded rows, half of them on lines, half moved rows. 8 on lines for each row instead, 6,000 on
 the tanks, left the student 6 % further from its teacher on left-out rows; moved rows in place of half of 40,000 brought
@@ -107,7 +107,7 @@ class CommitteeImitation:
     model. Truth plays no part: the teacher has weighed it, on rows that its learners had left out.
 
     Args:
-        teacher: a committee trained on folds.
+        teacher: a committee trained with cross-validation folds.
         further: series without truth, whose rows count as recorded ones.
         steps: updates, at least one for each of the `CHECKS` reports.
     """

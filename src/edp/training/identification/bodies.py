@@ -31,7 +31,8 @@ NAMES = ("X_1", "Y_1", "X_2", "Y_2", "X_3", "Y_3", "H_1", "H_2", "H_3")
 GIGA, MEGA = 1e6, 1e6
 """From Gg to kg, and from MN to N."""
 TORQUE_TRUST, INERTIA_TRUST = 0.01, 0.1
-"""Errors of gravity and inertia, as shares of their size: forces at rest are measured, inertia follows from swings."""
+"""Errors of gravity and inertia, as shares of their size: forces in steady state are measured, inertia follows from
+swings."""
 GUESS_TRUST = 1.0
 """Deviation of the nine numbers from those of the guess, as a share of their size: it decides where nothing moved."""
 NEAR = (0.7, 0.1, 0.1, 0.3)

@@ -45,7 +45,7 @@ def covariance(
         twin: the grey box at the optimum.
         parametrisation: the coordinates.
         theta: the optimum, in plausible deviations ``(coordinate,)``.
-        train: stretches that the fit has learned from.
+        train: segments that the fit has learned from.
         seed: seed of the free runs.
     """
     rate, prefix = twin.channels.rate_hz, twin.prefix_ticks

@@ -17,7 +17,7 @@ class MetaSpec:
     Attributes:
         inner_rate: learning rate of a step of adaptation.
         inner_steps: steps of adaptation to a machine.
-        shots: pieces (``training.chunks.length``) of a machine that are adapted on, and as many that judge.
+        shots: segments (``training.chunks.length``) of a machine that are adapted on, and as many that evaluate.
         head_only: adapt the head alone (ANIL, Raghu et al. 2020, arXiv 1909.09157).
 
     Raises:

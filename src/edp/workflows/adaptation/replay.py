@@ -142,7 +142,7 @@ def replay(
     """Run recordings one after the other through a network and its adaptation.
 
     Args:
-        predictor: the network; it starts anew with each recording.
+        predictor: the network; it starts again with each recording.
         adaptation: settings of the correction.
         series: the recordings.
         carry: keep what was learned from one recording to the next, as on one machine; else each starts from nothing.

@@ -76,7 +76,7 @@ def compare(*runs: str | Path) -> ComparedRuns:
 
     Raises:
         ConfigError: too few, too many, or one twice.
-        StorageError: a folder holds no judged run, or something damaged.
+        StorageError: a folder holds no evaluated run, or something damaged.
         DataError: twins beside networks, nothing in common, or recordings of one name that differ.
     """
     return ComparedRuns(compare_runs(runs))

@@ -107,12 +107,12 @@ class TrainedPredictor:
         Baselines fitted to its training data are evaluated, too.
 
         Args:
-            test: recordings, all of which are judged; without them those that the training set apart.
+            test: recordings, all of which are evaluated; without them those that the training set apart.
             baselines: names, such as ``persistence``, ``ridge_arx``; by default these two, and none for a bundle
                 without its run folder, whose training data is not known.
 
         Raises:
-            DataError: recordings that cannot be used, too short to be judged, or training data that changed.
+            DataError: recordings that cannot be used, too short to be evaluated, or training data that changed.
             ConfigError: an unknown baseline, or what a bundle alone cannot give.
         """
         recordings = None if test is None else to_recordings(test)

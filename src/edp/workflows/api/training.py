@@ -50,8 +50,8 @@ def train(
         data: recordings to train on.
         targets: channels to predict.
         horizons: look-ahead in samples; 10 samples are 0.1 s at 100 Hz.
-        test: recordings that are set apart to judge on. Without them a part of `data` is, as the settings say (a fifth
-            of the recordings; of a single recording its end).
+        test: recordings that are set apart to evaluate on. Without them a part of `data` is, as the settings say (a
+            fifth of the recordings; of a single recording its end).
         features: channels to read, or the name of a feature set. Without them those of the preset where the recordings
             have them all, else every channel.
         out: folder of the run; without it a temporary one, which is removed with the predictor.

@@ -1,4 +1,4 @@
-"""Automatic preset: several models are trained and judged on left-out data; the simplest of the best is kept."""
+"""Automatic preset: several models are trained and evaluated on left-out data; the simplest of the best is kept."""
 
 from edp.workflows.auto.settings import AutoSettings, auto_settings, load_auto, usual_preset
 from edp.workflows.auto.train_auto import AutoResult, train_auto

@@ -38,12 +38,12 @@ MAX_COLUMNS = 720
 """Columns of a bank at most, as far as its spans can be fewer: 48 channels have all spans, 100 only powers of two. A
 ridge regression takes the square of them for each row, and its spectra the cube."""
 WINDOW = 10
-"""Ticks until a stream counts as warm, and between neighbouring stretches of different parts beside the horizon.
+"""Ticks until a stream counts as warm, and between neighbouring segments of different parts beside the horizon.
 
 Changes over longer spans say less and less about the present: ten ticks after a reset their error was no larger than
 later on measured recordings. A longer gap would throw away what lies nearest to the test."""
 STRETCH_SHARE = 8
-"""The longest change is at most an eighth of the usual stretch, so that most of its rows are full."""
+"""The longest change is at most an eighth of the usual segment, so that most of its rows are full."""
 OPERATIONS_PER_S = 1.6e10
 """Floating-point operations that training is taken to do in a second of one core: measured, rounded down.
 
@@ -166,7 +166,7 @@ class Foundation:
         check_channels(recordings, self.source.bundle.task)
 
     def check_task(self, data: Prepared) -> None:
-        """Refuse a task other than the network's, and recordings on which it cannot be trained further.
+        """Refuse a task other than the network's, and recordings on which it cannot be fine-tuned.
 
         Raises:
             ConfigError: every part of the task that differs.
@@ -252,8 +252,8 @@ class Amount:
 
     Attributes:
         rows: ticks of the training and validation parts.
-        shortest: ticks of their shortest stretch.
-        usual: ticks of most of their stretches; 0 for those of the shortest one.
+        shortest: ticks of their shortest segment.
+        usual: ticks of most of their segments; 0 for those of the shortest one.
         trial: result of the recurrent network's trial, which decides how the budget is divided.
         features: features of a tick.
         outputs: horizons times targets.

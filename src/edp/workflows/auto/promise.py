@@ -26,7 +26,7 @@ GROUPS, DRAWS, COVERAGE = 20, 1000, 0.9
 """Contiguous groups of blocks that an interval draws from (10 and 40 held as many test errors of 38 on seven measured
 sets, 28 and 27), how often, and the share of tests that it is meant to hold."""
 Block = tuple[int, int, int]
-"""Number of a stretch, its first row and the row after its last one."""
+"""Number of a segment, its first row and the row after its last one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +48,12 @@ class Promise:
         return np.asarray(self._error(np.arange(len(self.rows))[None])[0])
 
     def last(self, count: int) -> Promise:
-        """Return the promise on the last `count` blocks."""
+        """Return the expected error on the last `count` blocks."""
         reference = None if self.reference is None else self.reference[-count:]
         return Promise(self.squared[-count:], self.rows[-count:], reference)
 
     def relative_to(self, other: Promise) -> Promise:
-        """Return this promise relative to the errors of another one, on the blocks that both left out."""
+        """Return this expected error relative to the errors of another one, on the blocks that both left out."""
         count = min(len(self.rows), len(other.rows))
         return replace(self.last(count), reference=other.last(count).squared)
 
@@ -87,7 +87,7 @@ class Promise:
         return np.asarray(np.sqrt(mean(self.squared) / below))
 
     def _group_blocks(self, groups: Sequence[NDArray[np.int64]]) -> Promise:
-        """Return the promise with groups of blocks as one block each."""
+        """Return the expected error with groups of blocks as one block each."""
         rows = np.array([self.rows[group].sum() for group in groups])
 
         def mean(squared: DoubleArray) -> DoubleArray:
@@ -114,7 +114,7 @@ class PortfolioChoice:
 
 
 def blocks_of(data: Prepared, skip: int) -> tuple[list[Block], int]:
-    """Return blocks of nearly equal size, training stretches before validation stretches, and the number of the latter.
+    """Return blocks of nearly equal size, training segments before validation segments, and the number of the latter.
 
     Raises:
         DataError: fewer than two blocks of the validation part are longer than the largest horizon.
@@ -142,13 +142,13 @@ def blocks_of(data: Prepared, skip: int) -> tuple[list[Block], int]:
 
 
 def promise_of(predicted: Sequence[DoubleArray], truth: Sequence[DoubleArray], blocks: Sequence[Block]) -> Promise:
-    """Return the errors of predictions of stretches, both standardised ``(tick, output)`` and of equal length."""
+    """Return the errors of predictions of segments, both standardised ``(tick, output)`` and of equal length."""
     squared = [np.square(predicted[n][a:b] - truth[n][a:b]).mean(axis=0) for n, a, b in blocks]
     return Promise(np.stack(squared), np.array([b - a for _, a, b in blocks], dtype=np.float64))
 
 
 def standard_truth(predictor: Predictor, data: Prepared) -> list[DoubleArray]:
-    """Return the true change or value at each tick of the training stretches, followed by the validation stretches.
+    """Return the true change or value at each tick of the training segments, followed by the validation segments.
 
     Standardised by the predictor's scaling, ``(tick, output)`` each.
     """

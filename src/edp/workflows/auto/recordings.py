@@ -43,7 +43,7 @@ MIN_DIVIDED = 14
 COPIES = 8
 """Of what is predicted at each tick, in double precision: the truth, and what each candidate said of it."""
 MOST_TICKS = 0.9
-"""Share of the ticks whose stretches settle how far changes reach back: a short log among long ones shortens none."""
+"""Share of the ticks whose segments settle how far changes reach back: a short log among long ones shortens none."""
 
 
 def fit_to_channels(settings: AutoSettings, names: Sequence[str], where: str) -> tuple[AutoSettings, list[str]]:
@@ -228,7 +228,7 @@ def still_inputs(data: Prepared) -> list[str]:
 
 
 def _moving(parts: Sequence[FloatArray], kinds: Sequence[Kind]) -> list[bool]:
-    """Test whether each channel moves in stretches ``(time, channel)``, relative to its own size."""
+    """Test whether each channel moves in segments ``(time, channel)``, relative to its own size."""
     values = np.concatenate(parts).astype(np.float64)
     spreads, sizes = values.std(axis=0), np.abs(values).max(axis=0)
     return [spread > least_spread(kind, size) for spread, size, kind in zip(spreads, sizes, kinds, strict=True)]

@@ -58,7 +58,7 @@ class Portfolio:
 
 @dataclass(frozen=True, kw_only=True)
 class AutoSettings:
-    """Settings of an automatic training and its judgement."""
+    """Settings of an automatic training and its evaluation."""
 
     task: TaskSettings = field(default_factory=TaskSettings)
     split: SplitSpec = field(default_factory=ByRecording)

@@ -82,7 +82,7 @@ def train_auto(
 
     Args:
         source: source of the recordings.
-        settings: task, split, budget, judge.
+        settings: task, split, budget, evaluate.
         out: run folder; a finished one of the same settings and data is read, not made again.
         progress: receiver of the progress; its units are models.
         workers: who trains candidates; nodes see the run folder under the same path. The run has the same bits with any

@@ -78,7 +78,7 @@ class CandidateTraining:
 
     @property
     def on_folds(self) -> bool:
-        """Test whether it is trained on folds; networks trained by gradient descent on chunks are not."""
+        """Test whether it is trained with cross-validation folds; networks trained by gradient descent on chunks are not."""
         return self.experiment.training.bagging is not None
 
 
@@ -216,7 +216,7 @@ def train_unit(identity: TrainingIdentity, where: Mapping[str, CandidateTraining
 
 
 def _read_trained(job: CandidateTraining, result: UnitResult) -> TrainedCandidate | str:
-    """Return a candidate trained on folds, or the message of a diverged training."""
+    """Return a candidate trained with cross-validation folds, or the message of a diverged training."""
     if DIVERGED in result.values:
         return str(result.values[DIVERGED])
     stored = unpack(result.content or b"", _FoldResult)
@@ -367,7 +367,7 @@ def _experiments(settings: AutoSettings, amount: Amount) -> dict[str, Experiment
 def _jobs(
     experiments: Mapping[str, Experiment], data: Prepared, amount: Amount, folder: Path
 ) -> list[CandidateTraining]:
-    """Return the trainings of the candidates, which are judged on the same blocks."""
+    """Return the trainings of the candidates, which are evaluated on the same blocks."""
     blocks, judged = blocks_of(data, amount.window)
     begun = {"foundation": amount.foundation}
     return [

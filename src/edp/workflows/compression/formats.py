@@ -29,7 +29,7 @@ class Format(Protocol):
     Attributes:
         label: name in tables.
         estimated: name in `edp.evaluation.controller.FORMATS` of the estimate of its cycles, program and state.
-        rounded: whether training with rounded numbers is of use for it.
+        rounded: whether training with rounded weights is of use for it.
     """
 
     label: ClassVar[str]
@@ -65,7 +65,7 @@ class DynamicInt8:
         return dynamic_int8(predictor).weight_bytes
 
     def predictions(self, predictor: Predictor, training_series: Sequence[Series]) -> Predict:
-        """Return a copy that computes with the rounded numbers."""
+        """Return a copy that computes with the rounded weights."""
         return partial(stream_predictions, dynamic_int8(predictor).predictor)
 
 

@@ -50,7 +50,7 @@ class CompressionPlan:
         return sum(len(orders) + self.rounds for orders in self.orders.values())
 
     def to_round(self, errors: Mapping[CompressionRequest, float]) -> list[CompressionRequest]:
-        """Return the requests that train the better recipe of each width with rounded numbers.
+        """Return the requests that train the better recipe of each width with rounded weights.
 
         Args:
             errors: error in float32, by recipe; a recipe without an entry failed.

@@ -19,7 +19,7 @@ from edp.workflows.train_evaluate import read_trained_run
 
 
 def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str, float]:
-    """Write a run in W8A16; its judgement, report and export use integer arithmetic.
+    """Write a run in W8A16; its evaluation, report and export use integer arithmetic.
 
     Formats and weights are chosen on the inputs of the training part; the errors are of the validation part.
 

@@ -166,7 +166,7 @@ def search(
         run: run folder of the teacher.
         request: run, budget and alternatives.
         out: folder of the search, with a run for each network.
-        source: recordings to learn, choose and judge on; by default those of the run.
+        source: recordings to learn, choose and evaluate on; by default those of the run.
         progress: receiver of the progress; its units are networks.
 
     Raises:

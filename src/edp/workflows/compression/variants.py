@@ -58,7 +58,7 @@ class MadeByOrder:
 
 @dataclass(frozen=True)
 class RoundedLikeThesis:
-    """Variant trained further with rounded convolutions and linear layers: a request's network, or the teacher."""
+    """Variant fine-tuned with rounded convolutions and linear layers: a request's network, or the teacher."""
 
     name: str
     order: CompressionRequest | None

@@ -1,4 +1,4 @@
-"""Closed loops: a controller drives a plant along tasks; gains are tuned on one plant and judged on another."""
+"""Closed loops: a controller drives a plant along tasks; gains are tuned on one plant and evaluated on another."""
 
 from edp.control.plants import is_fmu as is_fmu
 from edp.workflows.control.bench import ControlBench, ControlSources

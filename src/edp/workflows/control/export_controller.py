@@ -209,7 +209,7 @@ def _check_pilots(plan: PlanParts, plant: PlantInterface) -> None:
 
 
 def golden_loop(parts: ControllerParts, stored: KeptController) -> GoldenLoop | None:
-    """Return the kept stretch before the first tick with a missing input; None if the first tick has one."""
+    """Return the kept segment before the first tick with a missing input; None if the first tick has one."""
     columns = stored.plant.columns(tuple(channel.name for channel in parts.inputs))
     measured = stored.observed[:, columns]
     good: NDArray[np.bool_] = np.asarray(np.isfinite(measured).all(axis=1))

@@ -1,7 +1,7 @@
 """Content of a closed-loop run on its controller; the run alone is enough for an export.
 
 The folder ``controller`` of a run holds the settings' machine as a file, the valve map, the twin, what the plant
-measures, and a stretch of the first loop with which exported code is compared.
+measures, and a segment of the first loop with which exported code is compared.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Gains tuned on one plant, such as a twin, and judged on another, along other references."""
+"""Gains tuned on one plant, such as a twin, and evaluated on another, along other references."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from edp.workflows.search.space import Real
 from edp.workflows.search.study import SamplerSpec, Study
 
 TUNING_SEED = 1_000_000
-"""First seed of the references that gains are tuned on; those that judge begin at 0 and never come so far."""
+"""First seed of the references that gains are tuned on; those that evaluate begin at 0 and never come so far."""
 TUNED = "tuned.toml"
 
 
@@ -74,10 +74,10 @@ def tune_gains(
     """Tune a controller and write a run folder: ``tuning.json``, and ``tuned.toml`` for ``edp control --config``.
 
     Args:
-        experiment: task, machine, the controller to begin with, and the seeds that judge.
+        experiment: task, machine, the controller to begin with, and the seeds that evaluate.
         out: run folder; a stopped tuning continues after its last trial, and a finished one is read.
         tuned_on: plant and models of the tuning.
-        judged_on: plant and models of the judgement.
+        judged_on: plant and models of the evaluation.
         tuning: settings of the tuning.
         progress: receiver of the progress; its units are trials.
         workers: who runs the loops of a trial; nodes see models and run folder under the same paths.

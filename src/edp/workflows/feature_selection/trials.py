@@ -1,4 +1,4 @@
-"""Trials of feature sets: networks trained with equal settings on each set and judged on the same recordings.
+"""Trials of feature sets: networks trained with equal settings on each set and evaluated on the same recordings.
 
 What a feature set is for is the error of the model that reads it, so a proposal is held to that: beside all channels,
 the usual sets, and sets of the same size drawn at random.
@@ -77,7 +77,7 @@ def try_feature_sets(
     on_trial: OnTrial | None = None,
     workers: Workers = IN_PROCESS,
 ) -> Trials:
-    """Train the experiment's network on every set within its budget, and judge all on the held-out recordings.
+    """Train the experiment's network on every set within its budget, and evaluate all on the held-out recordings.
 
     Trainings that are in the folder already are kept; one that was interrupted goes on.
 

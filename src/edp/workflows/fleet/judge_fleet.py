@@ -1,4 +1,4 @@
-"""`edp fleet report`: judgement of every machine of a store under one network, or its own delta."""
+"""`edp fleet report`: evaluation of every machine of a store under one network, or its own delta."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ MIN_BLOCKS = 8
 
 @dataclass(frozen=True, kw_only=True)
 class FleetQuestion:
-    """Judgement of a fleet: network, monitor and machines.
+    """Evaluation of a fleet: network, monitor and machines.
 
     Attributes:
         network: run folder or bundle.
@@ -75,10 +75,10 @@ def report_fleet(
     out: str | Path,
     progress: Progress = SILENT,
 ) -> FleetFacts:
-    """Judge every machine, and write ``fleet_report.json`` and a page.
+    """Evaluate every machine, and write ``fleet_report.json`` and a page.
 
     Args:
-        workers: who judges; nodes see all folders under the same paths.
+        workers: who evaluates; nodes see all folders under the same paths.
         question: network, store, deltas, monitor.
         out: folder of the report.
         progress: receiver of the progress; its units are machines.

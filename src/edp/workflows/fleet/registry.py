@@ -1,4 +1,4 @@
-"""Registry of networks on disk: bundles and fleets of deltas with their lineage: data, base, judgement.
+"""Registry of networks on disk: bundles and fleets of deltas with their lineage: data, base, evaluation.
 
 A folder with ``entries/ID.json`` and ``files/ID``; an identifier is the content address of what it is of. Nothing in it
 is ever overwritten: the same network enters once, and another one has another identifier.
@@ -56,8 +56,8 @@ class RegistryEntry(ResultFile):
         label: description in words.
         base: identifier of the network that it was trained on from; empty for one that began at random.
         data: origin, hash, number and hours of its recordings; for a fleet also its machines.
-        judge: errors of the network and of the best baseline by horizon, how they were judged and on what; empty where
-            nobody judged it.
+        judge: errors of the network and of the best baseline by horizon, how they were evaluated and on what; empty
+            where nobody evaluated it.
         added: time of entry.
         edp: version that entered it.
 

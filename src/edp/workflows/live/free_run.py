@@ -48,7 +48,7 @@ class LiveTwin(LivePart):
         self._ticks = 0
 
     def step(self, row: Row, missed: int) -> Row:
-        """Return the twin's answer for the next tick, lower bounds, upper bounds; see `LivePart`."""
+        """Return the twin's output for the next tick, lower bounds, upper bounds; see `LivePart`."""
         commands = row[self._commands]
         possible = bool(((commands >= self._low) & (commands <= self._high)).all())
         if missed or not possible:

@@ -1,7 +1,7 @@
 """``--rerun``: the session in the viewer Rerun in addition to EDP's page; needs Rerun's package.
 
 Rerun is started by its command line, which unlike its Python interface can be told to listen on loopback only; its
-telemetry is off in a settings folder of its own, so that those of the user stay as they are. Rows go in pieces from a
+telemetry is off in a settings folder of its own, so that those of the user stay as they are. Rows go in segments from a
 thread of their own: a viewer that is slow loses rows, and never slows the source.
 """
 

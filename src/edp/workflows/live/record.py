@@ -84,7 +84,7 @@ class McapRecorder:
         self._writer.close()
 
     def _describe(self) -> dict[str, object]:
-        """Return the facts of `edp.logs.formats.edp_metadata.facts_text` without a digest, unknown until the end."""
+        """Return the data of `edp.logs.formats.edp_metadata.facts_text` without a digest, unknown until the end."""
         channels = [
             {"name": c.name, "unit": c.unit, "kind": str(c.kind), "description": c.description} for c in self._channels
         ]

@@ -47,7 +47,7 @@ class LiveOrder:
         port: see `host`.
         save: page to write at the end.
         record: MCAP file to write.
-        rerun: whether to show the session in Rerun besides.
+        rerun: whether to show the session in Rerun as well.
         until_end: whether to end with the source; a session stays open for viewers otherwise.
         history_bytes: maximum size of the stored rows in bytes.
     """
@@ -204,7 +204,7 @@ class LiveRun:
         return answers
 
     def begin_anew(self) -> None:
-        """Start anew: the next row does not continue the last one."""
+        """Start again: the next row does not continue the last one."""
         self.show()
         for part in self._parts:
             part.reset()

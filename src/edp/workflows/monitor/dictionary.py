@@ -253,7 +253,7 @@ def _average_blocks(monitor: Monitor, recording: Recording, onset_s: float) -> A
 
 
 def _summarise_channels(session: FaultSession, names: Sequence[str], onset_s: float) -> dict[str, Array]:
-    """Return level, width and rate of change of further channels after an onset."""
+    """Return level, width and rate of change of additional channels after an onset."""
     shown = {}
     first = round(onset_s * session.recording.rate_hz)
     for name in names:
@@ -265,7 +265,7 @@ def _summarise_channels(session: FaultSession, names: Sequence[str], onset_s: fl
 def _standardise(
     faults: Sequence[SimulatedFault], sound: dict[int, tuple[Array, dict[str, Array]]]
 ) -> list[SimulatedFault]:
-    """Return changes of further channels relative to their scatter between sound sessions."""
+    """Return changes of additional channels relative to their scatter between sound sessions."""
     names = sorted(next(iter(sound.values()))[1])
     width = {name: np.std([sensors[name] for _, sensors in sound.values()], axis=0) for name in names}
     return [

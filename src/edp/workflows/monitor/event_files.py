@@ -19,7 +19,7 @@ LONGEST_NAME = 100
 def write_event_files(
     alarms: Sequence[MonitorAlarm], recordings: Sequence[Recording], folder: str | Path
 ) -> list[Path]:
-    """Write every recording as MDF 4 with its alarms as stretches from onset to the detecting block.
+    """Write every recording as MDF 4 with its alarms as segments from onset to the detecting block.
 
     Args:
         alarms: alarms by recording name.

@@ -29,7 +29,7 @@ class FaultSession:
     """One session of the dictionary.
 
     Attributes:
-        base: index of the sound session with the same random numbers.
+        base: index of the sound session with the same random values.
         fault: place in the classes; -1 for the sound session itself.
         size: size of the fault in the unit of its class; `neutral` for faults without a size.
         recording: recording from the start of the session.

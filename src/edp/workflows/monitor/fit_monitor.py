@@ -100,7 +100,7 @@ def fit_monitor(
             dictionary has not the time for all of its draws: several processes make them all.
 
     Raises:
-        EdpError: runs or logs that cannot be used, or too few hours for the promise, or a process died.
+        EdpError: runs or logs that cannot be used, or too few hours for the expected error, or a process died.
     """
     check_claimable(out, "monitor")
     bundles = [_network_of(run) for run in runs]
@@ -171,7 +171,7 @@ def fit_to_recordings(
         side_by_side: calls a function for each of some jobs, such as in processes.
 
     Raises:
-        EdpError: recordings that cannot be used, or too few hours for the promise.
+        EdpError: recordings that cannot be used, or too few hours for the expected error.
     """
     began = time.process_time()
     divided = _healthy_sessions(recordings, experiment)
@@ -301,7 +301,7 @@ def _check_values(recordings: Sequence[Recording], channels: Sequence[Channel]) 
 
 
 def _enough_sessions(recordings: Sequence[Recording]) -> list[Recording]:
-    """Return the recordings, cut into pieces if they are few."""
+    """Return the recordings, cut into segments if they are few."""
     if len(recordings) >= MIN_SESSIONS:
         return list(recordings)
     pieces = []
@@ -340,7 +340,7 @@ def fit_source(job: _Fit) -> ResidualSource | Bundle | None:
 def _sources(
     experiment: MonitorExperiment, material: FitMaterial, side_by_side: SideBySide = ONE_BY_ONE
 ) -> tuple[ResidualSource, ...]:
-    """Return the residuals of the settings that have channels to judge.
+    """Return the residuals of the settings that have channels to evaluate.
 
     Raises:
         DataError: no residual of the settings has channels to evaluate.
@@ -372,12 +372,12 @@ def _sources(
 
 
 def _check_hours(sessions: Sequence[Recording], rest: Sequence[Recording], experiment: MonitorExperiment) -> None:
-    """Refuse a promise that the hours cannot support, before any network is trained.
+    """Raise an error for a false-alarm rate that the hours cannot support, before any network is trained.
 
     Args:
         sessions: all of them.
         rest: sessions that train nothing and set the limit.
-        experiment: experiment with the promised false-alarm rate.
+        experiment: experiment with the expected false-alarm rate.
     """
     hours = sum(session.duration_s for session in sessions) / 3600.0
     left = sum(session.duration_s for session in rest) / 3600.0

@@ -19,7 +19,7 @@ from edp.wording import typed
 
 Array = NDArray[np.float64]
 HOLD_S = 60.0
-"""Time after an alarm for which it holds: detectors begin anew at an alarm, and a fault that stays raises another."""
+"""Time after an alarm for which it holds: detectors begin again at an alarm, and a fault that stays raises another."""
 SURE = 0.5
 """Probability of a cause from which on a diagnosis is acted upon."""
 EXPLAINED = 0.5
@@ -103,7 +103,7 @@ class MonitorGuard:
 
 
 def list_evaluated_channels(monitor: Monitor) -> dict[str, tuple[str, ...]]:
-    """Return the judged channels of each residual by its name."""
+    """Return the evaluated channels of each residual by its name."""
     return {
         name: judged for source in monitor.sources for name, judged in zip(source.names, source.judged, strict=True)
     }
@@ -112,7 +112,7 @@ def list_evaluated_channels(monitor: Monitor) -> dict[str, tuple[str, ...]]:
 def suspected(alarm: MonitorAlarm, judged: Mapping[str, tuple[str, ...]]) -> tuple[tuple[str, ...], float]:
     """Channels whose residuals deviate most, and their score from 0 to 1.
 
-    A channel scores by the share of all deviation that lies in residuals that judge it, times how much of these
+    A channel scores by the share of all deviation that lies in residuals that evaluate it, times how much of these
     residuals deviates: one that explains all, and has no residual that stays quiet, scores highest.
 
     Args:

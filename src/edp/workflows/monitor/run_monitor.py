@@ -234,7 +234,7 @@ def _detectors(monitor: Monitor) -> list[str]:
 
 
 def groups_of(monitor: Monitor) -> dict[str, list[int]]:
-    """Return groups of residuals by source and kind of judged channels, with the positions of their summaries."""
+    """Return groups of residuals by source and kind of evaluated channels, with the positions of their summaries."""
     kinds = {channel.name: str(channel.kind).replace("_", " ") for channel in monitor.channels}
     groups: dict[str, list[int]] = {}
     for column, name in enumerate(monitor.summary_names):

@@ -1,4 +1,4 @@
-"""One network for many machines: joint training and meta-learning, judged on unseen machines."""
+"""One network for many machines: joint training and meta-learning, evaluated on unseen machines."""
 
 from edp.training.pretraining.methods import PRETRAININGS, Pretraining
 from edp.training.pretraining.spec import MetaSpec

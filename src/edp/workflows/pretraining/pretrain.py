@@ -1,4 +1,4 @@
-"""One network for many machines: trained on some, selected on others, judged on unseen ones."""
+"""One network for many machines: trained on some, selected on others, evaluated on unseen ones."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def pretrain(
     progress: Progress = SILENT,
     workers: Workers = IN_PROCESS,
 ) -> FoundationFile:
-    """Train one network for many machines and judge it on others; a stopped training continues.
+    """Train one network for many machines and evaluate it on others; a stopped training continues.
 
     What comes out is a run like any other, with ``foundation.json`` beside it.
 

@@ -153,7 +153,7 @@ def _size(look: LogLook, name: str) -> float:
 
 
 def _targets_of(look: LogLook, names: Sequence[str], step: int, rate: float) -> Recording:
-    """Return target columns of a looked-at log; missing values separate its pieces."""
+    """Return target columns of a looked-at log; missing values separate its segments."""
     columns = {column.name: column for column in look.columns}
     apart = np.full(1, np.nan)
     values = [np.concatenate([x for piece in columns[name].pieces for x in (piece[::step], apart)]) for name in names]
@@ -163,7 +163,7 @@ def _targets_of(look: LogLook, names: Sequence[str], step: int, rate: float) -> 
 
 @dataclass(frozen=True)
 class PlantProposal:
-    """Inputs and answers of a plant model for these logs.
+    """Inputs and outputs of a plant model for these logs.
 
     Attributes:
         parts: channels to name to `edp twin`, by part; a part that it finds by itself is not among them.

@@ -31,7 +31,7 @@ class SearchContext:
         spec: the settings of the search.
         base: settings of the network and its training from which everything starts.
         source: source of the recordings, as plain values.
-        development: names of the sessions that train and judge in all phases.
+        development: names of the sessions that train and evaluate in all phases.
         test: names of the sessions set apart.
         channels: channels of the recordings.
         unit: unit of the scores, for sentences.
@@ -50,7 +50,7 @@ class SearchContext:
     second: tuple[str, ...] = ()
 
     def facts(self, kind: type[F]) -> F:
-        """Return the facts of an earlier phase.
+        """Return the data of an earlier phase.
 
         Raises:
             ConfigError: the phase has not run.
@@ -63,7 +63,7 @@ class SearchContext:
     @property
     # Sessions of the first run: choices of later phases rest on the same ones.
     def validation(self) -> tuple[str, ...]:
-        """Return the development sessions that judge while the others train: those of the first run.
+        """Return the development sessions that evaluate while the others train: those of the first run.
 
         Two or more train.
         """
@@ -77,7 +77,7 @@ class SearchContext:
         return tuple(name for name in self.development if name not in self.validation)
 
     def folds(self, runs: int) -> NDArray[np.bool_]:
-        """Return the judging development sessions of each run ``(run, session)``; more runs keep the same first ones.
+        """Return the evaluation development sessions of each run ``(run, session)``; more runs keep the same first ones.
 
         Repeated folds; in the thesis's mode independent draws of as many sessions as a fold has.
         """
@@ -98,7 +98,7 @@ class SearchContext:
     def orders(self, arm: Arm, runs: Sequence[int], seed: int = 0) -> list[TrainingRequest]:
         """Return one request per run: the same folds and seeds for every arm (common random numbers).
 
-        Trainings of several epochs are validated by the sessions that judge them, as in the thesis.
+        Trainings of several epochs are validated by the sessions that evaluate them, as in the thesis.
 
         Args:
             arm: arm to train.
@@ -140,7 +140,7 @@ class SearchContext:
     def table(self, outcomes: Sequence[Outcome], name: str = "composite") -> Array:
         """Return scores ``(run, session)`` of runs 0, 1, ....
 
-        NaN for a session that a run does not judge, or a failure.
+        NaN for a session that a run does not evaluate, or a failure.
         """
         columns = {session: column for column, session in enumerate(self.development)}
         scores = np.full((len(outcomes), len(columns)), np.nan)

@@ -50,7 +50,7 @@ def write_networks(
     split: ByFrozen,
     outcomes: Sequence[Outcome],
 ) -> dict[str, Path]:
-    """Write the networks judged on the second sealed test set as runs, after the decision of phase 6.
+    """Write the networks evaluated on the second sealed test set as runs, after the decision of phase 6.
 
     Args:
         folder: folder of the study.

@@ -205,7 +205,7 @@ class _Data:
 
 
 class _Observer:
-    """Observer that reports events, and opens a sealed test set before a batch is judged on its sessions.
+    """Observer that reports events, and opens a sealed test set before a batch is evaluated on its sessions.
 
     Attributes:
         second: outcomes of trainings that were evaluated on the second test set, by key.
@@ -258,7 +258,7 @@ class _Observer:
 
 
 def _refuse_twice(recordings: Sequence[Recording]) -> None:
-    """Refuse duplicate sessions, which would both train and judge."""
+    """Refuse duplicate sessions, which would both train and evaluate."""
     seen: dict[str, str] = {}
     for recording in recordings:
         if recording.digest in seen:

@@ -184,7 +184,7 @@ class CompressionSpec:
         budget: limits of the controller: a table, or the path of a budget file.
         units: widths to make; none given, they are planned from the budget.
         shares: fractions of the widest network that fits; each gives one width.
-        formats: number formats to judge in; none given, all.
+        formats: number formats to evaluate in; none given, all.
         updates: training steps of each smaller network; 0 for as many as the teacher has, `SearchSpec.final_updates`.
 
     Raises:
@@ -218,8 +218,8 @@ class SearchSpec:
         seed: root of folds, seeds of trainings and questions.
         updates: training steps of every training but the final one, over all its epochs; 0 with several epochs makes
             each of them one pass over the data.
-        final_updates: training steps of what is judged on the test sessions, likewise.
-        epochs: of every training, thesis: after each the sessions that judge validate it, the schedule takes notice,
+        final_updates: training steps of what is evaluated on the test sessions, likewise.
+        epochs: of every training, thesis: after each the sessions that evaluate validate it, the schedule takes notice,
             and the best one counts. 1 is one long epoch that chooses nothing.
         patience: epochs without a better validation before a training ends early; 0 never.
         horizon: horizon of the scores, one of the task's.
@@ -230,7 +230,7 @@ class SearchSpec:
         folds: into which the other sessions are dealt.
         backbones: registered backbones that are compared.
         features: feature sets that are compared: names, or sets of one's own.
-        trial_runs: runs over which a question of phases 1, 4 and 5 is judged.
+        trial_runs: runs over which a question of phases 1, 4 and 5 is evaluated.
         run_seeds: seeds of each split in mode ``thesis``, and of the final trainings.
         batch: questions that are asked before the first of them is answered.
         space: dimensions and ranges of phase 1.
@@ -241,7 +241,8 @@ class SearchSpec:
         widths: ``equal``: every level has as many channels as units, and the head is left as it is; ``halved``: as in
             the thesis (`edp.workflows.search.space.halved`).
         sampler: sampler of the trials.
-        rungs: shares of the steps at which a question of phases 1, 4 and 5 is judged before its end; none without any.
+        rungs: shares of the steps at which a question of phases 1, 4 and 5 is evaluated before its end; none without
+            any.
         pruner: which questions end at a rung: ``none``, or ``median``: those worse than the median of the questions of
             earlier batches, once five of them were trained to the end (Optuna's median rule with its defaults).
         cost: ``none``, or a cost that is made small beside the score in phases 1, 4 and 5: a Pareto front comes out.

@@ -1,4 +1,4 @@
-"""One network of phase 6: trained by its recipe and judged in its number formats, from a plain request to a record.
+"""One network of phase 6: trained by its recipe and evaluated in its number formats, from a plain request to a record.
 
 A network rests on those that it is made of: a student on the teacher, a rounded one on a student. What it is made of
 comes with the state of an earlier order, or is trained again from the same order to the same bits.
@@ -45,14 +45,14 @@ class Recipe:
 
     Attributes:
         updates: training steps of a smaller network over all epochs, 0 for passes over the data; one that is trained
-            on with rounded numbers has a third.
-        formats: number formats in which it is judged.
+            on with rounded weights has a third.
+        formats: number formats in which it is evaluated.
         budget: limits of the controller.
         validation: sessions on which networks are compared; none of them trains.
         units: width; None for the teacher itself.
         pruned: begin with what pruning leaves of the teacher.
-        rounded: trained on with rounded numbers.
-        final: the format in which it is judged on the second sealed test set; empty for the comparison.
+        rounded: trained on with rounded weights.
+        final: the format in which it is evaluated on the second sealed test set; empty for the comparison.
     """
 
     updates: int

@@ -144,7 +144,7 @@ class StudyLog:
             self.trained += 1
 
     def _end_paused(self, going_on: Collection[str]) -> None:
-        """Mark trainings judged at a rung that do not continue as pruned."""
+        """Mark trainings evaluated at a rung that do not continue as pruned."""
         for which in [one for one in self._paused if one not in going_on]:
             del self._paused[which]
             self._end_row(which, "pruned")
@@ -249,7 +249,7 @@ def look_at(folder: str | Path) -> StudyStatus:
 
 
 def label_of(arm: Arm) -> str:
-    """Return a short name of a training: backbone, feature set, and further modules."""
+    """Return a short name of a training: backbone, feature set, and additional modules."""
     features = arm["task.features"]
     cell, head = arm.get("model.backbone.cell.kind", "lstm"), arm.get("model.head.kind", "mlp")
     activation = arm.get("model.activation.kind", "identity")

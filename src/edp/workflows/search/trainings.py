@@ -36,22 +36,22 @@ SessionScores = dict[str, dict[str, dict[str, float]]]
 
 @dataclass(frozen=True)
 class TrainingRequest:
-    """Training to perform and judge; equal requests give equal records.
+    """Training to perform and evaluate; equal requests give equal records.
 
     Attributes:
         settings: the whole experiment as plain tables (`edp.workflows.search.arms.Arm`); its split is not used.
         source: result of `DataSource.to_dict`.
         train: names of the sessions that train.
-        judged: names of the sessions that judge; none of them trains, and with one epoch none chooses anything.
+        judged: names of the sessions that evaluate; none of them trains, and with one epoch none chooses anything.
         seed: root of every random choice of the training.
         updates: training steps over all epochs; 0 with several epochs makes each of them one pass over the data.
-        until: the step after which this part of the training ends and is judged, or with several epochs the epoch;
+        until: the step after which this part of the training ends and is evaluated, or with several epochs the epoch;
             None for the end. A part goes on to the same bits as a training without a stop.
         stops: possible ends of earlier parts; they affect no result and are not part of a key.
-        epochs: one for a training without an early stop, so that no session that judges has a say.
+        epochs: one for a training without an early stop, so that no session that evaluates has a say.
         patience: epochs without a better validation score before an early stop; 0 never.
-        validation: names of the sessions that validate after each of several epochs; they may be those that judge, as
-            in the thesis, and do not train.
+        validation: names of the sessions that validate after each of several epochs; they may be those that evaluate,
+            as in the thesis, and do not train.
         recipe: what is made of the network in phase 6 (`edp.workflows.search.smaller.Recipe`), plain; None in the other
             phases.
     """
@@ -148,7 +148,7 @@ class Outcome:
         return float(self.result["sessions"][session][str(horizon)][name])
 
     def mean(self, horizon: int, name: str = "composite") -> float:
-        """Return a score, mean over the judging sessions; NaN for a failed training."""
+        """Return a score, mean over the evaluation sessions; NaN for a failed training."""
         return float(np.mean([self.score(session, horizon, name) for session in self.order.judged]))
 
 
@@ -157,7 +157,7 @@ class TrainedPart:
     """A training that has ended, or a part of one.
 
     Attributes:
-        result: for JSON. ``sessions``: for each judging session its scores at each horizon, report units, mean over
+        result: for JSON. ``sessions``: for each evaluation session its scores at each horizon, report units, mean over
             targets; ``scores``: their means over sessions; ``parameters``, ``macs_tick``, and more where it applies.
         state: state from which the next part continues; None at the end.
     """
@@ -167,7 +167,7 @@ class TrainedPart:
 
 
 def train_part(order: TrainingRequest, start: bytes | None = None) -> TrainedPart:
-    """Train and judge a request, which may be a part of a training.
+    """Train and evaluate a request, which may be a part of a training.
 
     Args:
         order: training to run.
@@ -239,7 +239,7 @@ def mean_scores(sessions: Mapping[str, Mapping[str, Mapping[str, float]]]) -> di
 
 
 def prepared(order: TrainingRequest, experiment: Experiment) -> Prepared:
-    """Return the series of a request: training sessions, the first also for validation; judging sessions for the test.
+    """Return the series of a request: training sessions, the first also for validation; evaluation sessions for the test.
 
     Raises:
         ConfigError: settings that contradict the data.
@@ -270,7 +270,7 @@ def prepared(order: TrainingRequest, experiment: Experiment) -> Prepared:
 
 @dataclass(frozen=True)
 class _Named:
-    """Split of whole sessions by name; validation and judging sessions may coincide, which `ByRecording` refuses."""
+    """Split of whole sessions by name; validation and evaluation sessions may coincide, which `ByRecording` refuses."""
 
     train: tuple[str, ...]
     validation: tuple[str, ...]

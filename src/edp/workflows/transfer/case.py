@@ -91,14 +91,14 @@ class TransferCase:
         return train(self.logs, experiment, folder, training_steps(progress), strategy_factory, data).predictor
 
     def tuning(self, optimizer: OptimizerSpec | None = None, epochs: int | None = None) -> TrainingSpec:
-        """Return the settings of further training, see `tuned`."""
+        """Return the settings of fine-tuning, see `tuned`."""
         return tuned(self.experiment.training, self.spec, optimizer, epochs)
 
 
 def tuned(
     training: TrainingSpec, spec: FinetuneSpec, optimizer: OptimizerSpec | None = None, epochs: int | None = None
 ) -> TrainingSpec:
-    """Return the settings of further training: small batches, light smoothness, early stopping (thesis 3.4.5).
+    """Return the settings of fine-tuning: small batches, light smoothness, early stopping (thesis 3.4.5).
 
     Args:
         training: settings of the source's training.

@@ -43,7 +43,7 @@ from edp.workflows.transfer.source import SourceModel, read_source, target_exper
 KIND, SHOWN = "transfer", "transfer_predictions.safetensors"
 BEFORE = "direct"
 RENAMED = {"replay": "rehearsal", "replay_distilled": "rehearsal_distilled"}
-"""Methods by their former names; ``edp replay`` judges a log with an adapted network and mixes no data."""
+"""Methods by their former names; ``edp replay`` evaluates a log with an adapted network and mixes no data."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +93,7 @@ def finetune(
     progress: Progress = SILENT,
     workers: Workers = IN_PROCESS,
 ) -> TransferFile:
-    """Train a network of one machine further for another, judge it with baselines, and write a run folder.
+    """Train a network of one machine further for another, evaluate it with baselines, and write a run folder.
 
     The source's scaling is carried and never fitted again. Each log is divided by time into training, validation and
     test part with a gap of W + k. The same call goes on after a stop. Baselines lie in ``baselines/`` of the folder.

@@ -67,7 +67,7 @@ class Method(Protocol):
     label: ClassVar[str]
     """Name in tables and pictures."""
     trains: ClassVar[bool] = True
-    """Whether it leaves a run, which can be judged, reported and exported."""
+    """Whether it leaves a run, which can be evaluated, reported and exported."""
     needs_source: ClassVar[bool] = False
     """Whether it needs the recordings of the source."""
     needs_code: ClassVar[bool] = False
@@ -105,7 +105,7 @@ class MachineCodeAlone(Method):
 
 @METHODS.register("direct")
 class Direct(Method):
-    """Network of the source with its own scaling, without further training (4.4.1)."""
+    """Network of the source with its own scaling, without fine-tuning (4.4.1)."""
 
     label = "Direct transfer"
     trains = False

@@ -108,7 +108,7 @@ def distributions(errors: Mapping[str, Errors], targets: Sequence[str]) -> dict[
 
 
 def excerpts(predictions: Mapping[str, Predictions], data: Prepared, skip: int) -> dict[str, NDArray[np.float32]]:
-    """Return the stretches of the test part with the most movement of targets: truth and predictions, SI units.
+    """Return the segments of the test part with the most movement of targets: truth and predictions, SI units.
 
     Returns:
         ``NAME/truth`` ``(time, horizon, target)`` at t + k, ``NAME/METHOD`` the predictions made at t, and

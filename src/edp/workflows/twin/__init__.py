@@ -1,4 +1,4 @@
-"""Plant models in free run: trained on a data set, compared with floors, and run along a log."""
+"""Plant models in free run: trained on a data set, compared with baselines, and run along a log."""
 
 from edp.workflows.twin.forecast_logs import ForecastLogs, forecast_logs
 from edp.workflows.twin.judge_twin import evaluate_twin

@@ -57,7 +57,7 @@ class TwinTrial:
     Attributes:
         spec: its options.
         fits: a fit for each fold.
-        runs: free runs of the stretches that each fit left out.
+        runs: free runs of the segments that each fit left out.
     """
 
     spec: TwinSpec
@@ -143,7 +143,7 @@ class TwinChoice:
 
     @cached_property
     def folds(self) -> list[StretchFold]:
-        """Return the division of training and validation part: by the settings, or each stretch left out in turn.
+        """Return the division of training and validation part: by the settings, or each segment left out in turn.
 
         From `LONG_TICKS` on, and where a fold would be shorter than what is trained on, the settings' own division.
         """

@@ -144,7 +144,7 @@ class BaseTwin:
 
 @dataclass(frozen=True, eq=False)
 class ContinuedTwin:
-    """Twin under further training; free runs of the validation part select the number of updates, possibly zero.
+    """Twin under fine-tuning; free runs of the validation part select the number of updates, possibly zero.
 
     Attributes:
         fit: common inputs of all fits of the run.

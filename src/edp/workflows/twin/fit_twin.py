@@ -33,7 +33,7 @@ class FittedFormulation:
     Attributes:
         spec: the formulation with the options that were settled.
         fitted: twin, history, processor time.
-        unseen: twins beside stretches that trained none of their weights; they calibrate the intervals. Empty where
+        unseen: twins beside segments that trained none of their weights; they calibrate the intervals. Empty where
             these are the twin itself and the validation part.
     """
 

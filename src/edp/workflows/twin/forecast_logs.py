@@ -1,4 +1,4 @@
-"""Logs with forecasts of a twin as further channels, which networks read like measured ones."""
+"""Logs with forecasts of a twin as additional channels, which networks read like measured ones."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from edp.wording import typed
 from edp.workflows.twin.prepare_twin import answer_columns
 
 AHEAD = "_in_"
-"""Between the name of an answer and the ticks ahead, in the name of a forecast."""
+"""Between the name of an output and the ticks ahead, in the name of a forecast."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +89,7 @@ def forecast_logs(
         progress: receiver of the progress; its units are logs.
 
     Raises:
-        EdpError: logs of other channels or another rate, a channel that the twin does not answer, or a folder in use.
+        EdpError: logs of other channels or another rate, a channel that the twin does not output, or a folder in use.
     """
     check_horizons(horizons)
     if gain is not None:

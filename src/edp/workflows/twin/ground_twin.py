@@ -25,7 +25,7 @@ from edp.workflows.twin.prepare_twin import cut_recordings
 
 FOLDER = "twin"
 JUDGED = (FreeRunFile.NAME, RUNS, StepResponses.NAME)
-"""What the judgement of a twin leaves in its run."""
+"""What the evaluation of a twin leaves in its run."""
 GROUND_BASIS = (
     "those of the ground from least squares on forces along logs in soil, errors of 2 s taken as one; numbers of a "
     "direction are not below zero, whatever their intervals say"

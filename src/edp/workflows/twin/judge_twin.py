@@ -1,4 +1,4 @@
-"""Judgement of a twin with its floors, in free run and a few ticks ahead, on held-out recordings or on others."""
+"""Evaluation of a twin with its baselines, in free run and a few ticks ahead, on held-out recordings or on others."""
 
 from __future__ import annotations
 
@@ -58,11 +58,11 @@ def judge_twin(
     labels: Mapping[str, str],
     progress: Progress = SILENT,
 ) -> tuple[dict[str, FreeRunScores], FreeRuns]:
-    """Return the scores of a twin and its floors on the test part by label, and the twin's free runs.
+    """Return the scores of a twin and its baselines on the test part by label, and the twin's free runs.
 
     Args:
         bundle: the twin.
-        experiment: its settings; floors are fitted to training and validation part, with the same prefix: the twin
+        experiment: its settings; baselines are fitted to training and validation part, with the same prefix: the twin
             has seen both.
         data: prepared series.
         labels: see `driving_labels`.
@@ -103,7 +103,7 @@ def write_scores(
 
 
 def describe_channels(channels: TwinChannels) -> AnswerChannels:
-    """Return the facts of each answer for a page."""
+    """Return the data of each output for a page."""
 
     def reported(channel: Channel) -> ReportedChannel:
         kind = KINDS[channel.kind]
@@ -116,7 +116,7 @@ def describe_channels(channels: TwinChannels) -> AnswerChannels:
 
 
 def select_shown_runs(runs: FreeRuns, intervals: FreeRunIntervals | None) -> dict[str, NDArray[Any]]:
-    """Return a few thinned runs for pages: time, answers, truth, and half widths if intervals are known.
+    """Return a few thinned runs for pages: time, outputs, truth, and half widths if intervals are known.
 
     One run of each way of driving would need labels; one of each recording, evenly chosen, needs none.
     """
@@ -148,7 +148,7 @@ def evaluate_twin(
     predictor_run: str | Path | None = None,
     progress: Progress = SILENT,
 ) -> Path:
-    """Judge a twin again: on its held-out recordings, or on all of other recordings.
+    """Evaluate a twin again: on its held-out recordings, or on all of other recordings.
 
     Args:
         run: run folder of a twin.
@@ -160,7 +160,7 @@ def evaluate_twin(
         The folder with ``free_run.json``: the run folder, or one in it for `source`.
 
     Raises:
-        EdpError: no twin, recordings that changed since, or a predictor that predicts nothing that the twin answers.
+        EdpError: no twin, recordings that changed since, or a predictor that predicts nothing that the twin outputs.
     """
     folder = Path(run)
     bundle = load_twin(folder)
@@ -229,7 +229,7 @@ def compare_with_predictor(
 
 
 def _rows(name: str, recordings: Mapping[str, Recording]) -> tuple[Recording, int, int | None]:
-    """Return recording and rows of a stretch by its name, ``recording`` or ``recording[start:stop]``, see `prepare`."""
+    """Return recording and rows of a segment by its name, ``recording`` or ``recording[start:stop]``, see `prepare`."""
     if name in recordings:
         return recordings[name], 0, None
     whole, _, rows = name.removesuffix("]").rpartition("[")

@@ -1,4 +1,4 @@
-"""Stretches of recordings for training and judgement of a twin."""
+"""Stretches of recordings for training and evaluation of a twin."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from edp.recording import Recording
 
 
 def prepare_twin(source: DataSource, experiment: TwinExperiment) -> tuple[TwinChannels, Prepared]:
-    """Read and cut a data set: commands as inputs, the twin's answers as targets.
+    """Read and cut a data set: commands as inputs, the twin's outputs as targets.
 
     Raises:
         EdpError: recordings or settings that cannot be used.

@@ -29,7 +29,7 @@ from edp.workflows.twin.prepare_twin import answer_columns
 FREE = "_twin"
 """Behind the name of a channel, for what the twin answered in its place."""
 LOW, HIGH = f"{FREE}_low", f"{FREE}_high"
-"""Behind the name of a channel, for the ends of the interval of that answer."""
+"""Behind the name of a channel, for the ends of the interval of that output."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class Rollout:
     """Free run with the measured values.
 
     Attributes:
-        recording: commands, measured channels, and the twin's answers under names that end in `FREE`, with their
+        recording: commands, measured channels, and the twin's outputs under names that end in `FREE`, with their
             intervals under `LOW` and `HIGH`; row by row at the same time.
         scores: see `edp.evaluation.free_run.free_run_scores`.
         start_s: start of the free run in the log, s.
@@ -84,7 +84,7 @@ def rollout_log(run: str | Path, source: DataSource, request: RolloutRequest) ->
         request: part of the log, and files to write.
 
     Raises:
-        EdpError: several logs, another rate or kind, times outside the log, or a channel that the twin does not answer.
+        EdpError: several logs, another rate or kind, times outside the log, or a channel that the twin does not output.
     """
     bundle = load_twin(run)
     twin = bundle.twin
@@ -168,7 +168,7 @@ def _span(twin: Twin, recording: Recording, seconds: float, start_s: float | Non
 def _make_recording(
     twin: Twin, recording: Recording, answers: np.ndarray, half: np.ndarray | None, start: int
 ) -> Recording:
-    """Return a recording; row t holds commands, measurements, answers and intervals of tick start + 1 + t."""
+    """Return a recording; row t holds commands, measurements, outputs and intervals of tick start + 1 + t."""
     channels = twin.channels.commands + twin.channels.answers
     rows = slice(start + 1, start + 1 + len(answers))
     measured_values = recording.select([channel.name for channel in channels])[rows]
@@ -187,7 +187,7 @@ def _make_recording(
 
 
 def _rename_channels(twin: Twin, suffix: str, text: str) -> tuple[Channel, ...]:
-    """Return the channels of the answers under other names."""
+    """Return the channels of the outputs under other names."""
     return tuple(
         replace(channel, name=f"{channel.name}{suffix}", description=f"{channel.description} ({text})".strip())
         for channel in twin.channels.answers

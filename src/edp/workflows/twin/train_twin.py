@@ -1,4 +1,4 @@
-"""Training of a twin into a run folder, with its scores and those of the floors in free run."""
+"""Training of a twin into a run folder, with its scores and those of the baselines in free run."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ def _linkage(experiment: TwinExperiment) -> dict[str, object]:
 
 
 def _train_or_choose(fit: TwinFit, run: KeyedRun, base: BaseTwin | None) -> FittedFormulation:
-    """Return the twin of the settings, or the further trained one; a choice is kept in ``candidates.json``."""
+    """Return the twin of the settings, or the fine-tuned one; a choice is kept in ``candidates.json``."""
     spec = fit.experiment.twin
     if base is not None:
         result, tried = ContinuedTwin(fit, base, run).best()

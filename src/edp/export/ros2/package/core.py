@@ -1,6 +1,6 @@
 """The network in C behind ctypes, and the rules by which messages become its ticks. Needs Python and a C compiler only.
 
-Nothing here knows ROS: messages are plain numbers with a time. `node.py` is the thin part that does.
+Nothing here knows ROS: messages are dimensionless values with a time. `node.py` is the thin part that does.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ LATE_TICKS = 2.0
 RATE_TOLERANCE = 0.1
 """How far the median time between messages may be from a tick, as a share of it."""
 RATE_MESSAGES = 11
-"""Messages over which the rate is judged."""
+"""Messages over which the rate is evaluated."""
 LOOPED_S = 1.0
 """A step back in time by more than this is another recording, not a late message."""
 

@@ -89,7 +89,7 @@ def _signals(values: list[Any], depth: int) -> Iterator[Any]:
 
 
 def _record(path: Path, records: h5py.Group, signal: Any, field: str) -> NDArray[Any] | None:
-    """Return the samples of a record as ``(time, column)``; None without a record of real numbers."""
+    """Return the samples of a record as ``(time, column)``; None without a record of real values."""
     reference = np.asarray(signal[field])
     if reference.dtype.kind not in "fiu" or reference.size != 1:
         return None
@@ -108,7 +108,7 @@ def _record(path: Path, records: h5py.Group, signal: Any, field: str) -> NDArray
 
 
 def _sample(signal: Any) -> tuple[str | None, int]:
-    """Return number type and count of the elements of one sample; the type is None unless they are real numbers."""
+    """Return number type and count of the elements of one sample; the type is None unless they are real values."""
     names = signal.dtype.names
     facts = np.asarray(signal["SignalAttributes"]).ravel() if "SignalAttributes" in names else np.empty(0)
     if not facts.size or not facts.dtype.names:

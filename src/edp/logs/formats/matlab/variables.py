@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 MAGIC = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")
 INFO = "edp_info"
-"""The variable that holds EDP's facts."""
+"""The variable that holds EDP's data."""
 
 
 @dataclass
@@ -33,7 +33,7 @@ class MatVariables:
         scalars: single numbers.
         repeated: names that several columns have, with the names that tell them apart.
         names: names of the variables.
-        info: EDP's facts, a text; None where the file has none.
+        info: EDP's data, a text; None where the file has none.
         experiments: experiments of one ``iddata``; if there are several, each is read separately.
         experiment_names: names of those that stand beside each other in one variable (``train{1}``).
     """

@@ -24,8 +24,8 @@ class GreyChannelMap:
         sides: columns of the commands that extend and retract ``(valve, 2)``; -1: none.
         actuator: index of the actuator of each valve.
         pump: index of the pump of each valve; -1 for the supply.
-        ports: kind (velocity, stroke, pressure) and number of the state behind each answer ``(answer, 2)``.
-        columns: answers of velocity, stroke, head and rod pressure of each actuator; -1: not measured.
+        ports: kind (velocity, stroke, pressure) and number of the state behind each output ``(output, 2)``.
+        columns: outputs of velocity, stroke, head and rod pressure of each actuator; -1: not measured.
         z_of: middle of the strokes (m or rad) and scale to -1..1; a scale of 0 where a stroke is not measured.
         nodes: pressures that are states.
     """

@@ -36,7 +36,7 @@ def datasheet(table: ParameterTable, values: Doubles, information: Doubles) -> t
 
 
 def _polynomial_inertias(table: ParameterTable, values: Doubles, covariance: Doubles) -> list[DatasheetRow]:
-    """Return one row for the inertia of each actuator with the others at rest, at the middle of all strokes.
+    """Return one row for the inertia of each actuator with the others in steady state, at the middle of all strokes.
 
     It is the sum of squares of its row of the root, whose first coefficients are the root there; its interval follows
     from theirs and their covariance.

@@ -26,12 +26,12 @@ class GreyFitSpec:
 
     Attributes:
         lengths_s: lengths of the free runs, stage after stage.
-        rounds: rounds of each stage; every one draws other stretches.
+        rounds: rounds of each stage; every one draws other segments.
         starts: number of starting points of the first stage; the one with the least validation error is used.
         steps: Gauss-Newton steps in a round.
         lanes: free runs of a round at most.
         ticks: approximate total number of samples of the free runs in a round.
-        memory: share of what a round knows that counts in the next one, beside its own stretches.
+        memory: share of what a round knows that counts in the next one, beside its own segments.
         final_rounds: number of rounds after all stages, each with one step on free runs of the longest length; 0 for
             none.
         final_ticks: approximate total number of samples of the free runs in a final round.

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 RENEWED_TICKS = 5
-"""After how many ticks in the ground the effect of a force on the velocities is asked for anew."""
+"""After how many ticks in the ground the effect of a force on the velocities is asked for again."""
 
 
 class GroundContact(ABC):

@@ -1,6 +1,6 @@
 """Compiled ground contact of a grey box with a known linkage: tip position, depth and holding forces.
 
-A force of the ground is a damper for one tick, the size of the force over the speed: it stands still within the tick,
+A force of the ground is a damper for one tick, the size of the force over the speed: it does not move within the tick,
 opposes the motion or stands across it, so that the ground never gives energy, whatever the numbers of its law are.
 """
 

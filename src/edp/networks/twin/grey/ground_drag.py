@@ -44,7 +44,8 @@ PARAMETERS += [Parameter("ground", "across_by_depth", "N/m", 1.0, 0.0, 5e4, posi
 PLAUSIBLE = Priors.from_parameters(PARAMETERS).width
 """Prior standard deviations of the numbers."""
 MIN_DEPTH, MIN_SPEED = -0.1, 0.03
-"""Rows of a fit are at least as deep (m), and at least as fast (m/s): at rest friction answers, whatever the ground."""
+"""Rows of a fit are at least as deep (m), and at least as fast (m/s): in steady state friction outputs, whatever the
+ground."""
 CLEAR_M = 0.3
 """Above the surface; forces that the logs show there are errors of the equations, and are taken off."""
 BLOCK = 200

@@ -48,8 +48,8 @@ def load_start(
 
     Args:
         table: of numbers.
-        train: training stretches.
-        columns: of velocity, stroke, head and rod pressure of each actuator among the answers; -1: not measured.
+        train: training segments.
+        columns: of velocity, stroke, head and rod pressure of each actuator among the outputs; -1: not measured.
         z_of: middle and scale of the strokes.
         rate_hz: samples per second.
         declared: whether the areas of each actuator are known, or one follows of the other.

@@ -15,10 +15,10 @@ from edp.wording import typed
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 COARSE = np.array([0.0, 0.1, 0.25, 0.45, 0.7, 1.0])
-"""Knots of an opening curve of five stretches, as shares of the spool's travel behind the dead band: denser where
+"""Knots of an opening curve of five segments, as shares of the spool's travel behind the dead band: denser where
 levers are finer."""
 STRETCHES = (5, 10, 20)
-"""Of an opening curve. Each number halves the stretches of the one before: a finer curve can be a coarser one."""
+"""Of an opening curve. Each number halves the segments of the one before: a finer curve can be a coarser one."""
 MEGA, LITRE = 1e6, 1e3
 PLAUSIBLE_AREAS = (0.015, 0.008)
 """m^2, of head and rod side where no bore is known."""

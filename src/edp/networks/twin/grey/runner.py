@@ -66,7 +66,7 @@ class GreyRunner(TwinRunner):
         first: NDArray[np.int64],
         single: int | None = None,
     ) -> tuple[Array, tuple[Doubles, ...]]:
-        """Return outputs ``(run, tick, answer)`` and the final state of the first run; see `run_near` for `single`."""
+        """Return outputs ``(run, tick, output)`` and the final state of the first run; see `run_near` for `single`."""
         ticks = commands.shape[1]
         now = tuple(np.array(state[name][0], np.float64, order="C") for name in self._names)
         answers = np.empty((*commands.shape[:2], len(self._units)))

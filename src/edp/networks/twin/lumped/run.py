@@ -21,7 +21,7 @@ Wiring = tuple[Integers, Integers, Integers, Doubles, Doubles, Doubles, tuple[in
 """Rows of the elements, each with the place of its first number last, and what bounds and paces them.
 
 Lags: command, column. Masses: command, column. Tanks: command of the pump or -1, tank above or -1, column of the level
-or -1, hidden state or -1. Then low and high of each answer, width of each command, (steps, velocities, whether strokes
+or -1, hidden state or -1. Then low and high of each output, width of each command, (steps, velocities, whether strokes
 are measured), and ticks in a second.
 """
 SMALL = 1e-8
@@ -164,12 +164,12 @@ def _tick(
 
 @compiled
 def free_run(numbers: Values, commands: Doubles, answer: Values, hidden: Values, wiring: Wiring) -> Values:
-    """Simulate outputs ``(lane, tick, answer)`` from commands only.
+    """Simulate outputs ``(run, tick, output)`` from commands only.
 
     Args:
-        numbers: of each lane ``(lane, number)``; `commands` ``(lane, tick, command)``.
+        numbers: of each lane ``(run, number)``; `commands` ``(run, tick, command)``.
         commands: see above.
-        answer: before the first tick ``(lane, answer)``; `hidden` likewise ``(lane, level)``.
+        answer: before the first tick ``(run, output)``; `hidden` likewise ``(run, level)``.
         hidden: see above.
         wiring: see `Wiring`.
     """
@@ -193,7 +193,7 @@ def simulate_measured(
     hidden: NDArray[np.float32],
     wiring: Wiring,
 ) -> NDArray[np.float32]:
-    """Simulate outputs ``(lane, tick, answer)``; a port reads the measurement, or the last output if it is NaN.
+    """Simulate outputs ``(run, tick, output)``; a port reads the measurement, or the last output if it is NaN.
 
     State is rounded at each tick, so that a run that goes on from a kept state is the same one. `answer` and `hidden`
     are moved to the end of the run.

@@ -56,7 +56,7 @@ class Sink(Protocol):
         ...
 
     def begin_anew(self) -> None:
-        """Start anew: the next row does not continue the last one, and models forget."""
+        """Start again: the next row does not continue the last one, and models forget."""
         ...
 
     def leave_out(self, reason: str) -> None:

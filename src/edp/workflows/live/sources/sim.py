@@ -31,7 +31,7 @@ class SimSource(LiveSource):
         rate_hz: ticks per second.
         seed: random seed of the first episode.
         settings: ``excitation``, ``faults`` (texts, see `edp.sim.faults`) and ``material``, where they are given.
-        further: names of channels that are shown besides, where the simulator knows them.
+        further: names of additional simulator channels to show.
 
     Raises:
         EdpError: gymnasium is not installed, or there is no such machine or excitation.

@@ -69,8 +69,8 @@ def answer_all(
     Args:
         context: context of the search.
         quests: quests to answer.
-        stops: steps at which trainings of a batch are judged and may end early. All of a batch are judged by what was
-            reported of earlier batches, in the order of their numbers, so that who trained them has no say.
+        stops: steps at which trainings of a batch are evaluated and may end early. All of a batch are evaluated by what
+            was reported of earlier batches, in the order of their numbers, so that who trained them has no say.
     """
     spec = context.spec
     answers: list[list[Trial]] = [[] for _ in quests]

@@ -161,7 +161,7 @@ def recipe_of(context: SearchContext, order: CompressionRequest | None = None) -
 
 
 def order_of(context: SearchContext, teacher: Arm, recipe: Recipe, judged: Sequence[str] = ()) -> TrainingRequest:
-    """Return the request that makes and judges a recipe's network, by default on the comparing sessions."""
+    """Return the request that makes and evaluates a recipe's network, by default on the comparing sessions."""
     validation, updates = context.validation, context.spec.final_updates
     sessions = tuple(judged) or validation
     order = context.order(teacher, context.training, sessions, context.seed(NAME), updates, validation)

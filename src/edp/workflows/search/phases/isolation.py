@@ -143,7 +143,7 @@ def lowest_against_others(tables: Mapping[str, Array], mask: NDArray[np.bool_]) 
 
     Args:
         tables: scores ``(run, session)`` by the name of the arm.
-        mask: cells that are judged.
+        mask: cells that are evaluated.
     """
     means = {name: float(arm_table[mask].mean()) for name, arm_table in tables.items()}
     best = min(means, key=lambda name: means[name])
@@ -168,7 +168,7 @@ def _tables(context: SearchContext, outcomes: Sequence[Outcome], arms: int, name
 
 
 def _mask_sessions(context: SearchContext) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return a mask ``(run, session)`` of the sessions that some run judges, and those sessions."""
+    """Return a mask ``(run, session)`` of the sessions that some run evaluates, and those sessions."""
     mask = context.folds(context.spec.isolation.runs)
     seen = np.asarray(mask.any(axis=0))
     return mask[:, seen], seen

@@ -30,7 +30,7 @@ class Synthesis:
         return context.spec.synthesis.trials * context.spec.trial_runs + 2 * context.spec.run_seeds
 
     def run(self, context: SearchContext) -> Course:
-        """Tune modules and rates together; train the best and the baseline at full length, and judge both once."""
+        """Tune modules and rates together; train the best and the baseline at full length, and evaluate both once."""
         confirmed = list(context.facts(ConfirmationFacts).confirmed)
         switches = [*confirmed, *context.spec.toggles]
         base, values, _ = baseline_of(context)
@@ -71,10 +71,10 @@ class Synthesis:
 
 
 def final_orders(context: SearchContext, arm: Arm) -> list[TrainingRequest]:
-    """Return trainings on all development sessions at full length, judged on the test sessions; one per seed.
+    """Return trainings on all development sessions at full length, evaluated on the test sessions; one per seed.
 
-    Several epochs are validated by the development sessions that judge the first run, which then do not train: the test
-    sessions have no say.
+    Several epochs are validated by the development sessions that evaluate the first run, which then do not train: the
+    test sessions have no say.
     """
     train = context.development
     validation: tuple[str, ...] = ()
