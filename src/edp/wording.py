@@ -1,4 +1,4 @@
-"""Text for numbers and names: few digits, one precision per column, units next to the value."""
+"""Text for values and names: few digits, one precision per column, units next to the value."""
 
 from __future__ import annotations
 
@@ -78,12 +78,12 @@ def typed(value: float | None, digits: int = MAX_DIGITS) -> str:
 
 
 def unit_text(unit: str) -> str:
-    """Return a unit for display: empty for dimensionless numbers, whose unit in files is "1"."""
+    """Return a unit for display: empty for dimensionless values, whose unit in files is "1"."""
     return "" if unit == "1" else unit
 
 
 def behind(unit: str) -> str:
-    """Return a unit with a leading space; empty for dimensionless numbers."""
+    """Return a unit with a leading space; empty for dimensionless values."""
     return f" {unit_text(unit)}".rstrip()
 
 

@@ -81,7 +81,7 @@ class ModelBatch(PlantBatch):
         self._ticks, self.tick = round(duration_s * rate_hz), np.zeros(count, np.int64)
 
     def begin(self, index: int, seed: int | None, rng: np.random.Generator, options: Options) -> Infos:
-        """Begin an episode in steady state at ``strokes`` (fractions of full stroke); nothing is drawn.
+        """Begin an episode in steady state at ``strokes`` (fractions of full stroke), without random values.
 
         Raises:
             ConfigError: an option is unknown, or a soil where there is no ground.
@@ -110,7 +110,7 @@ class ModelBatch(PlantBatch):
         return self._outcome
 
     def truth(self, index: Index) -> Mapping[str, object]:
-        """Return strokes and tip of one plant, or of all."""
+        """Return strokes and tip for one plant or for all plants."""
         strokes = self.observed[index][..., self._strokes].astype(float)
         values = np.concatenate([strokes, self._geometry.tip(strokes)], axis=-1).T
         return dict(zip((*STROKES, *TIP), values.tolist() if values.ndim == 1 else values, strict=True))

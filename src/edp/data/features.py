@@ -196,7 +196,7 @@ def derive(entry: Derived, source: FloatArray, rate_hz: float) -> FloatArray:
 
 
 def _trailing_mean(values: FloatArray, ticks: int) -> np.ndarray:
-    """Return the mean of the last `ticks` values, or of all values so far, ``(time,)`` in double precision."""
+    """Return the mean of the last `ticks` values, or of all values until now, ``(time,)`` in double precision."""
     # About the first value: sums of 30 MPa over hours would lose the digits in which the signal lies.
     first = float(values[0]) if len(values) else 0.0
     sums = np.concatenate([np.zeros(1), np.cumsum(values.astype(np.float64) - first)])

@@ -71,7 +71,7 @@ def target_means(series: Sequence[Series]) -> DoubleArray:
 
 
 def anchors(inputs: FloatArray, task: LagTask, means: DoubleArray) -> DoubleArray:
-    """Return the reference value of each prediction: the present measurement, or the training mean if there is none.
+    """Return the reference value of each prediction: the present measurement, or the training mean if missing.
 
     Args:
         inputs: ``(row, input)``.

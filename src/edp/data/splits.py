@@ -139,7 +139,7 @@ class ByName(ByRecording):
 
 
 def kind_of_name(name: str) -> str:
-    """Return the name of a recording without its numbers: ``m22_003_dig`` becomes ``m dig``."""
+    """Return the name of a recording without digits: ``m22_003_dig`` becomes ``m dig``."""
     return " ".join(re.findall(r"[^\W\d_]+", name))
 
 
@@ -352,7 +352,7 @@ def machine_of(recording: Recording) -> str:
 
 
 def _spread(names: Sequence[str], families: Mapping[str, str]) -> list[str]:
-    """Return the names in order with each family evenly distributed, so that any cut has its fraction of all."""
+    """Return the names in an order that distributes each family evenly, so that any cut has its proportion of each."""
     size = Counter(families[name] for name in names)
     seen: Counter[str] = Counter()
     position = {}

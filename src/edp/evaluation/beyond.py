@@ -63,7 +63,7 @@ def commands_beyond(ranges: Any, channels: TwinChannels, inputs: Sequence[NDArra
 
 
 def _ends(value: Any) -> tuple[float, float] | None:
-    """Return two finite ascending numbers; None for any other value."""
+    """Return two finite ascending values; None for any other value."""
     if not isinstance(value, list) or len(value) != 2:
         return None
     if not all(isinstance(end, int | float) and math.isfinite(end) for end in value) or value[0] > value[1]:
@@ -72,7 +72,7 @@ def _ends(value: Any) -> tuple[float, float] | None:
 
 
 def describe_excess(beyond: Mapping[str, CommandExcess]) -> str:
-    """Return a warning about errors and intervals outside the training range; empty if there is no excess."""
+    """Return a warning about errors and intervals outside the training range; empty within the training range."""
     if not beyond:
         return ""
     listed = ", ".join(

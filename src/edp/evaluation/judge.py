@@ -109,7 +109,7 @@ class _Kept:
             yield number, values
 
     def bounds(self, bounds: Numbered, which: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
-        """Yield the intervals ``(time, coverage, 2, horizon, target)`` unchanged, and store one of them."""
+        """Yield the intervals ``(time, coverage, 2, horizon, target)`` unchanged, and store the selected one."""
         for number, values in bounds:
             for end, side in enumerate(("network_low", "network_high") if number < len(self.series) else ()):
                 self._keep(number, side, values[:, which, end])
@@ -224,7 +224,7 @@ def first_scored(predictor: Predictor, data: Prepared, spec: JudgeSpec) -> int:
 
 
 class ModelBench:
-    """Evaluation of models one by one on the same samples: all here, or each in a separate process.
+    """Evaluation of several models on the same samples, in this process or in one process per model.
 
     Args:
         predictor: the network.
@@ -246,7 +246,7 @@ class ModelBench:
         return self.network_of(map(self.network_part, range(network_parts(self.data))), label, seconds)
 
     def network_part(self, number: int) -> JudgedPart:
-        """Run the network on one of the `network_parts` of the test part."""
+        """Run the network on a part of the test data; `network_parts` lists the parts."""
         net, test, pictures = self.predictor, self.data.test, _Kept(self.data.test)
         groups, coverages = _groups_of_part(self.data, number), net.spec.output.coverages
         predictions = pictures.seen(streamed(net, net.predict, test, groups=groups), "network")

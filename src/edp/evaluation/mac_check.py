@@ -88,7 +88,7 @@ class Trace(TorchDispatchMode):
         super().__exit__(*error)
 
     def read(self, values: Any) -> None:
-        """Mark a tree of tensors as data fed to the network."""
+        """Mark a tree of tensors as inputs of the network."""
         # Without the mark of data every product would pass for one of weights, computed once.
         self._data |= {_storage(value) for value in _tensors(values)}
 
@@ -193,7 +193,7 @@ def trace(predictor: Predictor, ticks: int, state: State | None = None) -> tuple
 
 
 def check_counted(predictor: Predictor) -> None:
-    """Compare the declared multiply-accumulates of a network's parts with those of one executed sample.
+    """Compare the declared multiply-accumulates of a network's parts with the executed ones.
 
     Raises:
         ConfigError: a part counts others than it runs, or computes with an operation that hides what it multiplies.

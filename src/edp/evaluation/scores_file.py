@@ -167,7 +167,7 @@ class ModelScores:
 
 @dataclass(frozen=True, kw_only=True)
 class OutsideRange:
-    """Channel outside its training range, for a fraction `share` of the samples."""
+    """Channel outside its training range, and the fraction of the samples outside."""
 
     channel: str
     share: float
@@ -175,7 +175,7 @@ class OutsideRange:
 
 @dataclass(frozen=True, kw_only=True)
 class TargetChange:
-    """Difference between the changes of a target and those in the training data.
+    """Difference between a target's changes in the test data and in the training data.
 
     Attributes:
         target: name.

@@ -58,7 +58,7 @@ class Decision:
 
 @dataclass(frozen=True, kw_only=True)
 class PhaseRow:
-    """Progress of a phase: trainings that it asked for first, and how they ended; moments are in ISO 8601.
+    """Progress of a phase: requested trainings and their outcomes, with ISO 8601 times.
 
     `seconds` of training are summed over workers, `wall_s` are by the clock.
     """

@@ -253,7 +253,7 @@ class SynthesisFacts(JointFacts):
 
 @dataclass(frozen=True, kw_only=True)
 class ExplorationFacts(JointFacts):
-    """Phase 5: the change by its winner against that of phase 4 on fresh folds, `fresh` scores of both there.
+    """Phase 5: comparison of its winner with the winner of phase 4 on folds that no phase has used before.
 
     `options` are the values that were searched, by option of a module; `teacher` is the phase whose winner is it.
     """

@@ -1,4 +1,4 @@
-"""Trials of feature sets: errors of one network that was trained on each of several sets."""
+"""Trials of feature sets: errors of one network, trained on each feature set."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from edp.settings.results import ResultFile
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """Difference of an error from that of the first set, report unit, with its 95 % interval."""
+    """Difference of an error from the error of the first set, in report units, with its 95 % interval."""
 
     mean: float
     low: float

@@ -158,7 +158,7 @@ def as_mat(variables: Mapping[str, object]) -> bytes:
 
 
 def _convert_for_matlab(value: Any) -> Any:
-    """Convert lists to rows of numbers or cells, and text to valid UTF-8."""
+    """Convert lists to rows of values or cells, and text to valid UTF-8."""
     if isinstance(value, str):
         # A lone surrogate has no UTF-8, in which text is written.
         return value.encode("utf-8", "replace").decode()

@@ -142,7 +142,7 @@ def golden_recording(predictor: Predictor, ticks: int) -> tuple[Rows, Rows, Rows
 
 
 def _take_until_clear(draws: Iterable[tuple[Rows, Rows]]) -> Iterator[tuple[Rows, Rows]]:
-    """Yield draws up to the first one without a step."""
+    """Yield draws until the first draw without a step."""
     for inputs, steps in draws:
         yield inputs, steps
         if not steps.any():

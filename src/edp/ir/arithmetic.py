@@ -1,4 +1,4 @@
-"""Both arithmetics of float layers: exact, and that of the C runtime with the operations in its order, bit for bit."""
+"""Arithmetic of float layers: exact, or bit for bit as in the C runtime."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ class Arithmetic(ABC):
 
 @dataclass(frozen=True, eq=False)
 class LayerRun:
-    """What the equations of a layer read and change in addition to its inputs.
+    """State and options of one run of a layer's equations, in addition to its inputs.
 
     Attributes:
         constants: constants of the layer, in the number type of the interpreter.

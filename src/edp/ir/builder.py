@@ -15,7 +15,7 @@ from edp.ir.layers import BinaryOperation, Elementwise, Gather
 
 
 def constant(values: Any) -> Array:
-    """Return numbers, an array or a tensor as a new float32 array.
+    """Return values, an array or a tensor as a new float32 array.
 
     Raises:
         ExportError: one of them is not finite.

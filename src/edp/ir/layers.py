@@ -47,7 +47,7 @@ class Function(StrEnum):
 
 
 class BinaryOperation(StrEnum):
-    """Operation on two numbers, the first operand first."""
+    """Operation on two values, the first operand first."""
 
     ADD = "add"
     SUBTRACT = "subtract"

@@ -315,7 +315,7 @@ class Rotation(Layer):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrailingMean(Layer):
-    """Mean of the last `window` inputs, or of all inputs so far. Slots: ring, and sample count up to `window`."""
+    """Mean of the last `window` inputs, or of all inputs until now. Slots: ring, and sample count up to `window`."""
 
     bit_exact = True
     counted = True
@@ -548,6 +548,6 @@ def _times(weight: Values, x: Values) -> Values:
 
 
 def _recurrent_products(name: str, x: Values, y: Values) -> dict[str, Values]:
-    """Return what both matrices of a recurrent layer are multiplied by; see `Layer.products`."""
+    """Return the inputs of both matrix products of a recurrent layer; see `Layer.products`."""
     before = np.concatenate([np.zeros_like(y[:1]), y[:-1]])
     return {f"{name}/x": x[:, None], f"{name}/h": before[:, None]}

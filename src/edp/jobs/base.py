@@ -61,7 +61,7 @@ class Executor(Protocol):
         ...
 
     def wait_any(self, timeout_s: float | None = None) -> Record | None:
-        """Return the next finished training; None after the timeout or if there is nothing to wait for."""
+        """Wait for the next finished training and return it; None after the timeout or without running trainings."""
         ...
 
     def cancel(self, key: str) -> None:

@@ -90,7 +90,7 @@ class RayPool(ClosedAtExit):
         self._refs[reference] = job.key
 
     def running(self) -> list[str]:
-        """Return the keys of the jobs in the cluster, at most as many as it has room for."""
+        """Return the keys of the jobs in the cluster, at most as many as its capacity."""
         return list(self._refs.values())[: self.workers]
 
     def wait_any(self, timeout_s: float | None = None) -> Record | None:

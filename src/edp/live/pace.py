@@ -96,7 +96,7 @@ class Pace:
             self._changed.notify_all()
 
     def run_ahead(self, tick: int) -> None:
-        """Process all samples before this one without delay, so that models have seen them."""
+        """Process all samples before this sample without delay, so that models have seen them."""
         with self._changed:
             self._ahead = tick
             self._changed.notify_all()

@@ -45,7 +45,7 @@ def live_page(title: str, host: str) -> tuple[str, str]:
 
 
 def session_page(session: LiveSession) -> str:
-    """Return the data streamed so far as one page without a server, with at most the latest `SAVED_BYTES` of rows."""
+    """Return the data streamed so far as a page without a server, limited to the latest `SAVED_BYTES` of rows."""
     most = max(1, SAVED_BYTES // (4 * session.layout.width))
     first, rows = session.read(session.ticks - most, most)
     content = {

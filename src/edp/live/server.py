@@ -249,7 +249,7 @@ class LiveServer:
             sending.cancel()
 
     def _obey(self, viewer: Viewer, message: str | bytes) -> None:
-        """Execute a viewer's request, or tell it why not."""
+        """Execute a viewer's request, or send the reason for a refusal."""
         if not viewer.may_ask():
             return
         try:

@@ -86,7 +86,7 @@ def is_text_log(path: Path) -> bool:
 
 
 def export_advice(suffix: str) -> str:
-    """Return advice on converting a file with an unsupported ending; empty if there is none."""
+    """Return advice on converting a file with an unsupported ending; empty if missing."""
     return _EXPORT.get(suffix, "")
 
 

@@ -25,7 +25,7 @@ _CHOICES = {
 
 @dataclass(frozen=True)
 class Repair:
-    """Repairs allowed while reading; by default there are none.
+    """Repairs allowed while reading; the default allows no repair.
 
     Attributes:
         nan: missing or infinite values: ``hold`` the last good value, or ``keep`` them as NaN.

@@ -85,7 +85,7 @@ def _other_entries(raw: RawLog, signal_map: SignalMap) -> list[ChannelMap]:
 
 
 def _holds_numbers(signal: RawSignal) -> bool:
-    """Return whether the first rows are numbers. Text in later rows is an error when the column is read."""
+    """Return whether the first rows are numeric. Text in later rows is an error when the column is read."""
     try:
         if signal.table is None:
             signal.load()

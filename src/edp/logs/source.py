@@ -220,7 +220,7 @@ class DataSource:
         return recordings
 
     def inspect(self, progress: Progress = SILENT, workers: Workers = IN_PROCESS) -> DataQuality:
-        """Report what is in each log, what is wrong with it, and which logs repeat each other; nothing is repaired.
+        """Report the content and the faults of each log and logs that repeat each other, without repairs.
 
         Args:
             progress: receiver of the progress; its units are logs, or recordings of a store.
@@ -564,5 +564,5 @@ def inspect_stored(identity: TrainingIdentity, where: Mapping[str, Any]) -> With
 
 @lru_cache(maxsize=1)
 def _open_store(store: str, digest: str, at_most_h: float | None) -> list[Recording]:
-    """Return the recordings of a store, opened once for all units of a process; `digest` is that of its content."""
+    """Return the recordings of a store, opened once for all units of a process; `digest` identifies the content."""
     return DataSource(Path(store), at_most_h=at_most_h).read()

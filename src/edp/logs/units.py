@@ -133,7 +133,7 @@ def add_kinds(signal_map: SignalMap) -> SignalMap:
 
 
 def drop_derived_kinds(signal_map: SignalMap) -> SignalMap:
-    """Return a map with the meaning of earlier versions, which read a channel without a kind as dimensionless values."""
+    """Return a map as earlier versions read it: channels without a kind are dimensionless."""
     entries = (
         replace(entry, kind=Kind.GENERIC) if _add_kind(entry) != entry else entry for entry in signal_map.channels
     )
@@ -147,7 +147,7 @@ def _add_kind(entry: ChannelMap) -> ChannelMap:
 
 
 def unit_for(stated: str | None, kind: Kind, where: str) -> Unit:
-    """Return the conversion for a unit stated by file or map; SI if there is none.
+    """Return the conversion for the unit stated by file or map; SI if no unit is stated.
 
     A generic channel has no unit of its own: its numbers are taken as they are.
 

@@ -47,7 +47,7 @@ class SlowDrift:
 
     @staticmethod
     def from_dict(plain: Table) -> SlowDrift:
-        """From plain values.
+        """Create the drift from the result of `to_dict`.
 
         Raises:
             ValueError: values that cannot be.

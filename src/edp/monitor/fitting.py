@@ -276,7 +276,7 @@ class _Part:
 
 @dataclass(frozen=True, eq=False)
 class FittedPart:
-    """Conditioning, views, and the rows of each view for each session that they were not fitted to."""
+    """Conditioning and views, with the rows of each view for sessions outside its training data."""
 
     conditioning: Conditioning
     watches: tuple[Watch, ...]

@@ -364,7 +364,7 @@ class MonitorStream:
         return Verdict(alarm, silent, self._statistics, bool(verdicts))
 
     def _alarm(self, verdict: BlockVerdict) -> MonitorAlarm:
-        """Return the alarm with causes from the rows so far."""
+        """Return the alarm with causes from the rows until now."""
         alarm, onset = self.monitor.alarm(verdict), onset_of(verdict.since, tuple(self._earlier))
         self._earlier.append((verdict.since, verdict.block))
         if self.monitor.diagnosis is None:

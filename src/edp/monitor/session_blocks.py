@@ -106,7 +106,7 @@ def drivers_of(channels: Sequence[Channel], session: Recording, judged: Sequence
 
 
 def _likely_axis(axes: Sequence[Axis], session: Recording, name: str) -> Axis | None:
-    """Return the axis whose velocity magnitude correlates most with that of a channel."""
+    """Return the axis whose velocity magnitude correlates most with the magnitude of a channel."""
     if not axes or name not in session.channel_names:
         return None
     sizes = np.abs(session.column(name).astype(np.float64) - float(session.column(name).mean()))

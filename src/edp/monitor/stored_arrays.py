@@ -36,7 +36,7 @@ def write_stored(folder: Path, name: str, header: Mapping[str, object], arrays: 
 
 
 def read_stored(folder: Path, name: str, schema: int) -> tuple[Table, dict[str, NDArray[Any]]]:
-    """Read header and arrays after a check of their hashes; nothing in them is executed.
+    """Read header and arrays after a check of their hashes; the content is never executed.
 
     Raises:
         StorageError: missing, damaged, changed, too large, or of another schema.

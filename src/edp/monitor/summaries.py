@@ -84,7 +84,7 @@ class BlockSummaries:
 
     @property
     def width(self) -> int:
-        """Number of values per block: `SUMMARIES` and drivers of the first residual, of the second, and so on."""
+        """Number of values per block: `SUMMARIES` and the driver columns of each residual."""
         return (len(SUMMARIES) + len(self.drivers)) * self.residuals
 
     @property

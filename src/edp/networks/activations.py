@@ -27,7 +27,7 @@ class ActivationSpec(Protocol):
         ...
 
     def bound(self) -> float | None:
-        """Return the largest possible magnitude; None if there is no limit."""
+        """Return the largest possible magnitude; None if unlimited."""
         ...
 
 

@@ -12,7 +12,7 @@ from edp.networks.stream import Inputs, Stream, StreamStatus, StreamTick
 
 
 class AdaptedStream(Stream):
-    """A stream whose predictions are corrected by what was learned on the way; see `edp.ir.rls.RlsCorrector`.
+    """Stream whose predictions are corrected online by recursive least squares; see `edp.ir.rls.RlsCorrector`.
 
     Held and missed ticks teach nothing; their predictions are corrected all the same, as in the exported C. Bounds of
     intervals move with the prediction.
@@ -34,7 +34,7 @@ class AdaptedStream(Stream):
         super().__init__(predictor, threads)
 
     def reset(self) -> None:
-        """Forget all ticks; what was learned stays. ``adapter.reset()`` forgets that."""
+        """Reset the state of the network; the learned correction remains. ``adapter.reset()`` resets the correction."""
         super().reset()
         # The change across a reset is no motion of the machine; learning from it would spoil the correction.
         self.adapter.interrupt()

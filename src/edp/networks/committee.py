@@ -81,7 +81,7 @@ class Members(Streaming):
 
 
 class Committee(Streaming):
-    """``[bank ; members' hidden units ; radial basis functions ; those on few columns ; trees' sums]``.
+    """Features of an ensemble: ``[bank ; hidden units ; radial functions ; sparse radial functions ; tree sums]``.
 
     A linear head on it is a linear model plus a weighted mean of perceptrons, a kernel machine and sums of trees.
 
@@ -122,7 +122,7 @@ class Committee(Streaming):
 
     @property
     def radials(self) -> list[RadialFeatures]:
-        """The radial basis functions, those on all columns first."""
+        """Radial basis functions on all columns, followed by radial basis functions on few columns."""
         parts = (self.radial, *self.near)
         return [functions for functions in parts if isinstance(functions, RadialFeatures)]
 

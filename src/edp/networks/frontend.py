@@ -34,7 +34,7 @@ class _Span:
 
 
 def _spans(derived: Sequence[Derived], rate_hz: float) -> tuple[_Span, ...]:
-    """Group derived channels by the kind and length of their mean, those without a mean first."""
+    """Group derived channels by the kind and length of their mean, starting with channels without a mean."""
     kinds = [(DERIVATIONS[entry.how].of_changes, entry.ticks(rate_hz)) for entry in derived]
     return tuple(
         _Span(*kind, tuple(number for number, other in enumerate(kinds) if other == kind))

@@ -107,7 +107,7 @@ class LinearHead:
 
     @property
     def hidden(self) -> int:
-        """Return 1, since there are no hidden features."""
+        """Return 1, the number of features without a hidden layer."""
         return 1
 
     def conflicts(self, model: Any, task: Any) -> str | None:
@@ -143,7 +143,7 @@ class OutputBand(nn.Module):
         return y - 2.0 * torch.clamp(y, -b, b) + torch.clamp(y, -2.0 * b, 2.0 * b)
 
     def lower(self, build: Builder, y: str) -> str:
-        """Add the dead band to a graph, with values varying slowest; nothing is added if all widths are 0."""
+        """Add the dead band to a graph, with values varying slowest; skip a dead band of zero width."""
         b = self.width.flatten()
         if not bool(b.any()):
             return y

@@ -100,7 +100,7 @@ class LagBank(Streaming):
         return max(self.lags[-1], *(2 * span - 1 for span in self.smoothed), 1)
 
     def columns_over(self, span: int) -> list[int]:
-        """Return the columns of the present values and of their changes over one of `lags`.
+        """Return the columns of the present values and of their changes over a lag.
 
         Only present values for span 0.
         """

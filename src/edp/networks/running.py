@@ -76,7 +76,7 @@ def stream_intervals(predictor: Predictor, series: Sequence[Series], batch: int 
 def stream_answers(
     predictor: Predictor, series: Sequence[Series], batch: int = 16, windowed: bool = False
 ) -> list[Prediction]:
-    """Return all standardised outputs at every sample, with a batch of one, in double precision on the CPU.
+    """Return all standardised outputs at every sample, with a batch of size 1, in double precision on the CPU.
 
     Args:
         predictor: the network.

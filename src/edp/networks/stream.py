@@ -167,7 +167,7 @@ class Stream:
         return ticks
 
     def missed(self, ticks: int = 1) -> StreamTick:
-        """Report samples that passed without a step; returns the result of the last of them.
+        """Report samples that passed without a step; return the result of the last missed sample.
 
         A gap that ends in a restart leaves the prediction as it was before the gap.
 

@@ -132,7 +132,7 @@ class Allowance:
             resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
 
     def exhausted(self) -> DataError:
-        """Return the error for exhausted memory: of the machine, or of the allowance for a file of this size."""
+        """Return the error for exhausted memory, of the machine or of the allowance for this file."""
         if self.bound + self.memory >= self.free:
             return DataError(
                 f"'{self.path}': reading it takes more memory than this machine has free ({gigabytes(self.free)} may "

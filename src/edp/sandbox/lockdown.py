@@ -43,7 +43,7 @@ _folders: list[Path] = []
 
 
 def note_libraries() -> None:
-    """Find the folders of the standard library, of installed libraries and of the packages imported so far.
+    """Find the folders of the standard library, of installed libraries and of the packages imported until now.
 
     A worker does so before it forks, whenever it has imported something.
     """

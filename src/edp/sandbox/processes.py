@@ -1,4 +1,4 @@
-"""Helper processes that end with their parent, in whatever way it ends."""
+"""Helper processes that end with their parent, even if the parent is killed."""
 
 from __future__ import annotations
 

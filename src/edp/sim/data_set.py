@@ -136,7 +136,7 @@ def simulate_data_set(
     workers: Workers = ONE_PER_CORE,
     on_done: Callable[[Scenario, bool], None] | None = None,
 ) -> list[Path]:
-    """Simulate a data set into a folder, one log per recording. Existing logs of the same order are kept.
+    """Simulate a data set into a folder, one log per recording. Existing logs of the same order are reused.
 
     Logs do not depend on who writes them: each scenario carries its own seed.
 
@@ -206,7 +206,7 @@ def write_log(identity: TrainingIdentity, where: Mapping[str, str]) -> dict[str,
 
 
 def _bound(folder: Path, identity: Mapping[str, object]) -> bool:
-    """Return whether a folder belongs to this order; False if it belongs to none."""
+    """Return whether a folder belongs to this order; False for an unmarked folder."""
     manifest = folder / MANIFEST
     if not is_entry_at(manifest):
         return False

@@ -218,7 +218,7 @@ def _rename_recording(name: str, machine: str) -> str:
 
 
 def hand_out(shares: Mapping[str, float], count: int) -> list[str]:
-    """Return `count` names in proportion to `shares`, mixed so that any leading part is in proportion, too.
+    """Return `count` names in the given proportions, mixed so that any leading part has these proportions, too.
 
     Each has its turn once, the largest share first, and then the one that is farthest behind, by Webster's method.
     """

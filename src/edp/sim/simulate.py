@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 
 class Simulation:
-    """Running simulation of a scenario: run it for some time, take snapshots, restore them, or branch off.
+    """Running simulation of a scenario, with snapshots and branches.
 
     Args:
         scenario: scenario to simulate.
@@ -50,7 +50,7 @@ class Simulation:
 
     @property
     def log(self) -> Array:
-        """Log so far, shape (samples, LOG_COLUMNS)."""
+        """Log until now, shape (samples, LOG_COLUMNS)."""
         return np.concatenate(self._logs) if self._logs else np.zeros((0, at.LOG_COLUMNS))
 
     @property
@@ -107,7 +107,7 @@ class Simulation:
         return np.concatenate(rows)
 
     def recording(self) -> Recording:
-        """Return the recorded signals of the log so far."""
+        """Return the recorded signals of the log until now."""
         return _recording(self.scenario, self.machine, self.log, self.plant.clamps)
 
     def snapshot(self) -> Snapshot:
@@ -141,7 +141,7 @@ class Simulation:
         return simulation
 
     def branch(self, seed: np.random.SeedSequence) -> None:
-        """Give operator and soil new random values from now on.
+        """Draw new random values for operator and soil.
 
         The operator's present action continues, see `redraw`.
         """

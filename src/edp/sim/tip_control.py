@@ -60,7 +60,7 @@ def inverse_lever(speed: float, speeds: Array, levers: Array, rest: float) -> fl
 
 @compiled
 def reference(leg: Array, time: float, ramp: float, setup: tuple[Any, ...], reached: Array) -> None:
-    """Compute stroke fractions at a time of a motion into `reached[:3]`; `setup` is that of `control`."""
+    """Write the stroke fractions at a time of a motion to `reached[:3]`; for `setup`, see `control`."""
     q = progress(time, leg[LENGTH], ramp)
     for i in range(at.AXES):
         reached[i] = leg[START + i] + q * (leg[GOAL + i] - leg[START + i])

@@ -101,7 +101,7 @@ class Concordance:
 
 
 def kendalls_w(scores: ArrayLike) -> Concordance:
-    """Test whether splits rank modules alike; equal scores share their mean rank.
+    """Test whether splits rank modules alike; equal scores have their mean rank.
 
     Args:
         scores: ``(split, module)``.

@@ -113,7 +113,7 @@ def _regular(factors: int, runs: int) -> Mask:
 
 
 def _repair_runs(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
-    """Repair runs with several active factors of a group: keep the factor that was kept least often so far."""
+    """Repair runs with several active factors of a group: select the factor with the fewest selections."""
     fixed = levels.copy()
     for group in groups:
         repairs = dict.fromkeys(group, 0)

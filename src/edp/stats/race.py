@@ -17,7 +17,7 @@ from edp.stats.variance import PairedVariance
 
 @dataclass(frozen=True)
 class InterimAnalysis:
-    """Interim analysis of the data so far.
+    """Interim analysis of the data until now.
 
     Attributes:
         runs: after which it is taken.

@@ -1,4 +1,4 @@
-"""Arrays of files: their declaration, the one reader that checks them, and numbers in JSON files."""
+"""Arrays of files: their declaration, the one reader that checks them, and values in JSON files."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ArrayRule:
     is_finite: bool = True
 
     def fault_of(self, values: NDArray[Any], sizes: dict[str, int]) -> str:
-        """Return what is wrong with an array, empty if nothing is; dimensions that are new are added to `sizes`."""
+        """Return the first fault of an array as text, empty without a fault; add new dimensions to `sizes`."""
         pairs = zip(self.shape, values.shape, strict=False)
         shape = tuple(one if isinstance(one, int) else sizes.setdefault(one, size) for one, size in pairs)
         is_type = values.dtype == self.dtype if self.is_exact else values.dtype.kind == np.dtype(self.dtype).kind
@@ -53,7 +53,7 @@ class ArrayRule:
         return f"{values[index]} at {index}"
 
     def expected(self, sizes: Mapping[str, int]) -> str:
-        """Return in words what is expected."""
+        """Return the expected dimensions and type as text."""
         parts = (f"{one} = {sizes[one]}" if isinstance(one, str) and one in sizes else str(one) for one in self.shape)
         words = [f"{np.dtype(self.dtype)} of shape ({', '.join(parts)})"] + ["finite"] * self.is_finite
         if self.low > -math.inf:
@@ -94,7 +94,7 @@ def _kind(values: NDArray[Any]) -> str:
 
 
 def arrays_under(arrays: Arrays, prefix: str) -> dict[str, NDArray[Any]]:
-    """Return the arrays whose names begin with a prefix, by the rest of their names."""
+    """Return the arrays whose names start with a prefix, by names without the prefix."""
     return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
 
 

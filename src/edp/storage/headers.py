@@ -54,7 +54,7 @@ def check_files(files: object, folder: str | Path, advice: str) -> None:
 
 
 def model_digest(path: str | Path) -> str:
-    """Return a hash of a model on disk that changes with its content: of its header, or of the file itself.
+    """Return a content hash of a model on disk: hash of its header, or of the file.
 
     Args:
         path: a run folder, the folder of a network, twin or monitor, or a file such as an FMU.
@@ -87,7 +87,7 @@ def is_whole(file: Path) -> bool:
 
 
 def _entries(header: Mapping[str, object]) -> Iterator[Mapping[str, object]]:
-    """Yield the entries that name a file of arrays: in the header, or in one of its parts."""
+    """Yield the entries of the header and its parts that name a file of arrays."""
     parts = [value for value in header.values() if isinstance(value, dict)]
     within = [value for part in parts for value in part.values() if isinstance(value, dict)]
     yield from (part for part in (*parts, *within) if part.keys() == _ENTRY)

@@ -70,7 +70,7 @@ class Compiler:
         return self._compile(function, {**self.options})
 
     def inlined(self, function: Function) -> Function:
-        """Compile like `compiled`, inlined into every caller, so that unused results cost nothing."""
+        """Compile like `compiled`, inlined into every caller, so that unused results have no cost."""
         return self._compile(function, {**self.options, "forceinline": True})
 
     def inner(self, function: Function) -> Function:

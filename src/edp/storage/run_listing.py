@@ -1,4 +1,4 @@
-"""Listing of runs below a folder from their files, read within bounds whatever they contain."""
+"""Listing of runs below a folder, with bounds on the size of every file that is read."""
 
 from __future__ import annotations
 

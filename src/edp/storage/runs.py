@@ -330,7 +330,7 @@ class KeyedRun:
 
 @contextmanager
 def part_of(run: KeyedRun | None, name: str) -> Iterator[KeyedRun | None]:
-    """Yield a locked subfolder of a run for one of its trainings.
+    """Lock and yield a subfolder of a run for one training.
 
     The run itself is returned for an empty `name`, None without a run.
     """

@@ -100,7 +100,7 @@ def declaration_errors(network: nn.Module, seen: Trace) -> list[str]:
 
 
 def check_operations(predictor: Predictor) -> None:
-    """Check that every part declares in `operations` exactly what it uses, so that an export target can refuse it.
+    """Check that every part declares exactly its operations in `operations`, so that an export target can refuse it.
 
     Args:
         predictor: predictor in double precision, in evaluation mode.

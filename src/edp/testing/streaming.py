@@ -175,7 +175,7 @@ def check_batch(predictor: Predictor) -> None:
 
 
 def check_gradients(predictor: Predictor) -> None:
-    """Check that the error reaches every trainable parameter, except those of an untrained skip connection.
+    """Check that the error reaches every trainable parameter; an untrained skip connection is exempt.
 
     Args:
         predictor: predictor in double precision.

@@ -62,7 +62,7 @@ def refusal_of(target: str, bundle: Bundle, folder: Path, options: Options = Non
 
 
 def check_names_refused(target: str, bundle: Bundle, folder: Path, options: Options = None) -> None:
-    """Check that invalid program names are refused and nothing is written.
+    """Check that invalid program names are refused before a file is written.
 
     Raises:
         ContractError: one is taken, or something is left behind.

@@ -99,7 +99,7 @@ def sample_twin(spec: TwinSpec, recording: Recording | None = None) -> tuple[Twi
 
 
 def check_twin(name: str, options: TwinSpec | None = None, recordings: Sequence[Recording] = ()) -> None:
-    """Check the contract of a registered formulation, for two actuators and for one with minimal sensors.
+    """Check the contract of a registered formulation, for two actuators and for minimal sensors.
 
     Args:
         name: under which it is registered.

@@ -333,7 +333,7 @@ def _assemble(header: Table, path: Path) -> Bundle:
 
 
 def _check_channels(header: Table, task: Task, inputs: Sequence[Channel]) -> None:
-    """Check that the listed channels are those of the task, in its order."""
+    """Check that the listed channels equal the channels of the task, in order."""
     # Order is meaning: swapped columns would give plausible and wrong predictions.
     if [channel.name for channel in inputs] != list(task.inputs):
         raise ValueError("its inputs are not those of its task")
@@ -348,7 +348,7 @@ def channel_to_dict(channel: Channel) -> dict[str, str]:
 
 
 def channel_from_dict(entry: Table) -> Channel:
-    """Create a channel from the result of `channel_to_dict`, or from one of earlier versions without a unit.
+    """Create a channel from the result of `channel_to_dict`; entries of earlier versions have no unit.
 
     Raises:
         ValueError: an unknown kind, or another unit than that of the kind.

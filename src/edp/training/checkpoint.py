@@ -59,13 +59,13 @@ class Within:
 
     @property
     def loss(self) -> float:
-        """Mean loss so far."""
+        """Mean loss until now."""
         return self.total / max(1, self.updates)
 
 
 @dataclass
 class Weights:
-    """Named tensors of the network, its average and the best so far; and the running errors of its outputs."""
+    """Named tensors of the network, its average and the best until now; and the running errors of its outputs."""
 
     current: dict[str, Tensor]
     average: dict[str, Tensor]

@@ -178,7 +178,7 @@ class Loop:
         return self._make_result()
 
     def _make_result(self) -> Fitted:
-        """Return the network with the best weights so far."""
+        """Return the network with the best weights until now."""
         with torch.no_grad():
             for name, parameter in self.net.named_parameters():
                 parameter.copy_(self.best[name])
@@ -263,7 +263,7 @@ class Loop:
         return seen
 
     def pause(self) -> Fitted:
-        """End training before the current epoch is complete and return the model with the best weights so far."""
+        """End training before the current epoch is complete and return the model with the best weights until now."""
         self.resumed_at, self.rate = self.progress.epoch, 0.0
         self.progress.history.append(self._judge_epoch(self.within.loss))
         return self._make_result()
@@ -339,7 +339,7 @@ class Loop:
         return row
 
     def _judge_epoch(self, loss: float) -> dict[str, object]:
-        """Validate the averaged weights and keep them if they are the best so far."""
+        """Validate the averaged weights and keep them if they are the best until now."""
         progress = self.progress
         score, report, validation_loss = self._validate()
         for what, value in (("score", score), ("loss", validation_loss)):

@@ -14,7 +14,7 @@ from edp.storage.reading import Table
 
 @dataclass(frozen=True)
 class FreeRunProgress(ResultFile):
-    """Progress of a training on free runs, also that of a training in another process (``progress.json``).
+    """Progress of a free-run training, in this process or in another process (``progress.json``).
 
     Attributes:
         update: updates done, of `updates`.

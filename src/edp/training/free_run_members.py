@@ -79,7 +79,7 @@ def train_unit(identity: TrainingIdentity, where: Mapping[str, MemberTraining]) 
 
 
 def read_progress_notes(jobs: Sequence[MemberTraining]) -> FreeRunProgress | None:
-    """Combine the latest progress of parallel trainings; None if there is none yet."""
+    """Combine the latest progress of parallel trainings; None if missing yet."""
     noted = [_read_progress(job) for job in jobs]
     events = [event for event in noted if event is not None]
     if not events:

@@ -118,7 +118,7 @@ class GreyProblem:
 
     @property
     def final_memory(self) -> float:
-        """Return the memory of the final rounds, limited by the samples, since repeated ones add nothing."""
+        """Return the memory of the final rounds, limited by the number of samples."""
         fit = self.twin.spec.fit
         return min(fit.final_memory, max(0.0, 1.0 - fit.final_ticks / self.ticks))
 
@@ -217,7 +217,7 @@ class _Stages:
         )  # fmt: skip
 
     def _advance(self, path: _Path, lengths: Sequence[float], final: bool = False) -> None:
-        """Run rounds on free runs of these lengths, and validate some of them."""
+        """Run rounds on free runs of these lengths, and validate at intervals."""
         for number, length_s in enumerate(lengths, 1):
             self.history.done += 1
             before = path.theta
@@ -273,7 +273,7 @@ class _Path:
         self.memory = self.memory if far else memory * (self.memory + self.matrix)
 
     def judge(self, error: float) -> bool:
-        """Store the validation error of the present position; return whether it is the least so far."""
+        """Store the validation error of the present position; return whether it is the least until now."""
         if error >= self.least:
             return False
         self.least, self.best, self.information = error, self.theta, self.memory + self.matrix

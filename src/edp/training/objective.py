@@ -51,7 +51,7 @@ class Objective:
         return loss
 
     def _course(self, predicted: Tensor, target: Tensor, level: Tensor, valid: Tensor) -> Course:
-        """Return consecutive predictions: the samples of a chunk, or the last samples of windows drawn together."""
+        """Return consecutive predictions: the samples of a chunk, or the last samples of windows sampled together."""
         chunks = self.spec.chunks
         if chunks.regime == "chunk":
             return Course(predicted, target, level, valid)

@@ -1,4 +1,4 @@
-"""Training in parts, each of which continues the previous one with the same bits as without a stop.
+"""Training in parts: each part continues the previous part with the same bits as an uninterrupted training.
 
 One of a single epoch is parted at an update, one of several between two epochs.
 """
@@ -119,7 +119,7 @@ def _restore_epochs(loop: Loop, state: Table) -> None:
 
 
 def _state(loop: Loop) -> dict[str, object]:
-    """Return the state that the rest of a training depends on in addition to its settings.
+    """Return the state that determines the remainder of a training, in addition to its settings.
 
     Without times, equal parts give equal bytes.
     """

@@ -26,7 +26,7 @@ def free_run_steps(progress: Progress) -> Callable[[FreeRunProgress], None]:
 
 
 def training_steps(progress: Progress) -> Callable[[TrainingProgress], None]:
-    """Return a training listener that reports each event as a step, with the best validation error so far.
+    """Return a training listener that reports each event as a step, with the best validation error until now.
 
     Args:
         progress: stage that the training belongs to.

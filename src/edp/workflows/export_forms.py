@@ -107,7 +107,7 @@ def all_forms() -> dict[str, str]:
 
 
 def export_run(order: ExportOrder) -> Exported:
-    """Write a run in one of `all_forms`.
+    """Write a run in a form of `all_forms`.
 
     Raises:
         EdpError: an unknown form or option, one that the form does not have, or a run that this form cannot hold.

@@ -15,7 +15,7 @@ from edp.training.bundle import Bundle
 def judged_data(
     bundle: Bundle, data: Prepared, others: Sequence[Recording] | None, at_most_h: float | None
 ) -> tuple[Prepared, Drawn | None]:
-    """Return a run's data with the evaluated ones as test part, and the drawn amount; None if all are evaluated.
+    """Return a run's data with the evaluated ones as test part, and the sampled amount; None if all are evaluated.
 
     Args:
         bundle: bundle of the run.

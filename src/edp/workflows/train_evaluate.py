@@ -415,7 +415,7 @@ def channel_importance(
 
 
 def _floor_scores(folder: Path, data: Prepared, scores: ScoresFile) -> ModelScores | None:
-    """Return scores on the same ticks of the reference of the preset auto's skill; None if the run has none."""
+    """Return scores on the same ticks of the reference of the preset auto's skill; None without one."""
     if not is_folder_at(folder / FLOOR):
         return None
     floor = load_bundle(folder / FLOOR).predictor

@@ -74,7 +74,7 @@ class TaskEpisodes(EpisodeBatch):
         self._sums = np.zeros((count, 5))
 
     def begin(self, index: int, seed: int | None, rng: np.random.Generator, options: Options) -> Infos:
-        """Begin an episode; its seed is that of reference and sensors, and it takes no options.
+        """Begin an episode with a seed for reference and sensors; options are refused.
 
         Raises:
             ConfigError: no reference of this seed, or of `DRAWS` drawn ones, can be done, or an option came.
@@ -172,7 +172,7 @@ class TaskEpisodes(EpisodeBatch):
             self._base[index] = self._bases[index].step(observed, int(self.tick[index]))
 
     def observation(self, index: Index) -> NDArray[np.float32]:
-        """Return what a policy sees of one episode, shape (value,), or of all, (count, value)."""
+        """Return the observation of the policy, shape (value,) for one episode or (count, value) for all episodes."""
         measured = self._plants.observed[:, self._reads].astype(float)
         return self.features.values(measured, self._rows.now(self.tick), self._past, self._base)[index]
 
@@ -182,7 +182,7 @@ class TaskEpisodes(EpisodeBatch):
         return {"position_m": position.copy() if isinstance(index, slice) else float(position)}
 
     def summary(self, index: int) -> Infos:
-        """Return the metrics of an episode over its evaluated samples so far, as ``score``."""
+        """Return the metrics of an episode over its evaluated samples until now, as ``score``."""
         ticks, squared, attitude, travel, violations = self._sums[index].tolist()
         count = max(ticks, 1.0)
         score = {

@@ -97,7 +97,7 @@ class PolicyController(Controller):
         self._remember(tick)
 
     def _remember(self, tick: int) -> None:
-        """Store the levers of the previous sample, once per sample; before the first one there were none."""
+        """Store the levers of the previous sample, once per sample; skip the first sample."""
         if tick > self._noted:
             self._past, self._noted = remembered(self._past, self.before[None]), tick
 

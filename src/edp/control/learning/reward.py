@@ -51,7 +51,7 @@ class RewardWeights:
         )
 
     def of_tick(self, position_m: Array, attitude_rad: Array, travel: Array, violated: NDArray[np.bool_]) -> Array:
-        """Return the reward from position and attitude errors, lever travel and limits, each of shape (environment,)."""
+        """Return the reward from position and attitude errors, lever travel and limits, shape (environment,) each."""
         near = 1.0 / (1.0 + position_m / self.position_m)
         upright = self.attitude / (1.0 + np.abs(attitude_rad) / self.attitude_rad)
         return np.asarray(near + upright - self.travel * travel - self.limit * violated)

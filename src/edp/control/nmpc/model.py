@@ -82,7 +82,7 @@ class TwinModel:
         self._past.clear()
 
     def row(self, measured: Array) -> NDArray[np.float32]:
-        """Return a row of the twin's outputs from one of `reads`, NaN for unmeasured or untrusted outputs."""
+        """Return one measured row of the channels `reads`; NaN for unmeasured or untrusted outputs."""
         row = self._free.copy()
         row[self._ports] = measured
         return row

@@ -131,7 +131,7 @@ TASKS: Registry[type[TaskSpec]] = Registry("task")
 
 
 def draw_task(spec: TaskSpec, geometry: TipGeometry, rate_hz: float, seed: int) -> ControlTask:
-    """Return a feasible task: parameters are drawn until strokes and speeds are within the machine's limits.
+    """Return a feasible task: parameters are sampled until strokes and speeds are within the machine's limits.
 
     Args:
         spec: options of a registered task.

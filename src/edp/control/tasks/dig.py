@@ -1,4 +1,4 @@
-"""Digging cycle in soil: lower, penetrate, drag, curl and lift, stretch out, dump."""
+"""Digging cycle in soil: lower, penetrate, drag, curl and lift, reach out, dump."""
 
 from __future__ import annotations
 

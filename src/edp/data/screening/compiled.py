@@ -17,7 +17,7 @@ Result = TypeVar("Result")
 
 
 def sources() -> tuple[Path, ...]:
-    """Return the source files that the compiled code depends on."""
+    """Return the source files that determine the compiled code."""
     return (*files_with(Path(__file__).parent, "from edp.data.screening.compiled import compiled"), Path(__file__))
 
 

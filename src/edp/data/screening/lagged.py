@@ -68,7 +68,7 @@ class Lagged:
 
 
 class _Spectra:
-    """Spectra of the blocks of one segment: of the blocks alone, and with the neighbouring rows."""
+    """Spectra of the blocks of one segment, without and with the neighbouring rows."""
 
     def __init__(self, table: CandidateTable, reach: int, live: NDArray[np.int64]) -> None:
         self.table, self.reach, self.live = table, reach, live

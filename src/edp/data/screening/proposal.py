@@ -1,4 +1,4 @@
-"""Proposal of a feature set: channels kept and dropped with reasons and order, and the memory length needed."""
+"""Proposal of a feature set: selected and omitted channels with reasons, order and required memory length."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def _noise(evidence: ScreeningEvidence, live_index: int, name: str) -> Flag:
 
 
 def redundant_flags(evidence: ScreeningEvidence, judged: Sequence[str], free: Sequence[str]) -> list[Flag]:
-    """Flag channels that add nothing to the others: members of a cluster, and channels predicted by other pasts.
+    """Flag redundant channels: members of a cluster, and channels predicted by the pasts of other channels.
 
     Args:
         evidence: figures.

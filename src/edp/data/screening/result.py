@@ -171,7 +171,7 @@ class GroupImportance:
 
 @dataclass(frozen=True)
 class Value:
-    """Granger gain: what the past of a channel adds to a linear prediction from the pasts of all other usable channels.
+    """Granger gain: reduction of the linear prediction error by a channel's past, given all other channels' pasts.
 
     Evaluated on left-out data.
 

@@ -27,7 +27,7 @@ def own_bytes(adaptation: Adaptation) -> int:
 
 
 def values(adaptation: Adaptation, upper: str, intervals: int) -> dict[str, object]:
-    """Return the template values of an adaptation, in addition to those of its model.
+    """Return the template values of an adaptation, which extend the template values of its model.
 
     Args:
         adaptation: the adaptation.
@@ -68,7 +68,7 @@ def values(adaptation: Adaptation, upper: str, intervals: int) -> dict[str, obje
 
 
 def constants(adaptation: Adaptation) -> list[CConstant]:
-    """Return all constants; those with text are in the order of the C code."""
+    """Return all constants; constants with text are in the order of the C code."""
     lines = []
     for name in POINTERS:
         values = np.atleast_1d(getattr(adaptation, name)).ravel()

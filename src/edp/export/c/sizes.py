@@ -1,4 +1,4 @@
-"""Memory of a model and its program on a controller, computed from its layers; every command reports these numbers.
+"""Memory of a model and its program on a controller, computed from its layers; every command reports these values.
 
 `constant_bytes` counts what the C code declares, so it is what a compiler makes of it, to the byte; `program_bytes`
 adds up measured functions and is within 2 % of what is linked.

@@ -76,7 +76,7 @@ def initialiser(items: Iterable[str]) -> Code:
 
 
 def initialiser_rows(rows: Iterable[Iterable[str]]) -> Code:
-    """Return braced initialisers, one on each line."""
+    """Return braced initialisers, one per line."""
     return Code(",\n".join(f"    {initialiser(row)}" for row in rows))
 
 
@@ -93,7 +93,7 @@ def struct(kind: str, name: str, members: Iterable[str]) -> Code:
 
 
 def table(kind: str, name: str, rows: Iterable[Iterable[str]]) -> Code:
-    """Return the definition of a constant array of structs or arrays, one on each line; `name` includes the sizes."""
+    """Return the definition of a constant array of structs or arrays, one row per line; `name` includes the sizes."""
     return Code(f"static const {kind} {name} = {{\n{initialiser_rows(rows)}\n}};")
 
 

@@ -122,7 +122,7 @@ class LaneModel:
         return [describe(layer), call("edp_copy", slot(last, "last"), last.size, calls.value(FED))]
 
     def _whole(self, calls: Calls, layer: Layer) -> str | None:
-        """Return the call that computes a layer for all copies; None if there is no such function."""
+        """Return the call that computes a layer for all copies; None if the runtime has no such function."""
         if any(source == INPUT for source in layer.inputs):
             return None
         if isinstance(layer, layers.Dense) and layer.rows == 1:

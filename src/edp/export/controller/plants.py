@@ -1,4 +1,4 @@
-"""What both forms of the model of a controller's plan have in common: template values and files."""
+"""Template values and files that both plant models of a controller share."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class SourceCode(ABC):
     @property
     @abstractmethod
     def bytes(self) -> int:
-        """Size of these members without what the layers of a network remember."""
+        """Size of the members in bytes, without the states of a network's layers."""
 
     @abstractmethod
     def constants(self, tables: ConstantTables) -> None:

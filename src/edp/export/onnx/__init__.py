@@ -1,4 +1,4 @@
-"""ONNX export: one graph of a single sample with explicit states, one of a whole window; both in SI units."""
+"""ONNX export: a graph of a single sample with explicit states and a graph of a window, both in SI units."""
 
 from edp.export.onnx.target import OnnxTarget
 

@@ -177,7 +177,7 @@ def _window_attention(
 
 
 def correct(nodes: Nodes, layer: memory.PrefixCorrection, seen: str) -> str:
-    """Return the change of the states, concatenated, from the mean of the first samples and the last of them."""
+    """Return the change of the states, concatenated, from the mean and the last value of the initial samples."""
     hidden = nodes.add("Tanh", nodes.linear(seen, layer.first_weight, layer.first_bias))
     return nodes.linear(hidden, layer.second_weight, layer.second_bias)
 

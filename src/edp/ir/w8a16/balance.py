@@ -46,6 +46,6 @@ def _only_reader(graph: Graph, layer: Layer) -> Layer | None:
 
 
 def _columns(graph: Graph, join: Gather, value: str) -> np.ndarray:
-    """Return a mask of the elements of a joined value that come from one of its inputs."""
+    """Return a mask of the elements of a joined value that belong to an input."""
     owners = np.repeat(np.array(join.inputs), [graph.width_of(name) for name in join.inputs])
     return np.asarray(owners[list(join.columns)] == value)

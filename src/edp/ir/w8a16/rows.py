@@ -68,7 +68,7 @@ def to_gates(matrix: str, weight: Array, input_frac: int, rounding: WeightRoundi
 
 
 def halves(gain: Array, most: int = 30) -> tuple[NDArray[np.int16], int]:
-    """Return gains as 16-bit numbers and their number of fractional bits, at most `most`."""
+    """Return gains as 16-bit values and their number of fractional bits, at most `most`."""
     bits = min(fixed.frac_for(float(np.abs(gain).max())), most)
     return fixed.to_fixed(gain, bits).astype(np.int16), bits
 

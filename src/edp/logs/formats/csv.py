@@ -174,7 +174,7 @@ def _number_of_any_kind(delimiter: str) -> Callable[[str], bool]:
 
 
 def _holds_numbers_only(head: list[str], decimal: str) -> bool:
-    """Return whether a row contains numbers and dates only, so that it has no names."""
+    """Return whether a row contains only numbers and dates, and therefore no names."""
     filled = [cell for cell in head if cell.strip()]
     others = [cell for cell in filled if not is_number(cell, decimal)]
     return len(others) < max(len(filled), 1) and all(map(is_date, others))
@@ -183,7 +183,7 @@ def _holds_numbers_only(head: list[str], decimal: str) -> bool:
 def _names_beside(
     path: Path, rows: list[list[str]], remark: str, delimiter: str, signal_map: SignalMap
 ) -> tuple[tuple[str, ...], tuple[str | None, ...]]:
-    """Return column names for a table without a header row: from the comment above the numbers, or numbered.
+    """Return column names for a table without a header row: from the comment above the values, or numbered.
 
     Raises:
         DataError: neither.

@@ -1,4 +1,4 @@
-"""Text exports of dSPACE ControlDesk: keyed header rows about the recording and its traces above the numbers.
+"""Text exports of dSPACE ControlDesk: keyed header rows about the recording and its traces above the values.
 
 The first cell of a row of the head is its key; rows of numbers have none, but the first. A trace without a name and
 a path is the time, in seconds, of the traces behind it; each raster has one, and slower rasters end in earlier rows.

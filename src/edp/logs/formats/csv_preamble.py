@@ -72,7 +72,7 @@ def find_table(
 
 
 def _runs_on(row: Sequence[str], width: int, is_number: Callable[[str], bool]) -> bool:
-    """Return whether names and the first numbers share a line, because a line end is missing after the names."""
+    """Return whether names and the first values share a line, because a line end is missing after the names."""
     names, numbers = row[:width], row[width:]
     return (
         len(numbers) == width
@@ -87,7 +87,7 @@ def _is_numeric(cells: list[str], is_number: Callable[[str], bool]) -> bool:
 
 
 def _is_data(row: Sequence[str], width: int, columns: list[int], is_number: Callable[[str], bool]) -> bool:
-    """Return whether most cells in the numeric columns of a row are numbers. Text may replace missing values."""
+    """Return whether most cells in the numeric columns of a row are numeric. Text may replace missing values."""
     if not width <= len(row) <= width + _MAX_REMARKS or any(map(is_number, row[width:])):
         return False
     filled = [row[i] for i in columns if row[i].strip()]
@@ -95,7 +95,7 @@ def _is_data(row: Sequence[str], width: int, columns: list[int], is_number: Call
 
 
 def _may_name(row: Sequence[str], width: int, whole: Sequence[Sequence[str]], is_number: Callable[[str], bool]) -> bool:
-    """Return whether a row may contain names, units or descriptions: half of its cells filled, without numbers."""
+    """Return whether a row may contain names, units or descriptions: half of its cells filled, without values."""
     ends_open = len(row) == width - 1 and not any(other[-1].strip() for other in whole)
     if width < len(row) <= width + _MAX_REMARKS:
         row = row[:width]
@@ -109,7 +109,7 @@ def _may_name(row: Sequence[str], width: int, whole: Sequence[Sequence[str]], is
 
 
 def _header_of(rows: Sequence[Sequence[str]], top: int, first: int, is_unit_row: Callable[[list[str]], bool]) -> int:
-    """Return the row with the column names: the lowest row above the numbers without units or descriptions."""
+    """Return the row with the column names: the lowest row above the values without units or descriptions."""
     # A row of names may pass for one of units: t, V and A are both.
     named = [top, *(row for row in range(top + 1, first) if not is_unit_row(list(rows[row])))]
     lowest = named[-1]

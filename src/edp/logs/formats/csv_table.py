@@ -94,7 +94,7 @@ def has_decimal_commas(rows: list[list[str]], delimiter: str) -> bool:
 
 
 def _parse_without_groups(cells: pa.Array) -> pa.Array | None:
-    """Parse numbers with decimal comma and thousands points; None if a text is neither a number nor missing."""
+    """Parse values with decimal comma and thousands points; None if a text is neither a number nor missing."""
     cells = pc.utf8_trim_whitespace(cells)
     cells = pc.if_else(pc.is_in(cells, pa.array(NULLS)), pa.scalar(None, pa.string()), cells)
     if not pc.all(pc.match_substring_regex(cells, _GERMAN)).as_py() and cells.null_count < len(cells):
@@ -298,7 +298,7 @@ class CsvTable:
         return numbers
 
     def parse_grouped_numbers(self, column_index: int) -> NDArray[np.float64] | None:
-        """Return a text column as numbers with thousands points, shape ``(rows,)``; None if it is not numeric."""
+        """Return a text column as values with thousands points, shape ``(rows,)``; None if it is not numeric."""
         if self.layout.decimal != ",":
             return None
         parts = [_parse_without_groups(batch.column(0)) for batch in self.stream([self.keys[column_index]])]
@@ -344,7 +344,7 @@ class CsvTable:
             )
 
     def refuse_text(self, column_index: int) -> None:
-        """Raise the error that names the first text in a column of numbers."""
+        """Raise the error that names the first text in a column of values."""
         name, row, key = self.layout.names[column_index], self.layout.skip_rows + 1, self.keys[column_index]
         for batch in self.stream([key]):
             for cell in batch.column(key).to_pylist():

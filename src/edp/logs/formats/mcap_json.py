@@ -181,7 +181,7 @@ def _message(path: Path, body: memoryview, by_number: dict[int, _Topic]) -> int:
 
 
 def _flatten(name: str, value: Any, values: dict[str, float], where: str) -> None:
-    """Collect the numbers in a value by their paths; null is a missing number. The parser limits the depth."""
+    """Collect the values in a value by their paths; null is a missing number. The parser limits the depth."""
     if isinstance(value, dict):
         for key, inner in value.items():
             _flatten(f"{name}.{key}" if name else key, inner, values, where)

@@ -131,7 +131,7 @@ _ENDS = ("lower", "upper")
 def _find_ranges(
     lower: NDArray[np.float64], upper: NDArray[np.float64], raw: NDArray[Any], closed: bool | None = None
 ) -> NDArray[np.intp]:
-    """Return the index of the range that contains each value, -1 if there is none.
+    """Return the index of the range that contains each value, -1 if missing.
 
     ASAM: the upper end belongs to a range (`closed`) of integers, not to one of floats.
     """

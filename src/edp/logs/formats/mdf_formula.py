@@ -148,7 +148,7 @@ class _Parser:
         return self.steps
 
     def next_is(self, *signs: str) -> str | None:
-        """Consume and return the next token if it is one of the signs."""
+        """Consume and return the next token if it is among the given signs."""
         if self.at < len(self.tokens):
             kind, text = self.tokens[self.at]
             if kind == "sign" and text in signs:

@@ -52,7 +52,7 @@ def name_of_file(path: Path) -> str:
 def only(
     chosen_names: Iterable[str], signals: Mapping[str, RawSignal], repeated: Mapping[str, Sequence[str]]
 ) -> tuple[dict[str, RawSignal], dict[str, list[str]]]:
-    """Return the selected columns of a log in the given order, and the names shared by several of them."""
+    """Return the selected columns of a log in the given order, and names that several columns have."""
     chosen_signals = {name: signals[name] for name in chosen_names if name in signals}
     among = {name: [full for full in several if full in chosen_signals] for name, several in repeated.items()}
     return chosen_signals, {name: several for name, several in among.items() if len(several) > 1}

@@ -348,7 +348,7 @@ def _width(table: _Table, field_index: int) -> int:
 
 
 def _stamps(table: _Table, field_index: int, signal_map: SignalMap) -> Column:
-    """Return time in seconds from a column of numbers, time stamps or durations; NaN for missing entries."""
+    """Return time in seconds from a column of values, time stamps or durations; NaN for missing entries."""
     field = table.schema.field(field_index)
     if _is_time(field.type):
         numbers = table.whole(field_index).to_numpy(zero_copy_only=False)

@@ -44,7 +44,7 @@ _MAX_STEPS = 100_000
 
 
 class LongMessageError(DataError):
-    """Message with more numbers than signal samples have, such as a plan, a map or a point cloud."""
+    """Message with more values than signal samples have, such as a plan, a map or a point cloud."""
 
 
 class Types(Protocol):
@@ -55,7 +55,7 @@ class Types(Protocol):
 
 @dataclass
 class MessageLayout:
-    """Positions of the numbers in a message.
+    """Positions of the values in a message.
 
     Attributes:
         fields: path of each number, such as ``twist.linear.x`` or ``data_1``, with its first byte and dtype.

@@ -175,7 +175,7 @@ class _Collected:
 
 
 class _Topic:
-    """Messages of one topic as a table of numbers."""
+    """Messages of one topic as a table of values."""
 
     def __init__(self, bag: _Bag, name: str, connections: list[Any]) -> None:
         self.bag = bag

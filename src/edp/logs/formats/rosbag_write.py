@@ -1,4 +1,4 @@
-"""Writer for bags: one topic with one message per sample, and one with EDP's metadata."""
+"""Writer for bags: a topic with one message per sample, and a topic with EDP's metadata."""
 
 from __future__ import annotations
 

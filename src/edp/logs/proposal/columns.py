@@ -315,7 +315,7 @@ def _usual_length(raw: RawLog) -> int:
 
 
 def _is_numeric(signal: RawSignal) -> bool:
-    """Return whether the first rows are numbers."""
+    """Return whether the first rows are numeric."""
     try:
         _read([signal], 0, min(signal.samples, _PROBE_ROWS))
     except DataError:

@@ -37,7 +37,7 @@ class Experiments:
         return short if len(files) == 1 else [f"{path.stem}_{name}" for (path, _), name in zip(self.entries, short)]
 
     def tests(self) -> list[str]:
-        """Return the recordings that the author named as test data; empty if no names say so."""
+        """Return the recordings that the author named as test data; empty if the names do not indicate test data."""
         variables = [entry.partition("{")[0].lower() for _, entry in self.entries]
         parted = {word in TRAINING_WORDS for word in variables} == {True, False}
         named = set(variables) <= {*TRAINING_WORDS, *TEST_WORDS}
@@ -47,7 +47,7 @@ class Experiments:
 
 
 def part_experiments(group: LogGroup) -> Experiments | None:
-    """Return the experiments in the logs of a group; None if they hold none.
+    """Return the experiments in the logs of a group; None without experiments.
 
     Raises:
         DataError: too many for a data set.

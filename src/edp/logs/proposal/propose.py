@@ -88,7 +88,7 @@ class MapProposal:
     signal_map: SignalMap
 
     def select_role(self, *roles: str) -> tuple[ColumnGuess, ...]:
-        """Return the channels with one of the given roles, in order."""
+        """Return the channels with the given roles, in order."""
         return tuple(guess for guess in self.columns if guess.channel and guess.role in roles)
 
 
@@ -142,7 +142,7 @@ _EMPTY = "empty"
 
 
 def _where_they_move(behaviours: dict[str, Behaviour], beside: Sequence[LogLook]) -> dict[str, Behaviour]:
-    """Replace the statistics of a column that is constant in the first log by those of another log of the group.
+    """Replace the statistics of a column that is constant in the first log by statistics from another log of the group.
 
     A machine is often tested one axis a log.
     """

@@ -120,7 +120,7 @@ def _two_units(reports: Sequence[QualityReport]) -> list[Finding]:
 
 
 def _unit_ratio(kind: Kind, ratios: tuple[float, float]) -> str:
-    """Return the two units that explain both ratios; empty if none do."""
+    """Return the two units that explain both ratios; empty if no pair of units does."""
     decades = [math.log10(ratio) for ratio in ratios]
     if min(map(abs, decades)) < math.log10(_MIN_RATIO) - _NEAR_DECADES:  # Most channels: no two units explain it.
         return ""

@@ -115,7 +115,7 @@ def unreadable(path: Path, why: DataError) -> QualityReport:
 
 
 def _open_with_map(path: Path, signal_map: SignalMap) -> tuple[RawLog, SignalMap, list[ChannelSource], list[EdpError]]:
-    """Open a log with its channels by the map, or by a proposed map if none is given and no column is known.
+    """Open a log with its channels by the map, or by a proposed map by default and no column is known.
 
     Raises:
         DataError: the file cannot be read.

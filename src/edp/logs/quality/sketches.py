@@ -45,7 +45,7 @@ class Sketch:
 
 
 class Sketches:
-    """Sketches of a data set. After `most` bytes, further recordings are represented by their hash."""
+    """Sketches of a data set. After `most` bytes, additional recordings are represented by their hash."""
 
     def __init__(self, most: int = MOST_BYTES) -> None:
         self.left, self.all, self.by_hash = most, list[Sketch](), 0

@@ -369,7 +369,7 @@ def _store_log(
 
 
 def _merge_meta(meta: Mapping[str, object], part: Mapping[str, object]) -> dict[str, object]:
-    """Merge the metadata of a log with those of one more part; each repair occurs once."""
+    """Merge the metadata of a log with the metadata of another part; list each repair once."""
     repairs = repairs_of(meta)
     repairs += [repair for repair in repairs_of(part) if repair not in repairs]
     return {**meta, **part, **({"repairs": repairs} if repairs else {})}

@@ -140,7 +140,7 @@ def stamped(folder: Path, file: RowsFile) -> RowsFile:
 
 
 def read_index(folder: str | Path) -> StoreIndex:
-    """Read and check the index of a store: every recording lies within a data file.
+    """Read and check the index of a store: every recording is within a data file.
 
     Raises:
         DataError: no store, one that is half built, of another schema, or damaged.
@@ -158,7 +158,7 @@ def read_index(folder: str | Path) -> StoreIndex:
 
 
 def parse_index(text: str, where: str) -> StoreIndex:
-    """Parse and check the content of an index file: every recording lies within a data file.
+    """Parse and check the content of an index file: every recording is within a data file.
 
     Raises:
         DataError: it is of another schema, or damaged.

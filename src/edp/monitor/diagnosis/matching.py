@@ -109,7 +109,7 @@ def _all_candidates(dictionary: Dictionary, further: bool) -> Candidates:
 
 
 def candidates(dictionary: Dictionary, further: bool = True) -> Candidates:
-    """Return all candidates of `match`; `further` includes sizes beyond the ladders."""
+    """Return all candidates of `match`; `further` adds sizes outside the ladders."""
     parts = [_list_sizes(dictionary, number, fault, further) for number, fault in enumerate(dictionary.classes)]
     counts = np.array([len(sizes) for sizes, _ in parts])
     return Candidates(

@@ -129,7 +129,7 @@ def remove_dictionary(folder: Path) -> None:
 
 
 def load_dictionary(folder: Path, summaries: Sequence[str]) -> Dictionary | None:
-    """Read the dictionary of a monitor; None if there is none.
+    """Read the dictionary of a monitor; None if missing.
 
     Args:
         folder: folder of the monitor.

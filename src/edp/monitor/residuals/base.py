@@ -326,7 +326,7 @@ def mean_inputs(material: FitMaterial, inputs: Sequence[str]) -> Rows:
 
 
 def source_arrays(parts: SourceParts, rules: Mapping[str, ArrayRule], **sizes: int) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a source after a check; those of its parts, with a dot in their names, are left out.
+    """Check and return the arrays of a source, without the arrays of its parts, whose names contain a dot.
 
     Args:
         parts: of the source.

@@ -233,7 +233,7 @@ def shut_of(spots: ChamberPlaces, rows: Singles) -> Singles:
 
 
 def _measure_end_distance(spots: ChamberPlaces, rows: Singles, end: float) -> Singles:
-    """Return the distance to an end of the stroke in cushion lengths, at most 1; 1 without a stroke."""
+    """Return the distance to an end of the stroke in cushion lengths, limited to 1; 1 without a stroke signal."""
     if spots.stroke < 0:
         return np.ones(rows.shape[:-1], np.float32)
     distance = np.abs(rows[..., spots.stroke] - np.float32(end)) * np.float32(1.0 / spots.cushion)

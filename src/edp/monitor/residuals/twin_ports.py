@@ -126,7 +126,7 @@ class TwinPorts(ResidualSource):
 @RESIDUALS.register("twin_ports")
 @dataclass(frozen=True, kw_only=True)
 class TwinPortsSpec(ResidualSpec):
-    """Uses the first twin given to the monitor, with free ports; without a twin there are no residuals.
+    """Residuals of the first twin of the monitor with free ports; empty without a twin.
 
     Attributes:
         free_s: time that the ports of a group run free before they are measured again, s.

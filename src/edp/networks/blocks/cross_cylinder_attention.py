@@ -26,7 +26,7 @@ class CrossCylinderAttention:
     space: ClassVar[dict[str, object]] = {}
 
     def conflicts(self, model: ModelView, task: TaskView) -> str | None:
-        """Return the conflict with a single output, which has no other output to attend to."""
+        """Return the reason why the block is invalid for a single output: attention needs at least two outputs."""
         if len(task.targets) > 1:
             return None
         return (

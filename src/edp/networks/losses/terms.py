@@ -46,7 +46,7 @@ class TermSpec(Protocol):
     """Consecutive predictions that it compares."""
 
     def evaluate(self, course: Course) -> Tensor:
-        """Return the unweighted term, a mean over the compared elements; zero if none can be compared."""
+        """Return the unweighted term, a mean over the compared elements; zero without compared elements."""
         ...
 
 
@@ -54,7 +54,7 @@ TERMS: Registry[type] = Registry("term")
 
 
 def check_weight(name: str, weight: float) -> None:
-    """Raise ConfigError for a weight without effect, or one that rewards what the term penalises.
+    """Raise ConfigError for a weight without effect, or for a weight that rewards the penalised quantity.
 
     Raises:
         ConfigError: the weight is not positive.

@@ -98,7 +98,7 @@ class Dynamic(PhysicsBase):
         return torque
 
     def standing(self, speed: Tensor) -> Tensor:
-        """Return the standstill fraction per axis (Stribeck): 1 in steady state, 0 at high velocity, ``(batch, time, 3)``."""
+        """Return the standstill fraction per axis (Stribeck), ``(batch, time, 3)``: 1 at standstill, 0 when moving."""
         # Stribeck's curve is smooth, so that gradients pass through zero velocity.
         return torch.exp(-(speed / self.geometry.axis("STRIBECK")).square())
 

@@ -169,7 +169,7 @@ def _constant(like: Symbol, numbers: np.ndarray) -> Symbol:
 
 
 def add(a: Any, b: Any) -> Symbol:
-    """Add two operands, one of which may be constant."""
+    """Add two operands; a constant is allowed."""
     if isinstance(a, Symbol) and isinstance(b, Symbol):
         return _both(BinaryOperation.ADD, a, b)
     value, constant = _meet(a, b)
@@ -177,7 +177,7 @@ def add(a: Any, b: Any) -> Symbol:
 
 
 def subtract(a: Any, b: Any) -> Symbol:
-    """Subtract two operands, one of which may be constant."""
+    """Subtract two operands; a constant is allowed."""
     if isinstance(a, Symbol) and isinstance(b, Symbol):
         return _both(BinaryOperation.SUBTRACT, a, b)
     value, constant = _meet(a, b)
@@ -185,7 +185,7 @@ def subtract(a: Any, b: Any) -> Symbol:
 
 
 def multiply(a: Any, b: Any) -> Symbol:
-    """Multiply two operands, one of which may be constant."""
+    """Multiply two operands; a constant is allowed."""
     if isinstance(a, Symbol) and isinstance(b, Symbol):
         return _both(BinaryOperation.MULTIPLY, a, b)
     value, constant = _meet(a, b)
@@ -193,7 +193,7 @@ def multiply(a: Any, b: Any) -> Symbol:
 
 
 def divide(a: Any, b: Any) -> Symbol:
-    """Divide two operands, one of which may be constant."""
+    """Divide two operands; a constant is allowed."""
     if isinstance(a, Symbol) and isinstance(b, Symbol):
         return _both(BinaryOperation.DIVIDE, a, b)
     value, constant = _meet(a, b)

@@ -1,4 +1,4 @@
-"""Plant models for free-run simulation: commands as inputs; velocities, strokes and pressures, measured or fed back."""
+"""Plant models for free-run simulation: commands to velocities, strokes and pressures, with feedback ports."""
 
 from edp.networks.twin import (  # noqa: F401  registers the formulations
     arx,

@@ -1,4 +1,4 @@
-"""Twins: plant models that simulate the machine from commands, with outputs measured or fed back."""
+"""Twins: plant models that simulate the machine from commands, with measured outputs or their own as feedback."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ class Twin(ABC):
         return TwinRunner(self)
 
     def scaled(self, answers: Array) -> Array:
-        """Outputs in SI units as a network reads them."""
+        """Return outputs in SI units as a network reads them."""
         return np.asarray((answers - self.scales.answer_offset) / self.scales.answer_width, dtype=np.float32)
 
     def scale_commands(self, commands: Array) -> Array:
@@ -271,7 +271,7 @@ class TwinRunner:
         return self.twin.branches(commands, state, measured, first)
 
     def neighbours(self, commands: Array, state: TwinState, measured: Array, first: NDArray[np.int64]) -> Array:
-        """Return `branches` for commands near those of the first run, from which derivatives of a plan are computed.
+        """Return `branches` for commands near the commands of the first run, for the derivatives of a plan.
 
         Where it is far cheaper, the load of the machine follows them to first order: the first run is exact, and what
         the others differ from it by is small against what they move.
@@ -314,7 +314,7 @@ TWINS: Registry[type] = Registry("twin")
 
 
 def list_solved_columns(channels: TwinChannels) -> list[int]:
-    """Outputs that a regression solves for: all but the strokes, which are integrals."""
+    """Return the outputs that a regression solves for: all outputs except strokes, which are integrals."""
     velocities, strokes = len(channels.velocities), len(channels.strokes)
     return [i for i in range(len(channels.answers)) if not velocities <= i < velocities + strokes]
 
@@ -328,7 +328,7 @@ def _measure_excess(channels: TwinChannels, scales: TwinScales, start: Array) ->
 
 
 def even_starts(twin: Twin, series: Sequence[Series], length: int, each: int) -> list[WindowStart]:
-    """Return evenly spaced starts of runs with `length` samples, at most `each` per segment, none beyond an end stop.
+    """Return evenly spaced starts of runs with `length` samples, at most `each` per segment, within the end stops.
 
     Raises:
         DataError: all of them lie beyond.

@@ -34,7 +34,7 @@ MOST_AHEAD = 1000
 
 
 def check_horizons(horizons: Sequence[int]) -> None:
-    """Raise ConfigError for invalid horizons: none, a duplicate, or a value that is not a number of samples.
+    """Raise ConfigError for missing, duplicate or invalid horizons (number of samples).
 
     Raises:
         ConfigError: the one that cannot be.

@@ -63,7 +63,7 @@ def _ports(build: Builder, twin: Twin, commands: int) -> tuple[str, str]:
 
 
 def add_bounds(build: Builder, twin: Twin, fed: str, proposed: str) -> str:
-    """Outputs within the bounds, scaled: `Twin.bounded` in layers."""
+    """Add layers that limit scaled outputs to the bounds, as `Twin.bounded` does."""
     scales, channels = twin.scales, twin.channels
     count, strokes = len(channels.velocities), len(channels.strokes)
     low, high = ((end - scales.answer_offset) / scales.answer_width for end in (scales.low, scales.high))

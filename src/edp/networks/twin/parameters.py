@@ -69,7 +69,7 @@ class Parameter:
 
 
 def interval(value: float, deviation: float, positive: bool) -> tuple[float, float]:
-    """Return the ends of a 95 % confidence interval; `deviation` is that of the logarithm for a positive value."""
+    """Return the ends of a 95 % confidence interval; for a positive value, `deviation` refers to its logarithm."""
     reach = NORMAL * deviation
     return (value * np.exp(-reach), value * np.exp(reach)) if positive else (value - reach, value + reach)
 
@@ -87,7 +87,7 @@ class Parametrisation(Protocol):
         ...
 
     def transform(self, equations: NormalEquations, theta: Doubles) -> NormalEquations:
-        """Return normal equations by the coordinates, from those by the parameters at `theta`."""
+        """Transform normal equations for the parameters at `theta` into normal equations for the coordinates."""
         ...
 
 

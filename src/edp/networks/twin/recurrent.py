@@ -35,7 +35,7 @@ MEMBER_SEED = 1000
 @TWINS.register("recurrent")
 @dataclass(frozen=True, kw_only=True)
 class Recurrent:
-    """GRU with feedback ports, trained on its own free runs (`edp.training.free_run`).
+    """GRU with feedback ports, trained with the free-run error (`edp.training.free_run`).
 
     Several members are networks that are trained apart; the twin outputs with the mean of their changes. As they read
     the same ports, they are one network, whose weights between members are zero.
@@ -328,7 +328,7 @@ def member_seed(seed: int, which: int) -> int:
 
 
 def averaged(twins: Sequence[RecurrentTwin]) -> RecurrentTwin:
-    """Return one twin whose state change is the mean of those of equally wide twins over the same channels.
+    """Return a twin whose state change is the mean of the state changes of equally wide twins.
 
     All of them read the same ports, and what an output adds up from h is linear: so their mean is one network, whose
     gates are theirs side by side and whose outputs have their weights over the number of twins.

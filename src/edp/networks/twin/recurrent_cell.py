@@ -128,7 +128,7 @@ class Bounds:
 
 
 def buffers(ticks: int, batch: int, answers: int, units: int) -> tuple[Array, ...]:
-    """Allocate the outputs of `run_forward`: outputs, fed values, mask of inactive bounds, gates, inner sums, and h."""
+    """Allocate the arrays of `run_forward`: outputs, feedback, mask of inactive bounds, gates, inner sums, and h."""
     shapes = [(ticks, answers)] * 3 + [(ticks, 3 * units), (ticks, units), (ticks + 1, units)]
     return tuple(np.empty((time, batch, width), np.float32) for time, width in shapes)
 

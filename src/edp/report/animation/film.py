@@ -1,4 +1,4 @@
-"""Film of a scene as MP4 or GIF: frames drawn with NumPy, encoded by ffmpeg where the system has it."""
+"""Film of a scene as MP4 or GIF: frames rendered with NumPy, encoded by ffmpeg where the system has it."""
 
 from __future__ import annotations
 

@@ -223,7 +223,7 @@ def _angles(shown: _Columns, machine: Machine) -> Array:
 
 
 def stroke_tables(machine: Machine) -> tuple[tuple[Array, Array], ...]:
-    """Return strokes (m, ascending) and joint angles (rad) of boom, arm and bucket, 201 of each."""
+    """Return 201 strokes (m, ascending) and joint angles (rad) for boom, arm and bucket."""
     from edp.sim.machine import layout as at
     from edp.sim.machine.parameters import pack
     from edp.sim.physics import linkage

@@ -178,7 +178,7 @@ def _render_parts(parts: Sequence[Part | None]) -> list[Part]:
 
 
 def _parts_within(part: Section | Fold | Subsection) -> Iterator[Part]:
-    """Yield all parts, including those of folds and subsections."""
+    """Yield all parts, including the parts of folds and subsections."""
     for inner in part.parts:
         if isinstance(inner, Fold | Subsection):
             yield from _parts_within(inner)

@@ -243,7 +243,7 @@ def _finish(axes: Axes, axis: ChartAxis, way: str, names: Mapping[str, int]) -> 
 
 @singledispatch
 def _draw(mark: Mark, axes: Axes, names: Mapping[str, Mapping[str, int]], layer: int, bars: Sequence[Bars]) -> Any:
-    """Draw a mark and return its entry in the legend; `bars` are those of its panel, side by side."""
+    """Draw a mark and return its legend entry; `bars` are the bar marks of the panel, drawn in groups."""
     raise TypeError(f"no drawing for {type(mark).__name__}")
 
 

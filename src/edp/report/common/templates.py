@@ -36,7 +36,7 @@ def stylesheet(*names: str) -> str:
 
 
 def json_text(value: Any) -> Markup:
-    """Return plain values as JSON that cannot end its script element, whatever their names are."""
+    """Return plain values as JSON that cannot end its script element, for any names."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
 

@@ -29,7 +29,7 @@ Array = NDArray[np.floating]
 
 @dataclass(frozen=True)
 class RunDifference:
-    """Difference between the error of a run and that of the first run.
+    """Difference between the error of a run and the error of the first run.
 
     Attributes:
         change: mean difference over the first run's mean error, -0.2 for a fifth less.

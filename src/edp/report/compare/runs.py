@@ -183,7 +183,7 @@ def _network(path: Path, name: str) -> ComparedRun:
 
 
 def _outputs(facts: Facts) -> list[tuple[str, str]]:
-    """Return name and unit of each output with errors; the mean comes first if all outputs share a unit."""
+    """Return name and unit of each output with errors; the mean is first if all outputs have the same unit."""
     outputs = [(target.name, unit_text(target.unit)) for target in facts.targets]
     if len(outputs) == 1:
         return outputs
@@ -237,7 +237,7 @@ def _twin(path: Path, name: str) -> ComparedRun:
 
 
 def _add(errors: dict[Measure, dict[str, float]], row: ChannelErrors, recording: str, what: str, at: float) -> None:
-    """Add the errors of one recording: each channel's, and their mean if the channels share a unit."""
+    """Add the errors of one recording by channel, and their mean if all channels have the same unit."""
     values = ({MEAN: row.mean} if row.unit and len(row.by_channel) > 1 else {}) | dict(row.by_channel)
     for output, value in values.items():
         if value is not None:

@@ -132,12 +132,12 @@ def reference_of(recording: Recording) -> Array:
 
 
 def drawn_rows(recording: Recording) -> slice:
-    """Return the rows of drawn lines, evenly spread."""
+    """Return the rows of plotted lines, evenly spread."""
     return slice(0, None, max(1, recording.samples // MAX_DRAWN))
 
 
 def evenly(recording: Recording, rows: slice) -> Evenly:
-    """Return the times of the drawn rows."""
+    """Return the times of the plotted rows."""
     return Evenly(0.0, (rows.step or 1) / recording.rate_hz)
 
 

@@ -74,7 +74,7 @@ class FleetFacts:
 
     @property
     def median(self) -> float:
-        """Return the median error of the machines; NaN if none was evaluated."""
+        """Return the median error of the evaluated machines; NaN without evaluated machines."""
         return float(np.median([row.mae for row in self.rows])) if self.rows else float("nan")
 
 

@@ -68,7 +68,7 @@ def _lines(columns: Sequence[Sequence[list[str]]], widths: Sequence[int], chosen
 
 
 def _break_words(words: Sequence[str], width: int) -> list[str]:
-    """Break words into lines of at most a width; the width is at least that of the longest word."""
+    """Break words into lines of a maximum width; longer words have a line of their own."""
     lines = [words[0]]
     for word in words[1:]:
         if len(lines[-1]) + 1 + len(word) <= width:

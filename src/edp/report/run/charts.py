@@ -69,7 +69,7 @@ def name_of(facts: Facts, model: str) -> str:
 
 
 def interval_name(facts: Facts) -> str:
-    """Return the name of the drawn interval in a legend."""
+    """Return the name of the plotted interval in a legend."""
     rows = facts.models[NETWORK].intervals.get(str(main_horizon(facts)), ()) if NETWORK in facts.models else ()
     coverages = [row.coverage for row in rows]
     return f"{100 * coverages[nearest_to_shown(coverages)]:.0f} % interval" if coverages else "Interval"
@@ -259,7 +259,7 @@ def recording_chart(facts: Facts) -> Chart | None:
 
 
 def learning_chart(facts: Facts) -> Chart | None:
-    """Return loss and validation error by epoch; a dotted line marks the epoch of the kept weights."""
+    """Return loss and validation error by epoch; a dotted line marks the epoch of the selected weights."""
     rows = facts.history
     if not rows:
         return None
@@ -287,7 +287,7 @@ def learning_chart(facts: Facts) -> Chart | None:
 
 
 def signal_chart(facts: Facts) -> Chart | None:
-    """Return the inputs of one recording over time, one panel per unit; None if none were kept."""
+    """Return the inputs of one recording over time, one panel per unit; None without stored inputs."""
     name = signals_of(facts)
     channels = () if facts.scores is None else facts.scores.inputs
     if not name or not channels:
@@ -314,5 +314,5 @@ def signal_chart(facts: Facts) -> Chart | None:
 
 
 def signals_of(facts: Facts) -> str:
-    """Return the name of the recording whose signals are drawn; empty without any."""
+    """Return the name of the recording whose signals are plotted; empty without signals."""
     return next((name for name, parts in sorted(facts.predictions.items()) if INPUTS in parts), "")

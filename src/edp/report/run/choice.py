@@ -226,7 +226,7 @@ def _tabulate_output(facts: Facts, choice: AutoChoice, target: ScoredTarget) -> 
 
 
 def promise_table(facts: Facts, choice: AutoChoice) -> Table | None:
-    """Return expected and test errors by output and horizon, each with that of a simple model."""
+    """Return expected and test errors by output and horizon, next to the errors of a simple model."""
     promised, unknown = choice.candidates[choice.chosen].promise, ErrorBounds(low={}, high={})
     interval = choice.interval or unknown
     skill = choice.skill or Skill(against=FLOOR, promise={}, interval=unknown)

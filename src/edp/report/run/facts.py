@@ -224,7 +224,7 @@ def read_history(path: Path) -> tuple[HistoryRow, ...]:
 
 
 def read_limit(path: Path | None, provenance: Provenance | None) -> LimitFile | None:
-    """Return the limit in a file, or in the folder of the run's data; None if there is none.
+    """Return the limit in a file, or in the folder of the run's data; None if missing.
 
     Raises:
         StorageError: the file that was named is missing, or a limit is damaged.
@@ -333,7 +333,7 @@ class ComparisonRow:
         return self.model == NETWORK
 
     def metric(self, name: str) -> float | None:
-        """Return one of `METRICS`."""
+        """Return a metric by its name in `METRICS`."""
         value: float | None = getattr(self, name)
         return value
 
@@ -441,7 +441,7 @@ def verdict_lines(facts: Facts) -> list[str]:
 
 
 def recordings_won(facts: Facts, baseline: str) -> tuple[int, int]:
-    """Count recordings on which the network's mean error is below a baseline's, and those with both scores."""
+    """Count the recordings on which the network has less mean error than a baseline, and the compared recordings."""
     samples = str(main_horizon(facts))
 
     def errors(name: str) -> dict[str, float]:

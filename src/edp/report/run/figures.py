@@ -189,7 +189,7 @@ class Histogram:
 
 
 def residual_histograms(facts: Facts, bins: int = 61) -> list[Histogram]:
-    """Return histograms of prediction minus truth over the kept recordings.
+    """Return histograms of prediction minus truth over the stored recordings.
 
     Bins span 99 % of the network's residuals.
     """
@@ -253,7 +253,7 @@ def recording_errors(facts: Facts, horizon: int) -> tuple[list[str], dict[str, l
 
 
 def log_ticks(values: Sequence[float | None]) -> list[float]:
-    """Return ticks of a logarithmic axis: 1, 2 and 5 per decade, or 1 for many decades; none with a value <= 0."""
+    """Return the ticks of a logarithmic axis: 1, 2 and 5 per decade, or 1 for many decades; empty with a value <= 0."""
     present = [value for value in values if value is not None]
     if not present or min(present) <= 0:
         return []

@@ -40,7 +40,7 @@ def losses_line(scores: ScoresFile) -> str:
 
 
 def describe_evaluation(scores: ScoresFile, provenance: Provenance | None) -> str:
-    """Name the evaluated logs, with a warning if they are few or of one kind; empty if the scores name none.
+    """Name the evaluated logs, with a warning for few logs or a single kind; empty without named logs.
 
     Args:
         scores: the content of ``scores.json``.
@@ -88,7 +88,7 @@ def situation_line(scores: ScoresFile) -> str:
 
 
 def _describe_change(row: TargetChange) -> str:
-    """Describe a target whose changes differ from those in training."""
+    """Describe a target whose changes differ from the training data."""
     ahead = f"{row.target} in {count_of(row.horizon, 'tick')}"
     if 1 / NOTED <= row.ratio <= NOTED:
         return f"{percent(row.beyond)} of the changes of {ahead} are larger than any in training"
@@ -96,7 +96,7 @@ def _describe_change(row: TargetChange) -> str:
 
 
 def by_output(scores: ScoresFile, horizon: int, targets: Sequence[tuple[str, str, str]], ahead: str) -> str:
-    """Return the headline for outputs without a common unit: the error of each, and the best baseline's.
+    """Return the headline for outputs without a common unit: their errors and the errors of the best baseline.
 
     Args:
         scores: the content of ``scores.json``.

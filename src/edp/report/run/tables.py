@@ -97,7 +97,7 @@ def _tabulate_outputs(facts: Facts, horizon: int | None) -> Table | None:
 
 
 def interval_table(facts: Facts) -> Table | None:
-    """Return the coverage and width of the network's intervals; None if it states none."""
+    """Return the coverage and width of the network's intervals; None without intervals."""
     network = facts.models.get(NETWORK)
     rows = [] if network is None else [(k, row) for k in facts.horizons for row in network.intervals.get(str(k), ())]
     if network is None or not rows:
@@ -144,7 +144,7 @@ def worst_recordings_table(facts: Facts, most: int = 10) -> Table | None:
 
 
 def budget_table(facts: Facts) -> Table:
-    """Return the footprint against each limit of the budget; a table without rows if there is no budget."""
+    """Return the footprint against each limit of the budget; empty without a budget."""
     rows = []
     for check in facts.footprint.checks if facts.footprint else ():
         share = check.value / check.limit if check.limit else None

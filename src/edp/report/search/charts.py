@@ -191,7 +191,7 @@ def _tests_of(effect: EffectView) -> str:
 
 
 def history_chart(views: Sequence[PhaseTrack], unit: str) -> Chart | None:
-    """Return the score of every training in order of the search; steps are the best of a phase so far."""
+    """Return the score of every training in order of the search; steps are the best of a phase until now."""
     scores = [score for view in views for score in view.scores]
     top = top_of(scores)
     if top is None:

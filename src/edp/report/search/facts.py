@@ -18,7 +18,7 @@ Absent = TypeVar("Absent")
 def require_phase(
     kind: type[Facts], absent: Absent
 ) -> Callable[[Callable[[StudyFile, Facts], Made]], Callable[[StudyFile], Made | Absent]]:
-    """Make a function of a study from one of a study and a phase's data; it returns `absent` before the decision."""
+    """Convert a function of a study and a phase's data to a function of a study, with `absent` before the decision."""
 
     def wrap(function: Callable[[StudyFile, Facts], Made]) -> Callable[[StudyFile], Made | Absent]:
         @wraps(function)

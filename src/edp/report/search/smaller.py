@@ -1,4 +1,4 @@
-"""Phase 6 of a study: its table, in the form of the thesis's Table 4.9, and its result in short."""
+"""Phase 6 of a study: a table in the form of the thesis's Table 4.9, and a short result."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def variance_table(study: StudyFile, facts: IsolationFacts) -> Table | None:
 
 
 def _numbers(heads: Sequence[tuple[str, str]], rows: Sequence[Sequence[Value]]) -> tuple[Column, ...]:
-    """Return columns of numbers, each with its own precision."""
+    """Return columns of values, each with its own precision."""
     return tuple(Column(*head, figures(values)) for head, values in zip(heads, zip(*rows), strict=True))
 
 

@@ -92,7 +92,7 @@ class PointView:
 
 
 def point_views(study: StudyFile) -> tuple[PointView, ...]:
-    """Return every network with a score and a cost; for an undecided phase, those of the history."""
+    """Return every network with a score and a cost; for an undecided phase, the networks of the history."""
     points = [*_view_calibration(study)]
     for kind, number in ((SynthesisFacts, 4), (ExplorationFacts, 5)):
         facts = study.facts(kind)
@@ -275,7 +275,7 @@ def _sort_effects(effects: Iterable[EffectView]) -> tuple[EffectView, ...]:
 
 @dataclass(frozen=True)
 class PhaseTrack:
-    """Trainings of one phase in order of request; those on test sessions are separate.
+    """Trainings of a phase in order of request; trainings on test sessions are separate.
 
     Attributes:
         name, heading: name and heading of the track.
@@ -318,7 +318,7 @@ def tracks(study: StudyFile) -> tuple[PhaseTrack, ...]:
 
 
 def top_of(scores: Iterable[float]) -> float | None:
-    """Return the upper end of a score axis; values far above the others are drawn at the edge."""
+    """Return the upper end of a score axis; values far above the others are plotted at the edge."""
     values = np.array([score for score in scores if math.isfinite(score)])
     if not values.size:
         return None

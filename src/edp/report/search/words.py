@@ -222,7 +222,7 @@ def decided(study: StudyFile) -> list[tuple[str, tuple[str, ...]]]:
 
 
 def _merge_sentences(lines: Sequence[str]) -> tuple[str, ...]:
-    """Merge sentences that say the same of several names; minus signs become true ones."""
+    """Merge sentences that differ only in a name, and replace hyphens by minus signs."""
     names: dict[str, list[str]] = {}
     for line in lines:
         name, colon, rest = line.partition(": ")

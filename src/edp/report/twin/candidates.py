@@ -14,7 +14,7 @@ MAX_CANDIDATES = 100
 
 
 def read_candidates(folder: str | Path) -> tuple[CandidateRow, ...]:
-    """Return the candidates of a run, the simplest first; none if its settings name the formulation.
+    """Return the candidates of a run, the simplest first; empty if the settings name the formulation.
 
     Raises:
         StorageError: the file is damaged.

@@ -66,7 +66,7 @@ class FreeRunFacts:
 
     @property
     def models(self) -> Mapping[str, FreeRunScores]:
-        """Return the scores of the twin, followed by those of its baselines."""
+        """Return the scores of the twin, followed by the scores of its baselines."""
         return self.content.models
 
     @property
@@ -75,7 +75,7 @@ class FreeRunFacts:
         return self.models[TWIN]
 
     def channels(self, part: str) -> Sequence[ReportedChannel]:
-        """Return the channels of one of `PARTS`."""
+        """Return the channels of a part; `PARTS` lists the parts."""
         channels: Sequence[ReportedChannel] = getattr(self.content.channels, part)
         return channels
 
@@ -158,7 +158,7 @@ def _figures(facts: FreeRunFacts) -> str:
 
 
 def _plain_answers(facts: FreeRunFacts) -> str:
-    """Return the names of outputs without a unit, whose integral is no stroke; empty if outputs have units."""
+    """Return the names of outputs without a unit, whose integral is not a stroke; empty if outputs have units."""
     if facts.twin.velocity_mae.unit != PLAIN_UNIT or facts.twin.velocity_mae.mean is None:
         return ""
     return listed(short_labels(channel.name for channel in facts.channels("velocities")))
@@ -244,7 +244,7 @@ def free_run_tables(facts: FreeRunFacts) -> dict[str, Table]:
 
 
 def _worst(summaries: Mapping[str, RunSummary]) -> dict[str, RunSummary]:
-    """Return the recordings sorted by error, largest first: strokes at the end, or else velocities."""
+    """Return the recordings sorted by error, largest first: final stroke error, or velocity error without strokes."""
 
     def size(summary: RunSummary) -> float:
         last: ChannelErrors = summary.stroke_error[-1] if summary.stroke_error else summary.velocity_mae

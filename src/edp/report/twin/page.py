@@ -31,7 +31,7 @@ def build_twin_report(run_folder: str | Path, output: str | Path | None = None, 
 
 
 def build_twin_page(facts: FreeRunFacts, title: str | None = None) -> Page:
-    """Return the page of free runs; its default title is that of the free runs."""
+    """Build the page of free-run simulations."""
     moments = facts.steps.moments if facts.steps else 0
     charts = {chart.name: chart for chart in twin_charts(facts)}
     tables = words.free_run_tables(facts)

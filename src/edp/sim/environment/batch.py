@@ -1,4 +1,4 @@
-"""Episodes that step together: what the environments of simulator, twin, FMU and tasks have in common."""
+"""Episodes that step together: common part of the environments of simulator, twin, FMU and tasks."""
 
 from __future__ import annotations
 
@@ -80,11 +80,11 @@ class EpisodeBatch(ABC):
 
     @abstractmethod
     def observation(self, index: Index) -> NDArray[np.float32]:
-        """Return a copy of the present observation of one episode, shape (value,), or of all, (count, value)."""
+        """Return a copy of the present observation, (value,) for one episode or (count, value) for all episodes."""
 
     @abstractmethod
     def info(self, index: Index) -> Infos:
-        """Return what is true now of one episode, or of all of them as arrays."""
+        """Return the true state of one episode, or of all episodes as arrays."""
 
     def summary(self, index: int) -> Infos:
         """Return the figures of an episode that has ended."""
@@ -119,12 +119,12 @@ class PlantBatch(EpisodeBatch):
         return row
 
     def info(self, index: Index) -> Infos:
-        """Return what is true of one machine, or of all, as ``truth``."""
+        """Return the true state of one machine, or of all machines, as ``truth``."""
         return {"truth": self.truth(index)}
 
     @abstractmethod
     def truth(self, index: Index) -> Mapping[str, object]:
-        """Return noise-free values by channel, with strokes and tip: numbers, or arrays of shape (count,) of all."""
+        """Return noise-free values by channel, with strokes and tip, of one machine, or arrays (count,) of all."""
 
 
 def check_render(what: str, mode: Any) -> None:

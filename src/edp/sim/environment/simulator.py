@@ -73,7 +73,7 @@ class SimulatorBatch(PlantBatch):
         return self._outcome
 
     def truth(self, index: Index) -> Truth:
-        """Return the noise-free channels of one machine, or of all."""
+        """Return the noise-free channels of one machine or of all machines."""
         episodes, row = self.episodes, self._present[1][index].copy()
         # A sum is a copy of one value or of many.
         pilots = self._pilots[index] + 0.0

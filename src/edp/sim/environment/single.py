@@ -1,4 +1,4 @@
-"""Environments of Gymnasium with one episode at a time; the simulated machine is one of them."""
+"""Gymnasium environments with a single episode, such as the simulated machine."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ class ExcavatorEnv(SingleEnvironment):
 
     @property
     def model(self) -> NominalMachine:
-        """The nominal machine of the present episode, or of the next one where none has begun."""
+        """Nominal machine of the present episode, or of the next episode before the first reset."""
         return self._batch.models[0]
 
     @property
@@ -154,7 +154,7 @@ class ExcavatorEnv(SingleEnvironment):
         return self._batch.observation(0)
 
     def branch(self, seed: int) -> None:
-        """Give sensors and soil new random values from now on; the present state stays.
+        """Draw new random values for sensors and soil from now on; the present state is unchanged.
 
         Raises:
             ConfigError: no episode has begun.

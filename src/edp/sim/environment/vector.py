@@ -1,4 +1,4 @@
-"""Environments of Gymnasium with many episodes side by side; simulated machines are some of them."""
+"""Gymnasium environments with many parallel episodes, such as simulated machines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Memory layout of an episode: a row of changing values, and a row of random values drawn before it begins.
+"""Memory layout of an episode: a row of changing values, and a row of random values sampled before the start.
 
 A copy of the two rows is the episode at that moment, exactly. Blocks of the rows have sizes of their own in each
 episode (a machine's reach, its dead times, the latency of its bus), so that each row begins with a table of them.

@@ -176,7 +176,7 @@ class Episodes:
         ended[index] = self.ended(index)
 
     def redraw(self, index: int, seed: np.random.SeedSequence) -> None:
-        """Draw new random values of sensors and soil from now on; the present observation and soil contact stay."""
+        """Draw new random values for sensors and soil; the present observation and soil contact are unchanged."""
         start = self.starts[index]
         if start is None:
             raise ConfigError(f"episode {index} has not begun; reset it first")

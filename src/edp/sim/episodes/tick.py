@@ -218,7 +218,7 @@ def step_all(
 
 @compiled
 def begin(memory: Array, drawn: Array, columns: NDArray[np.int64], scratch: Array, index: int, out: Out) -> None:
-    """Write the observation of episode `index` before its first sample; `memory` and `drawn` are its rows."""
+    """Write the observation of episode `index` before its first sample, from its rows of `memory` and `drawn`."""
     rest, work = scratch[9 + at.SPOOLS * (MAX_PAST + 2) :], scratch[3:9].reshape(2, 3)
     setup = setup_of(memory, drawn, rest)
     change(memory, drawn)

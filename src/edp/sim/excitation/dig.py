@@ -81,7 +81,7 @@ class Dig(Tracked):
         return self.stroke_leg(self._dump(view), rng.uniform(*self.MOVE))
 
     def _plan(self, view: View) -> bool:
-        """Choose surface, depth and drag line; returns False if none is within reach."""
+        """Choose surface, depth and drag line; return False if no choice is within reach."""
         rng, reach = self._rng, self.reach_m
         for _ in range(self.TRIES):
             self._surface = view.ground if view.ground == view.ground else rng.uniform(*self.MIME_M)

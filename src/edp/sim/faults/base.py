@@ -117,7 +117,7 @@ class FaultKind:
         return next(iter(self.units), "")
 
     def component(self, site: str) -> str:
-        """Return the faulty component, such as ``boom valve``; kinds of one component share it."""
+        """Return the faulty component, such as ``boom valve``; several fault kinds can have the same component."""
         return insert_site(self.part, site)
 
 
@@ -233,7 +233,7 @@ def insert_site(text: str, site: str) -> str:
 
 
 def among(name: str, options: Iterable[str]) -> str:
-    """Return a suffix for messages on an unknown name: the closest option, and all of them."""
+    """Return a suffix for messages on an unknown name: the closest option, and all options."""
     hint = closest(name, options)
     listed = ", ".join(options)
     return f"{hint}; there are {listed}" if hint.startswith("; did") else f"; there are {listed}"

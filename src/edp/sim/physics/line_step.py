@@ -136,7 +136,7 @@ def compute_line_terms(i: int, g: float, r: Array, e: Array) -> tuple[float, flo
 
 @inlined
 def fill_lines(i: int, r: Array, e: Array, out: Array) -> None:
-    """Compute the line changes of cylinder `i` from those of joint, pumps and chambers, all in `out`."""
+    """Compute the line derivatives of cylinder `i` from the derivatives of joint, pumps and chambers, in `out`."""
     k, b3, b4 = out[at.RATE + i], out[at.PUMP], out[at.PUMP + 1]
     head = e[i, PORT_HEAD_K] + e[i, PORT_H_BY_W] * k + e[i, PORT_H_BY_1] * b3 + e[i, PORT_H_BY_2] * b4
     rod = e[i, PORT_ROD_K] + e[i, PORT_R_BY_W] * k + e[i, PORT_R_BY_1] * b3 + e[i, PORT_R_BY_2] * b4

@@ -72,7 +72,7 @@ def first_valve_pressure(plant: Array) -> int:
 
 
 def rest(state: Array, plant: Array) -> None:
-    """Set the oil in the lines to rest at the chamber pressures."""
+    """Set the oil in the lines to zero flow at the chamber pressures."""
     if plant[at.LINES] > 0.0:
         state[at.PORT_HEAD : at.PORT_HEAD + 2 * at.AXES] = state[at.HEAD : at.HEAD + 2 * at.AXES]
         state[at.FLOW_HEAD : at.FLOW_HEAD + 2 * at.AXES] = 0.0

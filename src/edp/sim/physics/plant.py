@@ -226,7 +226,7 @@ class Plant:
 
     @property
     def clamps(self) -> int:
-        """Number of pressures raised to the floor so far."""
+        """Number of pressures raised to the floor until now."""
         return int(self._counts[0])
 
     def run(self, levers: Array) -> Array:

@@ -70,7 +70,7 @@ def demand(valves: Array, axes: Array, plant: Array, motors: Motors | None = Non
 def find_highest_loads(
     state: Array, valves: Array, axes: Array, plant: Array, motors: Motors | None = None
 ) -> tuple[float, float]:
-    """Return the highest chamber pressure (Pa) open to each pump's spools; the tank pressure if there is none."""
+    """Return the highest chamber pressure (Pa) open to each pump's spools; the tank pressure if missing."""
     first = second = plant[at.TANK]
     port = lines.first_valve_pressure(plant)
     for j in range(at.SPOOLS):

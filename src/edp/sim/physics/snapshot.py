@@ -43,7 +43,7 @@ class Snapshot:
     log: tuple[NDArray[np.float64], ...]
 
     def save(self, path: str | Path) -> Path:
-        """Write the snapshot as one ``.npz`` file: arrays, with the rest as embedded JSON.
+        """Write the snapshot as one ``.npz`` file: arrays and embedded JSON.
 
         Raises:
             StorageError: the disk is full or the folder read-only.
@@ -137,7 +137,7 @@ def _changes(value: Any) -> bool:
 
 
 def restored(current: Any, plain: Any, arrays: tuple[NDArray[Any], ...]) -> Any:
-    """Restore the result of `capture`: arrays and generators of `current` are set in place, the rest is created."""
+    """Restore the result of `capture`: set arrays and generators of `current` in place, create other objects."""
     if plain is None:
         return current
     ((kind, content),) = plain.items()

@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Bus:
-    """Timing of the frames of every ECU, in s; with `period` 0 there is no bus, and values are logged directly.
+    """Timing of the frames of every ECU, in s; `period` 0 disables the bus: values are logged directly.
 
     Attributes:
         period: time between two frames of an ECU.

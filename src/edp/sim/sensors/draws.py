@@ -1,4 +1,4 @@
-"""Random numbers of sensors and bus for a recording, drawn before it begins: one row per sample."""
+"""Random numbers of sensors and bus for a recording, sampled before the start: one row per sample."""
 
 from __future__ import annotations
 

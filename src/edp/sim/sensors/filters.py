@@ -35,7 +35,7 @@ def _filter(numbers: Array, values: Array, state: Array, out: Array) -> None:
 
 
 def lfilter(numbers: Array, values: Array) -> Array:
-    """Apply the filter of `biquad` along time, from rest, shape ``(time, channel)``."""
+    """Apply the filter of `biquad` along time from a zero state, shape ``(time, channel)``."""
     out = np.empty(values.shape)
     _filter(numbers, np.ascontiguousarray(values, dtype=float), np.zeros(2), out)
     return out

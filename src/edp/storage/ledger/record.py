@@ -99,7 +99,7 @@ def code_version(whole: bool = False) -> str:
 
 
 def _below(path: str, folders: tuple[str, ...]) -> bool:
-    """Return whether a path is one of the folders or inside one."""
+    """Return whether a path is in `folders` or inside a folder of it."""
     return any(path == folder or path.startswith(f"{folder}/") for folder in folders)
 
 

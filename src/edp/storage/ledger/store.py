@@ -214,7 +214,7 @@ class Ledger:
         return file
 
     def keep_states(self, keys: Collection[str]) -> None:
-        """Remove all states except those of some trainings; records stay."""
+        """Remove the states of all trainings except `keys`; records are unchanged."""
         for file in entries_of(self.path / "states", f"*{SUFFIX}"):
             if file.stem not in keys:
                 file.unlink(missing_ok=True)

@@ -1,1 +1,1 @@
-"""Ensembles trained with cross-validation folds: a linear model, and learners of several kinds on its residuals (bagging, stacking)."""
+"""Ensembles trained on folds: a linear model, and several kinds of learners on its residuals (bagging, stacking)."""

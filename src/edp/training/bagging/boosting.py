@@ -161,7 +161,7 @@ class TreeLearner:
         return [one - linear if kind.direct else one for kind, one in zip(self.kinds, every, strict=True)]
 
     def write(self, shares: DoubleArray) -> HeadPart:
-        """Write the weighted trees to the network; the head passes their sums through."""
+        """Write the weighted trees to the network, whose head adds their sums."""
         outputs = self.work.table.targets.shape[1]
         tables = [
             [

@@ -117,7 +117,7 @@ class MemberGroup:
         return float(losses.mean()), absolute
 
     def of_kind(self, kind: int) -> Tensor:
-        """Return the indices of the members trained with one of the losses."""
+        """Return the indices of the members trained with the given kind of loss."""
         return torch.nonzero(self.kind == kind).flatten()
 
     def left_out(self, columns: Tensor, folds: Folds, kind: int) -> DoubleArray:

@@ -1,4 +1,4 @@
-"""Settings of a training that averages networks trained on different folds."""
+"""Settings of an ensemble of networks, each trained on different folds."""
 
 from __future__ import annotations
 

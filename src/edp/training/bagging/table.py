@@ -68,7 +68,7 @@ class BaggingTable:
 
 
 def committee_of(net: Predictor) -> Committee:
-    """Return the backbone of a network trained with cross-validation folds.
+    """Return the backbone of an ensemble network.
 
     Raises:
         TypeError: it is another one; `check_training` refuses this before.
@@ -162,7 +162,7 @@ def _whole_recordings(
 
 
 def _pieces(share: float, test: Sequence[Series], reach: int, stride: int) -> int:
-    """Return the number of contiguous parts per fold, so that they are as long as the test segments.
+    """Return the number of contiguous parts per fold that makes them as long as the test segments.
 
     What a fold leaves out should be as unlike the rest as what tests is: of three logs whose ends test a fold of one
     piece would leave out most of one log, and a model that does well on a log it has not seen would be preferred.

@@ -1,4 +1,4 @@
-"""Hidden-feature hints: how well a student's hidden features predict those of its teachers."""
+"""Hidden-feature hints: how well a student's hidden features predict the hidden features of its teachers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RIDGE = 1e-3  # of the student's mean square: keeps the map small where features
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """Principal components of hidden features with a common scale, so that their mean square is one on average.
+    """Principal components of hidden features, scaled to a mean square of 1.
 
     Attributes:
         mean: ``(width,)``.

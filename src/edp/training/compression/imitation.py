@@ -80,7 +80,7 @@ def imitates(teachers: Sequence[Predictor], model: ModelSpec) -> bool:
 
 
 def predict_rows(net: Predictor, rows: Tensor) -> Tensor:
-    """Return the outputs of an ensemble with a linear head on bank rows, before the dead band, which a student shares.
+    """Return the outputs of an ensemble on bank rows before the dead band.
 
     Args:
         net: its settings satisfy `imitates`.

@@ -110,7 +110,7 @@ class MachineParametrisation:
         return result
 
     def transform(self, equations: NormalEquations, theta: Doubles) -> NormalEquations:
-        """Return normal equations by the coordinates, from those by the grey-box parameters at `theta`."""
+        """Transform normal equations for the grey-box parameters at `theta` to the coordinates of the fit."""
         slopes = self.slopes(theta)
         return NormalEquations(slopes.T @ equations.matrix @ slopes, slopes.T @ equations.gradient, equations.losses)
 

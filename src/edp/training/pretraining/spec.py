@@ -12,7 +12,7 @@ MAX_STEPS = 1_000
 
 @dataclass(frozen=True, kw_only=True)
 class MetaSpec:
-    """Inner loop of the meta-learners; joint training over all machines has none.
+    """Inner loop of the meta-learners; joint training over all machines does not use it.
 
     Attributes:
         inner_rate: learning rate of a step of adaptation.

@@ -105,7 +105,7 @@ def _shift(net: Predictor, change: NDArray[np.float64]) -> None:
 
 
 def _errors(net: Predictor, series: Sequence[Series]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return mean error and mean absolute error, SI units, ``(horizon, target)``; NaN if nothing can be evaluated."""
+    """Return mean error and mean absolute error, SI units, ``(horizon, target)``; NaN without evaluated samples."""
     horizons, targets = len(net.task.horizons), len(net.task.targets)
     total, size, ticks = np.zeros((horizons, targets)), np.zeros((horizons, targets)), np.zeros((horizons, 1))
     for index, error in stream_errors(net, series):

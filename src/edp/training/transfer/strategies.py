@@ -58,7 +58,7 @@ class LowRank:
         return True
 
     def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
-        """Return the loss of the base strategy; there is no teacher."""
+        """Return the loss of the base strategy, without a teacher."""
         return self.base.loss(objective, batch_context)
 
     def end(self, net: Predictor) -> None:

@@ -24,7 +24,7 @@ Rows = NDArray[np.float32]
 
 
 def choose_tuned_spec(bundle: TwinBundle) -> TunedSpec:
-    """Return which numbers of a twin adapt; oil temperature is known if the logs hold it.
+    """Return which parameters of a twin adapt; oil temperature is known if the logs contain it.
 
     Raises:
         BundleError: its provenance holds another thing than a temperature there.

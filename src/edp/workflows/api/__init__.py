@@ -1,1 +1,1 @@
-"""Public Python API: the names of ``import edp``. A module is imported on first use of one of its names."""
+"""Public Python API: the names of ``import edp``. The first use of a name imports its module."""

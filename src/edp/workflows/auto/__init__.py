@@ -1,4 +1,4 @@
-"""Automatic preset: several models are trained and evaluated on left-out data; the simplest of the best is kept."""
+"""Automatic preset: train several models, evaluate them on left-out data and select the simplest of the best."""
 
 from edp.workflows.auto.settings import AutoSettings, auto_settings, load_auto, usual_preset
 from edp.workflows.auto.train_auto import AutoResult, train_auto

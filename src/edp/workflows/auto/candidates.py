@@ -153,7 +153,7 @@ class Foundation:
 
     @property
     def ticks(self) -> int:
-        """Return the ticks of an update, all lanes together."""
+        """Return the number of samples of an update over the batch."""
         chunks = self._training(0, 1).chunks
         return chunks.length * chunks.batch
 
@@ -216,7 +216,7 @@ class Foundation:
 
 
 def read_foundation(path: str) -> Foundation | None:
-    """Read the network that the settings name; None if they name none.
+    """Read the network that the settings name; None if not set.
 
     Raises:
         ConfigError: a committee, whose parts do not learn by gradient.

@@ -77,7 +77,7 @@ class Promise:
         return {"low": self.error() * low, "high": self.error() * high}
 
     def _error(self, chosen: NDArray[np.int64]) -> DoubleArray:
-        """Return errors over drawn blocks ``(draw, block)``, ``(draw, output)``."""
+        """Return errors over resampled blocks ``(draw, block)``, ``(draw, output)``."""
         shares = self.rows[chosen] / self.rows[chosen].sum(axis=1, keepdims=True)
 
         def mean(squared: DoubleArray) -> DoubleArray:

@@ -1,4 +1,4 @@
-"""Training of the candidates, one by one or in parallel, after a short trial of the longest training."""
+"""Training of the candidates in sequence or in parallel, after a short trial of the longest training."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class CandidateTraining:
 
     @property
     def on_folds(self) -> bool:
-        """Test whether it is trained with cross-validation folds; networks trained by gradient descent on chunks are not."""
+        """Return whether the candidate is trained on folds, in contrast to gradient descent on chunks."""
         return self.experiment.training.bagging is not None
 
 

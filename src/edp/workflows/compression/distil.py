@@ -180,7 +180,7 @@ def _run_folder(run: str | Path) -> Path:
 
 
 def order_facts(order: CompressionRequest) -> dict[str, object]:
-    """Return the plain values that determine what a request trains."""
+    """Return the plain values that determine the training of a request."""
     spec = order.distillation
     plain = None if spec is None else asdict(spec) | {"soft": _loss(spec)}
     rounding: RoundingSpec | None = order.rounding

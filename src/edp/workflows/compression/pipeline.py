@@ -125,7 +125,7 @@ def on_validation(data: Prepared) -> Prepared:
 
 
 def relative_error(scores: Scores, teacher: Scores) -> float:
-    """Return the MAE divided by that of the teacher, mean over horizons."""
+    """Return the MAE relative to the teacher's MAE, mean over horizons."""
     # A ratio by horizon: far horizons have larger errors and would decide alone.
     return float(np.mean([scores[horizon]["mae"] / max(row["mae"], 1e-30) for horizon, row in teacher.items()]))
 
@@ -172,7 +172,7 @@ def _recipe_text(order: CompressionRequest) -> str:
 
 
 def choose(rows: Sequence[CompressedRow]) -> tuple[list[int], int | None]:
-    """Return the front of error, cycles and bytes, and the fitting row with the least error; None if none fits."""
+    """Return the front of error, cycles and bytes, and the row within the budget with the least error, if any."""
     fitting = [index for index, row in enumerate(rows) if row.fits]
     # Ties of error go to fewer cycles, then fewer bytes, by the order of the tuple.
     return pareto([row.costs for row in rows]), min(fitting, key=lambda index: rows[index].costs, default=None)

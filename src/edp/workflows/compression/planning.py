@@ -177,7 +177,7 @@ def _usage_at(teacher: Predictor, units: int, name: str, budget: Budget) -> Reso
 
 
 def _widest(teacher: Predictor, name: str, budget: Budget, widths: Sequence[int]) -> int:
-    """Return the width of the widest network that fits; 0 if none does."""
+    """Return the width of the widest network within the budget; 0 without one."""
     low, high = 0, len(widths)  # those before `low` fit, those from `high` on do not
     # Cost rises with the width, so bisection finds the widest that fits in a few builds.
     while low < high:

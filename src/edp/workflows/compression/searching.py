@@ -298,7 +298,7 @@ class _Comparison:
     def _add(
         self, order: CompressionRequest | None, result: NetworkResult, network: Predictor, variant: str = ""
     ) -> None:
-        """Add the rows of a network; those of a thesis variant have its name."""
+        """Add the rows of a network; rows of a thesis variant have its name."""
         run = self.run if order is None else self.bench.folder / order.name
         for row in rows_of(order, result, self.teacher.scores, str(run)):
             self.rows.append(replace(row, name=variant or row.name))

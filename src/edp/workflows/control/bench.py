@@ -112,7 +112,7 @@ class ControlBench:
         guard: LoopGuard | None = None,
         divided: DividedLoops | None = None,
     ) -> list[LoopResult]:
-        """Run every loop with a controller, by default that of the experiment.
+        """Run every loop with a controller; the default is the controller of the experiment.
 
         Args:
             spec: settings of the controller.

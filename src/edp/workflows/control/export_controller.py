@@ -68,7 +68,7 @@ def parts_of(
     twin: TwinBundle | None,
     most: Mapping[str, int] = MOST,
 ) -> ControllerParts:
-    """Return the numbers of a controller, without a self-test.
+    """Return the exported parts of a controller, without a self-test.
 
     Args:
         experiment: its settings.
@@ -186,7 +186,7 @@ def _pilots(machine: Machine, names: tuple[str, ...]) -> tuple[PilotCommand, ...
 
 
 def _check_pilots(plan: PlanParts, plant: PlantInterface) -> None:
-    """Refuse a plant whose pilot pressures differ from those of its machine.
+    """Raise an error if the pilot pressures of a plant differ from the pilot pressures of its machine.
 
     Raises:
         ExportError: it is one.
@@ -209,7 +209,7 @@ def _check_pilots(plan: PlanParts, plant: PlantInterface) -> None:
 
 
 def golden_loop(parts: ControllerParts, stored: KeptController) -> GoldenLoop | None:
-    """Return the kept segment before the first tick with a missing input; None if the first tick has one."""
+    """Return the stored segment before the first tick with a missing input; None if the first tick has one."""
     columns = stored.plant.columns(tuple(channel.name for channel in parts.inputs))
     measured = stored.observed[:, columns]
     good: NDArray[np.bool_] = np.asarray(np.isfinite(measured).all(axis=1))
@@ -224,7 +224,7 @@ def golden_loop(parts: ControllerParts, stored: KeptController) -> GoldenLoop | 
 
 
 def _replay(stored: KeptController, ticks: int) -> tuple[Array, Array]:
-    """Return memory before each tick and levers of the controller under the kept observations."""
+    """Return memory before each tick and levers of the controller under the stored observations."""
     experiment = stored.experiment
     controller = experiment.controller.build(stored.plant, experiment.task.limits, stored.models)
     if not isinstance(controller, PiController | NmpcController):

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TransferSpec:
-    """Number of drawn settings.
+    """Number of random settings.
 
     Attributes:
         settings: uniformly from what the controller says is worth trying.
@@ -48,7 +48,7 @@ class TuningTransfer:
 
     @property
     def rank_correlation(self) -> float:
-        """Return Spearman's rank correlation; 0 if one of the scores does not vary."""
+        """Return Spearman's rank correlation; 0 if a score is constant."""
         if np.ptp(self.on_model) == 0.0 or np.ptp(self.on_plant) == 0.0:
             return 0.0
         return float(spearmanr(self.on_model, self.on_plant).statistic)
@@ -60,7 +60,7 @@ class TuningTransfer:
 
 
 def draw_settings(controller: ControllerSpec, spec: TransferSpec) -> list[ControllerSpec]:
-    """Return controllers with gains drawn uniformly from their space.
+    """Return controllers with gains sampled uniformly from their space.
 
     Raises:
         ConfigError: it has no gains to vary.

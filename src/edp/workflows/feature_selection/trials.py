@@ -47,7 +47,7 @@ _DRAWS = 20
 
 @dataclass(frozen=True, kw_only=True)
 class TrialSpec:
-    """Trainings in addition to those of the given sets.
+    """Trainings in addition to the given feature sets.
 
     Attributes:
         random: sets drawn at random from the channels, of the size of the first given set.
@@ -266,7 +266,7 @@ class _Finished:
 def _tabulate_trials(
     finished: Mapping[str, Sequence[_Finished]], notes: Sequence[str], horizons: Sequence[int]
 ) -> Trials:
-    """Return the table of the kept scores."""
+    """Return the table of the stored scores."""
     ahead = [str(horizon) for horizon in horizons]
     names = list(finished)
     by_recording = {name: _recordings(finished[name], ahead) for name in names}

@@ -195,7 +195,7 @@ def _unit(machine: StoredMachine, digest: str, source: str | Path, store: str | 
 
 
 def tune_machine(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState | dict[str, Any]:
-    """Fine-tune for one machine; only the change of the weights is kept."""
+    """Fine-tune for one machine and return the change of the weights."""
     config = identity.config
     base = _source(where["source"], config["base"])
     logs = MachineSource(Path(where["store"]), machine=config["machine"])

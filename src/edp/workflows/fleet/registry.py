@@ -294,7 +294,7 @@ def find_entry(registry: str | Path, asked: str) -> RegistryEntry:
 
 
 def lineage(registry: str | Path, entry: RegistryEntry) -> list[RegistryEntry | str]:
-    """Return the ancestors of an entry: its base, the base of that, and so on; an identifier for an unknown one."""
+    """Return the ancestors of an entry: its base, the base of its base, ...; the identifier of an unknown ancestor."""
     steps: list[RegistryEntry | str] = []
     seen = {entry.id}
     while entry.base:

@@ -1,4 +1,4 @@
-"""Machine file of the simulator from logs: a grey box is fitted, and its numbers are written back."""
+"""Machine file of the simulator from logs: a grey box is fitted, and its values are written back."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class Identified:
 
 @dataclass(frozen=True, eq=False)
 class _Fitted:
-    """Grey box of an excavator front, with the information on its numbers."""
+    """Grey box of an excavator front, with the information on its values."""
 
     twin: GreyTwin
     information: Doubles
@@ -114,7 +114,7 @@ def identify(
     run: str | Path | None = None,
     progress: Progress = SILENT,
 ) -> Identified:
-    """Find a simulator machine with the numbers of the logs, and write its file.
+    """Find simulator parameters that reproduce the logs, and write the machine file.
 
     Next to it a file of the same name that ends in ``.json`` has every number and the scores, and a run folder that
     ends in ``.run`` the stages of the fit: the same call continues after a stop.

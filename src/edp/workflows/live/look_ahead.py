@@ -1,4 +1,4 @@
-"""Predictions of a trained network tick by tick, equal to those of `edp evaluate`."""
+"""Predictions of a trained network sample by sample, equal to the predictions of `edp evaluate`."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class LiveNetwork(LivePart):
 
 
 def spread(count: int, most: int = MAX_HORIZONS) -> list[int]:
-    """Return at most `most` evenly spread numbers below `count`, including the first and the last."""
+    """Return at most `most` evenly spread values below `count`, including the first and the last."""
     if count <= most:
         return list(range(count))
     return sorted({round(i * (count - 1) / (most - 1)) for i in range(most)})

@@ -151,7 +151,7 @@ def entities(layout: LiveLayout, escaped: Any = str) -> Mapping[str, tuple[int, 
 
 
 def quiet_environment(folder: Path) -> dict[str, str]:
-    """Return environment variables that keep Rerun's settings in a folder of the session and its telemetry off."""
+    """Return environment variables that disable Rerun's telemetry and keep its settings in the session folder."""
     places = dict.fromkeys(("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME", "APPDATA", "LOCALAPPDATA"))
     return {**os.environ, **dict.fromkeys(places, str(folder))}
 

@@ -22,7 +22,7 @@ networks cost as much for a block as for one sample. Parts of longer blocks suff
 
 
 class _Chunks(MonitorStream):
-    """Monitor over chunks of ticks; its results equal those of single ticks."""
+    """Monitor over chunks of samples, with the same results as sample by sample."""
 
     @property
     def statistics(self) -> tuple[float, ...]:
@@ -42,7 +42,7 @@ class _Chunks(MonitorStream):
 
 
 class LiveMonitor(LivePart):
-    """Only source of alarms: a value outside its interval raises none.
+    """Only source of alarms: a value outside its interval does not raise an alarm.
 
     Args:
         monitor: running monitor.

@@ -96,7 +96,7 @@ def monitor_footprint_of(monitor: str | Path) -> MonitorFootprint:
 
 
 def monitor_parts(monitor: Monitor, golden: bool = True) -> MonitorParts:
-    """Return the numbers of a monitor, and the expected values of its self-test.
+    """Return the exported parts of a monitor, and the expected values of its self-test.
 
     Args:
         monitor: fitted.
@@ -214,7 +214,7 @@ def _twin(source: TwinPorts, columns: Mapping[str, int]) -> TwinPart:
 
 
 def golden_chain(chain: MonitorChain) -> GoldenChain:
-    """Return the results of the chain for drawn rows."""
+    """Return the results of the chain for plotted rows."""
     inputs, residuals = drawn_rows(chain)
     verdicts, _ = chain.run(residuals, inputs, chain.initial_state())
     last = [verdict.evidence for verdict in verdicts if verdict.alarm is not None]
@@ -261,7 +261,7 @@ def _fill_missing(rows: Rows, start: NDArray[np.float64]) -> Rows:
 
 
 def _compute_tolerance(part: SourcePart, rows: Rows) -> NDArray[np.float64]:
-    """Return the tolerance of residuals in C: that of the network's numbers; zero for sums and integers."""
+    """Return the tolerance of residuals in C: the tolerance of the network; zero for sums and integers."""
     if isinstance(part, Balances | FlowBalances):
         return np.zeros(len(part.names))
     if isinstance(part, TwinPart):

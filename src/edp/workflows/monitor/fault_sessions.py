@@ -76,7 +76,7 @@ def cases_of(classes: Sequence[FaultClass]) -> list[tuple[int, float]]:
 
 
 def mirrors(classes: Sequence[FaultClass]) -> dict[int, int]:
-    """Return the positions of classes of negative sizes by those of positive sizes."""
+    """Return the position of the class with the opposite sign for each class."""
     numbers = {(fault.kind, fault.site): n for n, fault in enumerate(classes) if not _is_negative(fault)}
     return {numbers[fault.kind, fault.site]: n for n, fault in enumerate(classes) if _is_negative(fault)}
 
@@ -88,7 +88,7 @@ def _is_negative(fault: FaultClass) -> bool:
 def simulated(
     classes: Sequence[FaultClass], machine: str, seconds: tuple[float, float], seed: tuple[int, int], rate_hz: float
 ) -> Iterator[FaultSession]:
-    """Yield the sessions of one draw: sound ones, followed by one for each class and size.
+    """Yield the sessions of one draw: healthy sessions, followed by one session per class and size.
 
     Args:
         classes: result of `fault_classes`.

@@ -223,7 +223,7 @@ def _assemble_monitor(
     sessions: Sequence[Recording],
     rest: Sequence[Recording],
 ) -> Monitor:
-    """Return the monitor without a dictionary; `rest` are the sessions that trained no residual."""
+    """Return the monitor without a dictionary; `rest` are the sessions that no residual was trained on."""
     doubtful = fitted.doubtful
     provenance: dict[str, object] = {
         "sessions": len(sessions),
@@ -260,7 +260,7 @@ def _add_dictionary(
 
 
 def select_watched(recordings: Sequence[Recording], experiment: MonitorExperiment) -> tuple[Channel, ...]:
-    """Return the channels that all recordings hold and sensors can measure, or those of the settings.
+    """Return the channels of the settings, or the measurable channels that all recordings have.
 
     Raises:
         DataError: a named channel is missing, rates differ, or fewer than two channels are left.
@@ -372,7 +372,7 @@ def _sources(
 
 
 def _check_hours(sessions: Sequence[Recording], rest: Sequence[Recording], experiment: MonitorExperiment) -> None:
-    """Raise an error for a false-alarm rate that the hours cannot support, before any network is trained.
+    """Raise an error for a false-alarm rate that the hours of data cannot support, before any training.
 
     Args:
         sessions: all of them.
@@ -404,7 +404,7 @@ class _HealthySessions:
 
 
 def _healthy_sessions(recordings: Sequence[Recording], experiment: MonitorExperiment) -> _HealthySessions:
-    """Divide healthy logs into randomly drawn sessions, and check that they suffice for a monitor.
+    """Divide healthy logs into random sessions, and check that they suffice for a monitor.
 
     Raises:
         DataError: channels, values or hours that a monitor cannot be fitted to.

@@ -208,7 +208,7 @@ def watch_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithStat
 
 @lru_cache(maxsize=1)
 def _open_monitor(folder: str, digest: str) -> Monitor:
-    """Return a monitor, loaded once for all units of a process; `digest` is that of its content."""
+    """Return a monitor, loaded once for all units of a process; `digest` identifies its content."""
     return load_monitor(folder)
 
 

@@ -1,4 +1,4 @@
-"""Test of all forms of a network on one golden recording: numbers against PyTorch, and speed."""
+"""Test of all forms of a network on one golden recording: values against PyTorch, and speed."""
 
 import edp.workflows.parity.forms  # noqa: F401, enters them
 from edp.workflows.parity.base import FORMS, Broken, Missing, ParityCase, Ran, Row

@@ -142,7 +142,7 @@ class Row:
 
 
 def compared(form: str, title: str, case: ParityCase, ran: Ran) -> Row:
-    """Compare the numbers of a form with the expected ones."""
+    """Compare the outputs of a form with the expected outputs."""
     expected = case.expected if ran.expected is None else ran.expected
     allowed = case.allowed if ran.allowed is None else ran.allowed
     computed = np.asarray(ran.numbers, dtype=np.float64)

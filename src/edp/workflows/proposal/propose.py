@@ -117,7 +117,7 @@ class LogsProposal:
 
 
 def _untold_inputs(proposal: MapProposal) -> tuple[str, ...]:
-    """Return command channels if all are generic; none if a name contains the comma that separates names."""
+    """Return the command channels if all are generic; empty if a name contains the separator (comma)."""
     commands = proposal.select_role("command")
     names = tuple(guess.channel for guess in commands)
     plain = all(guess.kind.kind is Kind.GENERIC for guess in commands) and not any("," in name for name in names)
@@ -129,7 +129,7 @@ def _quoted(path: Path) -> str:
 
 
 def propose(path: str | Path | Sequence[str | Path], progress: Progress = SILENT) -> LogsProposal:
-    """Examine logs and propose a map and settings; nothing is written.
+    """Examine logs and propose a map and settings, without writing files.
 
     Args:
         path: a log or a folder of logs, or several of them.

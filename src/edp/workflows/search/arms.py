@@ -43,7 +43,7 @@ class Arm:
         return self.get(path)
 
     def get(self, path: str, default: Any = None) -> Any:
-        """Return the value at a path, or a default if there is none."""
+        """Return the value at a path, or a default if missing."""
         return value_at(self.tables, path, default)
 
     def __contains__(self, path: str) -> bool:

@@ -63,7 +63,7 @@ class SearchContext:
     @property
     # Sessions of the first run: choices of later phases rest on the same ones.
     def validation(self) -> tuple[str, ...]:
-        """Return the development sessions that evaluate while the others train: those of the first run.
+        """Return the validation sessions of the first run among the development sessions.
 
         Two or more train.
         """
@@ -77,7 +77,7 @@ class SearchContext:
         return tuple(name for name in self.development if name not in self.validation)
 
     def folds(self, runs: int) -> NDArray[np.bool_]:
-        """Return the evaluation development sessions of each run ``(run, session)``; more runs keep the same first ones.
+        """Return the evaluation sessions of each run ``(run, session)``; the first runs do not depend on their number.
 
         Repeated folds; in the thesis's mode independent draws of as many sessions as a fold has.
         """
@@ -125,7 +125,7 @@ class SearchContext:
         updates: int,
         validation: tuple[str, ...],
     ) -> TrainingRequest:
-        """Request a training; sessions of `validation` select the best of several epochs, and nothing for one epoch."""
+        """Request a training; `validation` sessions select the best of several epochs and are unused for one epoch."""
         epochs, patience = self.spec.epochs, self.spec.patience
         chosen_by = validation if epochs > 1 else ()
         sessions = (arm.tables, self.source, train, judged)
@@ -167,7 +167,7 @@ def _fills_folds(development: int, spec: SearchSpec) -> bool:
 def set_apart(
     sessions: Sequence[str], families: Mapping[str, str], spec: SearchSpec
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """Return development sessions, test sessions, and the second test set, drawn once in proportion from each family.
+    """Return development sessions, test sessions, and the second test set, sampled once in proportion from each family.
 
     Args:
         sessions: names in order.

@@ -1,4 +1,4 @@
-"""Copy of a study's questions and answers for optuna-dashboard; the ledger remains the source."""
+"""Copy of a study for optuna-dashboard; the ledger remains the source."""
 
 from __future__ import annotations
 

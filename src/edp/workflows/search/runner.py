@@ -65,7 +65,7 @@ class Resources(Workers):
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Results of a search so far.
+    """Results of a search until now.
 
     Attributes:
         folder: folder of the study.

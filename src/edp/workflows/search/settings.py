@@ -211,7 +211,7 @@ class CompressionSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class SearchSpec:
-    """Settings of a search; the preset ``thesis`` holds the thesis's own numbers.
+    """Settings of a search; the preset ``thesis`` holds the thesis's own values.
 
     Attributes:
         mode: ``sound`` (docs/statistics.md) or ``thesis``, whose tests and rules are followed (docs/thesis_preset.md).

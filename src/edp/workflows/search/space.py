@@ -39,7 +39,7 @@ class Real:
             raise ConfigError(f"a logarithmic range from {self.low}; low > 0 must hold")
 
     def holds(self, value: Value) -> bool:
-        """Test whether a value lies in the range."""
+        """Test whether a value is in the range."""
         return isinstance(value, float | int) and self.low <= value <= self.high
 
     def around(self, value: float, reach: float, beyond: bool = False) -> Real:
@@ -157,7 +157,7 @@ def _patience(arm: Arm, value: int) -> Arm:
 
 @DIMENSIONS.register("smoothness")
 def _smoothness(arm: Arm, value: float) -> Arm:
-    """Set the weight of the smoothness term; with it, windows are drawn in runs that have second differences."""
+    """Set the weight of the smoothness term; with it, windows are sampled in runs that have second differences."""
     terms = [term for term in arm["training.terms"] if term["kind"] != "smoothness"]
     if not value:
         return arm.with_value("training.terms", terms)

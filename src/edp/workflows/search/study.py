@@ -62,7 +62,7 @@ class Trial:
     score: float | None = None
 
     def mean(self, horizon: int, name: str = "composite") -> float | None:
-        """Return a score, mean over its runs; None if there is none, or one did not end well."""
+        """Return a score, mean over its runs; None if missing, or one did not end well."""
         scores = [outcome.mean(horizon, name) for outcome in self.outcomes]
         return float(np.mean(scores)) if scores and np.isfinite(scores).all() else None
 
@@ -235,7 +235,7 @@ class Study:
     def tell(
         self, number: int, values: Sequence[float] | None, costs: Sequence[float] = (), pruned: bool = False
     ) -> None:
-        """Report the answer of a question in any order; answers count in the order of numbers.
+        """Report the answer of a question in any order; answers count in the order of values.
 
         Args:
             number: number of the trial.

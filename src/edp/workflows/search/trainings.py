@@ -239,7 +239,7 @@ def mean_scores(sessions: Mapping[str, Mapping[str, Mapping[str, float]]]) -> di
 
 
 def prepared(order: TrainingRequest, experiment: Experiment) -> Prepared:
-    """Return the series of a request: training sessions, the first also for validation; evaluation sessions for the test.
+    """Return the series of a request: training, validation and evaluation sessions.
 
     Raises:
         ConfigError: settings that contradict the data.

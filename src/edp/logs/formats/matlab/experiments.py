@@ -26,7 +26,7 @@ def experiment_names(variables: Mapping[str, object]) -> list[str]:
 
 
 def pick_experiment(variables: Mapping[str, object], name: str) -> dict[str, object] | None:
-    """Return one experiment as a variable; None if no variable has one of this name."""
+    """Return one experiment as a variable; None if no variable has this name."""
     match = _ONE.fullmatch(name)
     if match is None or match["variable"] not in variables:
         return None
@@ -36,7 +36,7 @@ def pick_experiment(variables: Mapping[str, object], name: str) -> dict[str, obj
 
 
 def _experiments(value: Any) -> list[Any]:
-    """Return the experiments of a variable; empty if it is a single one or none."""
+    """Return the experiments of a variable; empty for a single experiment or other content."""
     if isinstance(value, MatlabOpaque):
         return _split_iddata(value)
     if not isinstance(value, np.ndarray) or value.size < 2 or not (value.dtype.names or value.dtype == object):

@@ -195,7 +195,7 @@ def _walk_structure_with_time(element: Any, path: str, mat_variables: MatVariabl
 
 
 def _add_streamed(element: Any, fields: tuple[str, ...], path: str, mat_variables: MatVariables) -> None:
-    """Add a Dataset signal whose values `edp.logs.formats.matlab.sigstream` has filled in."""
+    """Add a Dataset signal with the values from `edp.logs.formats.matlab.sigstream`."""
     values, time = element[VALUES], element[EVEN_TIMES]
     if not isinstance(values, np.ndarray) or values.ndim != 2 or time is None:
         return
@@ -318,7 +318,7 @@ def _timeseries_time(props: dict[str, object]) -> NDArray[np.float64] | None:
 
 @lru_cache(maxsize=1)
 def _even(start: float, step: float, length: int, factor: float) -> NDArray[np.float64]:
-    """Return evenly spaced times; signals of one Dataset share the array."""
+    """Return evenly spaced times; all signals of a Dataset use the same array."""
     return np.asarray((start + step * np.arange(length)) * factor, dtype=np.float64)
 
 

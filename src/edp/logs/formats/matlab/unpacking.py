@@ -27,7 +27,7 @@ OBJECT_BYTES = 8192
 
 
 def unpack(path: Path, variable: str | None = None) -> MatVariables:
-    """Return everything in a file, or in one of its variables.
+    """Return all variables of a file, or a single variable.
 
     Args:
         path: the file.

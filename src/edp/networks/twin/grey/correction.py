@@ -264,7 +264,7 @@ def _propagate_back(
     by_tick: Array,
     by_state: Array,
 ) -> None:
-    """Compute the gradient by the state before a sample from those by the fed values and the grey-box result."""
+    """Compute the gradient with respect to the previous state from the gradients of feedback values and grey box."""
     (t, row) = now
     by_state[:] = 0.0
     if trace.counts[t, row] == 0.0:

@@ -21,7 +21,7 @@ BASIS = (
 
 
 def datasheet(table: ParameterTable, values: Doubles, information: Doubles) -> tuple[DatasheetRow, ...]:
-    """Return one row per fitted parameter, and one for the derived inertia of each actuator; SI units.
+    """Return one row per fitted parameter, and one row for the inertia of each actuator, in SI units.
 
     Args:
         table: parameters of the grey box.

@@ -399,7 +399,7 @@ class Equations:
         return dp / self.algebra.sqrt(self.algebra.sqrt(dp * dp + SMOOTH2))
 
     def _open_centre(self, m: int, spools: Values) -> Any:
-        """Return the open-centre area of a pump; each moving spool closes it further."""
+        """Return the open-centre area of a pump; each moving spool reduces it."""
         area = self.pump[m][at.BYPASS]
         for j in range(self.form.valves):
             if self.form.valve_pump[j] == m:

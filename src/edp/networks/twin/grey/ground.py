@@ -80,12 +80,12 @@ class GroundLaw(ABC):
 
     @abstractmethod
     def to_dict(self) -> dict[str, object]:
-        """All of it as JSON takes it."""
+        """Return the law in JSON types."""
 
     @classmethod
     @abstractmethod
     def from_dict(cls, plain: Mapping[str, object]) -> GroundLaw:
-        """From what `plain` gave.
+        """Create the law from the result of `to_dict`.
 
         Raises:
             ValueError: it is damaged; likewise KeyError and TypeError.
@@ -97,7 +97,7 @@ class GroundLaw(ABC):
         """Parameters of the law."""
 
     def rows(self) -> list[DatasheetRow]:
-        """Return the rows of the datasheet. A parameter that the logs do not tell has no interval."""
+        """Return the rows of the datasheet. A parameter that the logs do not determine has no interval."""
         is_finite = np.isfinite(self.deviations)
         columns = zip(self.parameters, self.numbers, np.where(is_finite, self.deviations, 0.0), is_finite, strict=True)
         return [one.row(value, deviation / one.width, excited) for one, value, deviation, excited in columns]

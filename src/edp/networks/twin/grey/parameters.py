@@ -1,4 +1,4 @@
-"""Parameters of a grey box: position, meaning, unit and typical initial value of each."""
+"""Parameters of a grey box: position, meaning, unit and typical initial value."""
 
 from __future__ import annotations
 

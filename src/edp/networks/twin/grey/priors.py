@@ -36,7 +36,7 @@ START_CURVE = (0.25, 0.75)
 
 
 def opening_knots(stretches: int) -> Array:
-    """Return the knots of an opening curve with a number of `STRETCHES` ``(stretches + 1,)``, from 0 to 1."""
+    """Return the knots of an opening curve from 0 to 1, one more than its segments."""
     parts = stretches // STRETCHES[0]
     places = np.arange(stretches + 1) / parts
     return np.asarray(np.interp(places, np.arange(len(COARSE)), COARSE))
@@ -181,7 +181,7 @@ def valve_numbers(
     first: int,
     knots: Array,
 ) -> list[Parameter]:
-    """Return the parameters of a spool with opening curves between `knots`; `places` is filled in."""
+    """Return the parameters of a spool with opening curves between `knots`, and write their positions to `places`."""
     rows = [("dead_time", "s", 0.04, 0.5), ("pilot_lag", "s", 0.025, 0.5), ("spool_lag", "s", 0.02, 0.5)]
     numbers = [Parameter(name, label, unit, 1.0, start, width) for label, unit, start, width in rows]
     places[at.DELAY : at.BAND] = first + np.arange(3)

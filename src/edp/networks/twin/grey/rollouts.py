@@ -41,7 +41,7 @@ IntArray = NDArray[np.int64]
 
 
 class RunBatch(NamedTuple):
-    """Batch of runs in units of the grey box. A simulation updates all arrays from `answers` on in place.
+    """Batch of runs in units of the grey box. A simulation updates `answers` and all following arrays in place.
 
     Attributes:
         demands: valve commands, shape (run, sample, valve).
@@ -258,7 +258,7 @@ def evaluate_run(program: GreyProgram, machine: MachineArrays, batch: RunBatch, 
 def _sum_errors(
     program: GreyProgram, machine: MachineArrays, target: FitTarget, truth: Array, work: RunValues, used: int
 ) -> float:
-    """Return the Huber loss of one sample; write its errors and their derivatives from row `used` on."""
+    """Return the Huber loss of one sample, and write errors and derivatives, starting at row `used`."""
     loss, nodes = 0.0, program.sizes.nodes
     for c in range(len(machine.ports)):
         kind = machine.ports[c, 0]

@@ -149,7 +149,7 @@ class ExpressionGraph:
         return self.less(a, 0.0, -a, a)
 
     def function(self, name: str, a: Any) -> Expression:
-        """Return the function `name`, one of `FUNCTIONS`, of an expression."""
+        """Apply a function of `FUNCTIONS` to an expression."""
         argument = self.wrap(a)
         if argument.operation == "constant":
             return self.wrap(getattr(math, name)(argument.value))

@@ -19,7 +19,7 @@ class Pretraining(Protocol):
     """Whether it adapts to machines within an update; the others walk carried chunks."""
 
     def strategy(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy | None:
-        """Return the training strategy; None if the method has none.
+        """Return the training strategy; None without one.
 
         Raises:
             ConfigError: options that the method has no use for.

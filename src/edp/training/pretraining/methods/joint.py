@@ -19,5 +19,5 @@ class Joint:
     episodic: ClassVar[bool] = False
 
     def strategy(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy | None:
-        """Return a warm start, if there is a network to start from."""
+        """Return a warm start from a network; None without a network."""
         return None if start is None else WarmStart(start, unfreeze=False)

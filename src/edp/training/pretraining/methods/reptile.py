@@ -42,7 +42,7 @@ class Towards(Meta):
     """The gradient is the way that adaptation went, ``(w - w') / (sum of the rates)``."""
 
     def cost(self, net: Predictor, objective: Objective, support: Pieces, query: Pieces) -> Tensor:
-        """Return the query's loss after adaptation, with the Reptile gradient in place of its own."""
+        """Return the query's loss after adaptation, whose gradient is replaced by the Reptile gradient."""
         start = self.start_of(net)
         weights = start
         for number, rate in enumerate(self.spec.steps):

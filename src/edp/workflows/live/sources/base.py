@@ -52,7 +52,7 @@ class Sink(Protocol):
         ...
 
     def show(self) -> None:
-        """Show the rows so far: the next one is late."""
+        """Show the rows until now: the next one is late."""
         ...
 
     def begin_anew(self) -> None:

@@ -1,4 +1,4 @@
-"""``--ros2``: joints and pressures of a running ROS 2 with rclpy; topics equal those of exported nodes."""
+"""``--ros2``: joints and pressures of a running ROS 2 with rclpy; topics equal the topics of exported nodes."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Ros2Source(LiveSource):
 
     @classmethod
     def from_options(cls, options: SourceOptions, needs: Needs) -> Ros2Source:
-        """Return a source with the channels of the models; without a model those of Table A.1."""
+        """Create a source with the channels of the models; without a model, with the channels of Table A.1."""
         channels = tuple(needs.channels) or tuple(VOCABULARY.values())[:24]
         source = cls(channels, choose_rate(options, needs, "--ros2"))
         source.machine = options.machine

@@ -1,4 +1,4 @@
-"""``--sim``: simulator tick by tick with one of its operators at the levers."""
+"""``--sim``: simulator, sample by sample, with a simulated operator."""
 
 from __future__ import annotations
 

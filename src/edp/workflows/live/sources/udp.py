@@ -134,7 +134,7 @@ class UdpSource(LiveSource):
         return row
 
     def _first_channels(self) -> tuple[Channel, ...]:
-        """Return the channels of the first row if nothing else states them."""
+        """Return the channels of the first row if the settings do not state them."""
         ends = time.monotonic() + STARTUP_S
         while time.monotonic() < ends:
             try:

@@ -56,7 +56,7 @@ int main(void) {
 
 
 def streamed(bundle: Bundle, inputs: Rows, folder: Path) -> tuple[Rows, float]:
-    """Export, compile and run: return the numbers of each tick, and the seconds per tick.
+    """Export, compile and run; return the outputs of each sample and the seconds per sample.
 
     Raises:
         ExportError: the network has no such form.

@@ -1,4 +1,4 @@
-"""ONNX graphs in ONNX Runtime, in this Python and in others with other versions of it."""
+"""ONNX graphs in ONNX Runtime, in this Python and in Pythons with other versions of ONNX Runtime."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PyTorch tick by tick against PyTorch in one piece."""
+"""PyTorch sample by sample against PyTorch over the whole recording."""
 
 from __future__ import annotations
 

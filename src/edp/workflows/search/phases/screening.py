@@ -100,7 +100,7 @@ def _draw_values(context: SearchContext, window: Space, count: int) -> list[dict
 
 @dataclass(frozen=True)
 class _DesignRow:
-    """Training of the design: its active modules, drawn values, and fold."""
+    """Training of the design: its active modules, random values, and fold."""
 
     levels: NDArray[np.bool_]
     values: Mapping[str, float]
@@ -113,7 +113,7 @@ def _estimate_effects(
     rows: Sequence[_DesignRow],
     outcomes: Sequence[Outcome],
 ) -> Decision:
-    """Estimate main effects by least squares, with drawn values and fold as covariates; modules with a sign pass."""
+    """Estimate main effects by least squares, with random values and fold as covariates; modules with a sign pass."""
     scores = np.array([outcome.mean(context.spec.horizon) for outcome in outcomes])
     failed = int((~np.isfinite(scores)).sum())
     # A failed training counts as the worst that was seen, not as missing.

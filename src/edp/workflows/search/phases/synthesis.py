@@ -51,7 +51,7 @@ class Synthesis:
         return self.decide(context, facts)
 
     def decide(self, context: SearchContext, facts: SynthesisFacts) -> Decision:
-        """Return the kept modules, counterproductive combinations, and the result on the test sessions."""
+        """Return the selected modules, counterproductive combinations, and the result on the test sessions."""
         names = ", ".join(map(title_of, facts.modules)) or "no module"
         sentences = [f"Best together: {names}; {typed(facts.score, 3)}{behind(context.unit)} on development sessions."]
         sentences += facts.said_of_pruned
