@@ -126,7 +126,7 @@ class Recording:
         return same
 
     def index(self, name: str) -> int:
-        """Column of the named channel.
+        """Return the column of the named channel.
 
         Raises:
             DataError: no such channel; the closest name is offered.
@@ -139,7 +139,7 @@ class Recording:
             ) from None
 
     def column(self, name: str) -> FloatArray:
-        """Values of one channel, shape ``(time,)``."""
+        """Return the values of one channel, shape ``(time,)``."""
         return self.values[:, self.index(name)]
 
     def select(self, names: Sequence[str]) -> FloatArray:
@@ -160,7 +160,10 @@ class Recording:
 
 
 def columns(values: FloatArray, places: Sequence[int]) -> FloatArray:
-    """Columns of an array ``(time, channel)``; a view where they lie side by side, so that samples stay on disk."""
+    """Return the columns of an array ``(time, channel)``.
+
+    A view where they lie side by side, so that samples stay on disk.
+    """
     first = places[0] if places else 0
     if list(places) == list(range(first, first + len(places))):
         return values[:, first : first + len(places)]
@@ -168,7 +171,9 @@ def columns(values: FloatArray, places: Sequence[int]) -> FloatArray:
 
 
 def spread_stretches(lengths: Sequence[int], length: int, most: int = MAX_ROWS) -> list[tuple[int, int, int]]:
-    """Stretches that are evenly spread over sequences of rows: number of the sequence, first row, one after the last.
+    """Return the stretches that are evenly spread over sequences of rows.
+
+    Number of the sequence, first row, one after the last.
 
     Args:
         lengths: rows of each sequence.

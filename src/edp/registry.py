@@ -220,7 +220,7 @@ def origins_in(plain: Any) -> list[dict[str, str]]:
 
 
 def _kinds(plain: Any) -> Iterator[str]:
-    """Names of parts in nested plain values."""
+    """Return the names of parts in nested plain values."""
     if isinstance(plain, Mapping):
         for key, value in plain.items():
             if key in _NAMING_KEYS and isinstance(value, str):

@@ -24,7 +24,7 @@ HUGE_SHARE = 1e13
 
 
 def decimals_for(values: Iterable[float | None], significant: int = 3) -> int:
-    """Decimals that show the smallest non-zero magnitude of a column with `significant` digits, 0 to 6."""
+    """Return the decimals that show the smallest non-zero magnitude of a column with `significant` digits, 0 to 6."""
     sizes = [abs(value) for value in values if value is not None and math.isfinite(value) and value != 0]
     if not sizes:
         return 1
@@ -145,7 +145,7 @@ def setting_text(value: object) -> str:
 
 
 def printable(text: str) -> str:
-    """Text without control characters, turns of direction and halves of characters, each of them as one mark."""
+    """Return text without control characters, turns of direction and halves of characters, each of them as one mark."""
     return "".join(c if c.isprintable() or unicodedata.category(c) == "Zs" else "\ufffd" for c in text)
 
 

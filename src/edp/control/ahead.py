@@ -35,11 +35,13 @@ class VelocityModel(ABC):
 
     @abstractmethod
     def begin(self, measured: Array, command: Array) -> None:
-        """Form the memory as if the machine had rested with this row of `reads` and command of `PILOTS`, (12,)."""
+        """Initialise the memory in steady state for this row of `reads` and this command of `PILOTS`, (12,)."""
 
     @abstractmethod
     def ahead(self, measured: Array, commands: Array) -> Array:
-        """Velocities (m/s), shape (candidate, 3), of candidate commands (Pa), shape (candidate, 12); memory stays.
+        """Return the velocities (m/s), shape (candidate, 3), of candidate commands (Pa), shape (candidate, 12).
+
+        Memory stays.
 
         The first candidate is the one that a model may be made linear about.
         """
@@ -160,7 +162,7 @@ class TwinAhead(VelocityModel):
         self._state = self._runner.step(pilots, self._state, self._row(measured))
 
     def _row(self, measured: Array) -> NDArray[np.float32]:
-        """Values of all ports, NaN where one is free."""
+        """Return the values of all ports, NaN where one is free."""
         row = np.full(len(self.twin.channels.answers), np.nan, np.float32)
         row[self._ports] = measured
         return row
@@ -168,7 +170,7 @@ class TwinAhead(VelocityModel):
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """PyTorch on one thread, on which the few rows of a tick are fastest; the caller's number comes back."""
+    """Return the PyTorch on one thread, on which the few rows of a tick are fastest; the caller's number comes back."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -104,7 +104,7 @@ class Controller(ABC):
 
     @abstractmethod
     def levers(self, measured: Array, tick: int) -> Array:
-        """Levers of a tick, shape (3,), before limits.
+        """Return the levers of a tick, shape (3,), before limits.
 
         Args:
             measured: the channels of `reads`, finite; NaN where a spared one is not trusted.
@@ -115,7 +115,9 @@ class Controller(ABC):
         """
 
     def fallback(self, measured: Array, tick: int, reason: str) -> Array:
-        """Levers of a tick at which a guard does not trust the controller's model; arguments and shape of `levers`.
+        """Return the levers of a tick at which a guard does not trust the controller's model.
+
+        Arguments and shape of `levers`.
 
         Args:
             measured: the channels of `reads`, finite; NaN where a spared one is not trusted.
@@ -173,7 +175,7 @@ class Controller(ABC):
         self.begin(measured, reference)
 
     def step(self, observation: Array, tick: int, verdict: GuardVerdict = TRUSTED) -> Array:
-        """Levers to apply from now to the next tick, shape (3,), within the limits; never raises.
+        """Return the levers to apply from now to the next tick, shape (3,), within the limits; never raises.
 
         Args:
             observation: SI values in the order of the plant's channels; NaN where one is missing.
@@ -201,7 +203,7 @@ class Controller(ABC):
         return self._before.copy()
 
     def _compute_levers(self, observation: Array, tick: int, verdict: GuardVerdict) -> tuple[Array, str]:
-        """Levers before limits, and the fault for which they are neutral; empty without one."""
+        """Return the levers before limits, and the fault for which they are neutral; empty without one."""
         values = np.asarray(observation, float)
         neutral = np.zeros(AXES)
         if values.shape != (len(self.plant.channels),):

@@ -36,7 +36,7 @@ class TipGeometry:
         self._kinematics = pose.Kinematics(axes, plant)
 
     def tip(self, strokes_m: Array) -> Array:
-        """Tip x and y (m) and attitude (rad) at strokes (m), shape (..., 3) both.
+        """Return the tip x and y (m) and attitude (rad) at strokes (m), shape (..., 3) both.
 
         Raises:
             ConfigError: a stroke that is not finite.
@@ -47,7 +47,7 @@ class TipGeometry:
         return self._kinematics.poses(np.clip(strokes, 0.0, self.full_m))
 
     def strokes(self, poses: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Strokes (m) that put the tip at poses, and which of the poses can be reached.
+        """Return the strokes (m) that put the tip at poses, and which of the poses can be reached.
 
         Args:
             poses: tip x, y (m) and attitude (rad), shape (..., 3).

@@ -61,7 +61,7 @@ class LoopLimits:
                 )
 
     def applied(self, levers: Array, before: Array, rate_hz: float) -> Array:
-        """Levers within range and slew; the slew limit counts from the levers of the tick before.
+        """Return the levers within range and slew; the slew limit counts from the levers of the tick before.
 
         Args:
             levers: asked for, shape (3,), finite.

@@ -118,7 +118,7 @@ class _Watched:
         self.warnings: list[ControlEvent] = []
 
     def step(self, observation: Array, tick: int) -> tuple[Array, float]:
-        """Levers of a tick, and the time (s) that the controller took, without the guard's."""
+        """Return the levers of a tick, and the time (s) that the controller took, without the guard's."""
         verdict = TRUSTED if self._guard is None else verdict_of(self._guard, self.controller.plant, observation)
         if verdict.untrusted or verdict.fall_back:
             log_event(self.warnings, tick, str(verdict))
@@ -155,7 +155,7 @@ def _run_loop(
 
 
 def start_options(task: ControlTask, geometry: TipGeometry) -> Table:
-    """Options of the environment's reset that put the machine at the start of a task."""
+    """Return the options of the environment's reset that put the machine at the start of a task."""
     shares = np.clip(task.reference.strokes[0] / geometry.full_m, 0.0, 1.0)
     return {"strokes": tuple(map(float, shares)), "material": task.material}
 

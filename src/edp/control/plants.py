@@ -23,7 +23,7 @@ SAME_STROKE = 0.01
 
 
 def is_fmu(plant: str | Path) -> bool:
-    """Whether a plant is an FMU, by the ending of its file."""
+    """Return whether a plant is an FMU, by the ending of its file."""
     return Path(plant).suffix.lower() == FMU
 
 

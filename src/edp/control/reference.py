@@ -44,7 +44,7 @@ class TipReference:
         return np.clip(np.arange(start, start + count), 0, self.ticks - 1)
 
     def speeds(self) -> Array:
-        """Stroke velocities, m/s, shape (ticks, 3): central differences."""
+        """Return the stroke velocities, m/s, shape (ticks, 3): central differences."""
         return np.asarray(np.gradient(self.strokes, 1.0 / self.rate_hz, axis=0))
 
 

@@ -110,7 +110,7 @@ def scored(trace: LoopTrace, reference: TipReference, limits: LoopLimits, missed
 
 
 def path_distance(points: Array, path: Array) -> Array:
-    """Distance of points, shape (points, 2), to a polyline, shape (corners, 2); shape (points,)."""
+    """Return the distance of points, shape (points, 2), to a polyline, shape (corners, 2); shape (points,)."""
     moved = np.concatenate(([True], np.abs(np.diff(path, axis=0)).max(axis=1) > 0.0))
     corners = path[moved]
     if len(corners) > MOST_SEGMENTS:
@@ -127,12 +127,12 @@ def path_distance(points: Array, path: Array) -> Array:
 
 
 def _figures(errors: Array) -> tuple[float, float, float]:
-    """Root of the mean square, 95th percentile, largest value."""
+    """Return the root of the mean square, 95th percentile, largest value."""
     return float(np.sqrt(np.mean(errors**2))), float(np.percentile(errors, 95.0)), float(errors.max())
 
 
 def _arrival(tip: Array, reference: TipReference, rate: float) -> float | None:
-    """Seconds after which the tip stays near the end of the reference."""
+    """Return the seconds after which the tip stays near the end of the reference."""
     away = np.hypot(*(tip - reference.tip[-1])[:, :2].T) > ARRIVED_M
     if away[-1]:
         return None
@@ -140,7 +140,7 @@ def _arrival(tip: Array, reference: TipReference, rate: float) -> float | None:
 
 
 def _violations(trace: LoopTrace, limits: LoopLimits, rate: float) -> dict[str, int]:
-    """Ticks at which a limit was violated, by its name."""
+    """Return the ticks at which a limit was violated, by its name."""
     # 1e-9: a lever exactly at its limit keeps it.
     levers, slew = trace.levers, np.abs(np.diff(trace.levers, axis=0, prepend=0.0)) * rate
     beyond = (levers < np.array(limits.lever_low) - 1e-9) | (levers > np.array(limits.lever_high) + 1e-9)

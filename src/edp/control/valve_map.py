@@ -56,7 +56,7 @@ class ValveMap:
         return float(SIDES[side] * np.interp(size, self.speeds[axis, side], self.levers[axis, side]))
 
     def speed(self, axis: int, lever: float) -> float:
-        """Cylinder speed (m/s) at a lever position."""
+        """Return the cylinder speed (m/s) at a lever position."""
         side = 0 if lever > 0.0 else 1
         # Below the first position lies the dead band, where the speed is that of the first: zero.
         return float(SIDES[side] * np.interp(abs(lever), self.levers[axis, side], self.speeds[axis, side]))
@@ -146,7 +146,7 @@ def map_of_speeds(levels: Array, measured: Array, source: str) -> ValveMap:
 
 
 def _end_of_dead_band(levels: Array, rising: Array, first: int) -> float:
-    """Lever at which the speed is zero: the line through the first two moving points, within the last step."""
+    """Return lever at which the speed is zero: the line through the first two moving points, within the last step."""
     before = levels[first - 1] if first else 0.0
     if len(rising) < 2 or rising[1] <= rising[0]:
         return float(before)

@@ -115,7 +115,7 @@ class Sampler(Protocol):
         ...
 
     def updates(self, number: int = 0) -> int:
-        """How many batches an epoch has."""
+        """Return how many batches an epoch has."""
         ...
 
 
@@ -158,7 +158,7 @@ class ChunkSampler:
         return self._windows(rng, number) if self.spec.regime == "window" else self._lanes(rng, number)
 
     def updates(self, number: int = 0) -> int:
-        """How many batches an epoch has."""
+        """Return how many batches an epoch has."""
         if self.spec.regime == "window":
             total = sum(self._groups(part, 0) for part in self.series) * self.spec.consecutive
             # Rounded up: the last batch may be smaller.
@@ -296,7 +296,7 @@ def _ticks(lane: list[tuple[int, int, int]]) -> int:
 
 
 def stack(rows: list[Piece], resets: list[bool]) -> Batch:
-    """Pieces side by side."""
+    """Return the pieces side by side."""
     *columns, strategy_columns = zip(*rows, strict=True)
     inputs, future, valid = (np.stack(parts) for parts in columns)
     return Batch(

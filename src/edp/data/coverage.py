@@ -302,13 +302,13 @@ def _cell(values: NDArray[Any], low: float, high: float, count: int) -> NDArray[
 
 
 def _count_cells(cells: Sequence[NDArray[np.intp]], shape: tuple[int, ...]) -> NDArray[np.int64]:
-    """How often each cell occurs; one array of places an axis."""
+    """Return how often each cell occurs; one array of places an axis."""
     flat = np.ravel_multi_index(tuple(cells), shape)
     return np.bincount(flat, minlength=int(np.prod(shape))).reshape(shape)
 
 
 def _joints(recordings: Sequence[Recording], axes: Sequence[Axis], absent: list[str]) -> list[JointHistogram]:
-    """Histograms of command, pressures and velocity of each axis, and of velocities with each other."""
+    """Return the histograms of command, pressures and velocity of each axis, and of velocities with each other."""
     joints = [_joint(recordings, "command", a.command, (a.velocity,)) for a in axes if a.command and a.velocity]
     for side, title in enumerate(("head pressure", "rod pressure")):
         chosen = [axis for axis in axes if len(axis.pressures) > side and axis.velocity]
@@ -360,7 +360,9 @@ def _range(values: Array) -> tuple[float, float]:
 
 
 def mutual_information(x: Array, y: Array, bins: int = QUANTILES) -> float:
-    """Mutual information in nat of two signals in bins of equal content, less its expected value for independent ones.
+    """Return the mutual information in nat of two signals in bins of equal content.
+
+    Less its expected value for independent ones.
 
     A value held for long (a command in steady state) takes a bin of its own, however many samples it has.
     """

@@ -39,7 +39,7 @@ class CoverageTarget:
         return self.value >= self.bound if self.at_least else self.value <= self.bound
 
     def to_json(self) -> dict[str, object]:
-        """Plain values."""
+        """Return the plain values."""
         return {**asdict(self), "met": self.met}
 
 

@@ -65,7 +65,7 @@ def split_distance(recordings: Sequence[Recording], axes: Sequence[Axis], split:
 
 
 def _states(recordings: Sequence[Recording], axes: Sequence[Axis], stretches: Sequence[Stretch]) -> Array:
-    """Commands now and a little earlier, velocities and pressures, shape ``(sample, signal)``."""
+    """Return the commands now and a little earlier, velocities and pressures, shape ``(sample, signal)``."""
     parts = []
     every = -(-sum(stretch.stop - stretch.start for stretch in stretches) // MAX_STATES)
     for stretch in stretches:

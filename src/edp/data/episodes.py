@@ -55,7 +55,7 @@ class EpisodeSampler:
                 )
 
     def updates(self, number: int = 0) -> int:
-        """Batches of an epoch."""
+        """Return the batches of an epoch."""
         return -(-len(self.owned) // self.machines)
 
     def epoch(self, number: int) -> Iterator[Batch]:
@@ -91,7 +91,7 @@ class EpisodeSampler:
 
 
 def group_by_machine(series: Sequence[Series]) -> dict[str, list[int]]:
-    """Places of the series of each machine, machines in the order in which they come.
+    """Return the places of the series of each machine, machines in the order in which they come.
 
     Raises:
         DataError: a series that does not know its machine.

@@ -31,7 +31,7 @@ Mask = NDArray[np.bool_]
 
 
 def moving_ticks(recordings: Sequence[Recording], channels: Sequence[str], span: int) -> list[Mask]:
-    """At which ticks of each recording some channel moves, ``(time,)`` each.
+    """Return a mask of the samples with motion for each recording, ``(time,)`` each.
 
     Args:
         recordings: the data set.
@@ -193,7 +193,7 @@ def _gap(horizons: Sequence[int]) -> int:
 def _evenness(
     recordings: Sequence[Recording], channels: Sequence[str], horizons: Sequence[int], by_time: ByTime
 ) -> tuple[ByBlocks, bool, bool]:
-    """Blocks of motion, and whether they and the division by time test and validate motion."""
+    """Return the blocks of motion, and whether they and the division by time test and validate motion."""
     gap, moving = _gap(horizons), moving_ticks(recordings, channels, max(1, *horizons))
     blocks = blocks_of_motion(recordings, gap)
     return blocks, is_even(blocks, recordings, gap, moving), is_even(by_time, recordings, gap, moving)

@@ -51,7 +51,7 @@ class RareEvent:
 
 
 def rises(on: NDArray[np.bool_]) -> int:
-    """How often a condition becomes true; once more where it begins true."""
+    """Return how often a condition becomes true; once more where it begins true."""
     return int(np.count_nonzero(on[1:] & ~on[:-1]) + bool(len(on) and on[0]))
 
 
@@ -111,7 +111,7 @@ def together(recordings: Sequence[Recording], axes: Sequence[Axis], dead_band: f
 
 
 def events_of(recordings: Sequence[Recording], ends: Mapping[str, tuple[float, float]] | None) -> tuple[RareEvent, ...]:
-    """Contacts with the ends of the strokes and recorded events.
+    """Return the contacts with the ends of the strokes and recorded events.
 
     Args:
         recordings: the data set.

@@ -14,7 +14,7 @@ SUFFIX = ".toml"
 
 
 def is_set_file(features: object) -> bool:
-    """Whether a setting `task.features` names a file."""
+    """Return whether a setting `task.features` names a file."""
     return isinstance(features, str) and features.endswith(SUFFIX)
 
 

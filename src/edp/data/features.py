@@ -92,7 +92,7 @@ class Derived:
             check_bounds(f"derived '{self.name}'", self, seconds=above(0.0, MAX_SECONDS))
 
     def ticks(self, rate_hz: float) -> int:
-        """How many ticks it looks back at a rate, n of its derivation; 1 where it takes no span.
+        """Return how many ticks it looks back at a rate, n of its derivation; 1 where it takes no span.
 
         Raises:
             ConfigError: a span shorter than the derivation allows, or longer than `MAX_LAG`.
@@ -218,7 +218,7 @@ def column(recording: Recording, name: str, derived: Sequence[Derived]) -> Float
 
 
 def kind_of(name: str, recording: Recording | None, derived: Sequence[Derived]) -> Kind:
-    """Kind of a logged or derived channel."""
+    """Return the kind of a logged or derived channel."""
     for entry in derived:
         if entry.name == name:
             return entry.kind

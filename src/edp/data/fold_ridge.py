@@ -33,14 +33,14 @@ class FoldRidge:
     left_out: DoubleArray
 
     def mean(self) -> tuple[DoubleArray, DoubleArray]:
-        """Weights ``(column, output)`` and intercept ``(output,)`` of the mean of the folds' predictions."""
+        """Return the weights ``(column, output)`` and intercept ``(output,)`` of the mean of the folds' predictions."""
         return self.weights.mean(axis=0), self.intercepts.mean(axis=0)
 
 
 def fold_ridge(
     table: NDArray[np.floating], targets: DoubleArray, folds: Folds, column_sets: Sequence[NDArray[np.int64]]
 ) -> FoldRidge:
-    """For each output the columns and the penalty with the least error on rows that were left out.
+    """Return the columns and the penalty with the least error on left-out rows for each output.
 
     Args:
         table: ``(row, column)``, columns of about unit spread.
@@ -94,12 +94,12 @@ class TableMoments:
     variance: DoubleArray
 
     def select_columns(self, chosen: NDArray[np.int64]) -> TableMoments:
-        """Those of some columns."""
+        """Return the moments of the selected columns."""
         covariance = self.covariance[np.ix_(chosen, chosen)]
         return TableMoments(covariance, self.cross[chosen], self.mean[chosen], self.level, self.variance)
 
     def squared_error(self, weight: DoubleArray, shift: DoubleArray) -> DoubleArray:
-        """Mean squared error of a linear map, ``(output,)``."""
+        """Return the mean squared error of a linear map, ``(output,)``."""
         bias = self.mean @ weight + shift - self.level
         quadratic = (weight * (self.covariance @ weight)).sum(axis=0)
         return np.asarray(self.variance - 2.0 * (weight * self.cross).sum(axis=0) + quadratic + bias**2)
@@ -129,7 +129,7 @@ class _Spectrum:
         return cls(moments, np.maximum(values, 0.0), vectors, vectors.T @ moments.cross)
 
     def solve(self, penalty: float) -> tuple[DoubleArray, DoubleArray]:
-        """Weights ``(column, output)`` and intercepts ``(output,)``."""
+        """Return the weights ``(column, output)`` and intercepts ``(output,)``."""
         weight = self.vectors @ (self.turned / (self.values + penalty)[:, None])
         return weight, self.moments.level - self.moments.mean @ weight
 
@@ -164,7 +164,7 @@ class _Sums:
         return _Sums(*(mine + sign * theirs for mine, theirs in pairs))
 
     def moments(self, centre: DoubleArray, level: DoubleArray, own: slice) -> TableMoments:
-        """Means and covariances, with some of the targets; sums are about these centres."""
+        """Return the means and covariances, with some of the targets; sums are about these centres."""
         mean, height = self.first / self.rows, self.level[own] / self.rows
         return TableMoments(
             self.squares / self.rows - np.outer(mean, mean),
@@ -178,7 +178,7 @@ class _Sums:
 def _fold_moments(
     table: NDArray[np.floating], targets: DoubleArray, folds: Folds
 ) -> tuple[list[TableMoments], list[TableMoments]]:
-    """Moments of the rows that each fold trains on, and of those that it leaves out.
+    """Return the moments of the rows that each fold trains on, and of those that it leaves out.
 
     Each row is multiplied out once for the fold that leaves it out, and once for each fold beside whose gap it lies:
     what a fold trains on is the sum over the other folds without its gap.

@@ -89,7 +89,7 @@ def make_block_folds(lengths: Sequence[int], folds: int, gap: int, pieces: int =
 
 
 def recording_folds(lengths: Sequence[int], recordings: Sequence[str], folds: int) -> Folds | None:
-    """Folds that leave out whole recordings, as many of them as there are recordings at most.
+    """Return the folds that leave out whole recordings, as many of them as there are recordings at most.
 
     Each fold takes recordings until it has its share of the rows, the longest first.
 

@@ -225,14 +225,14 @@ def _refuse_pieces(recordings: Sequence[Recording], frozen: Mapping[str, str], d
 
 
 def _rows(values: np.ndarray) -> np.ndarray:
-    """Each row as one value that can be compared."""
+    """Return each row as one value that can be compared."""
     # Rows as bytes: two equal rows are equal to the last bit, and sorting needs no tolerance.
     solid = np.ascontiguousarray(values)
     return solid.view(np.dtype((np.void, solid.dtype.itemsize * solid.shape[1]))).ravel()
 
 
 def _whole(recordings: Sequence[Recording], parts: Mapping[str, Sequence[int]]) -> Split:
-    """Whole recordings by part.
+    """Return the whole recordings by part.
 
     Raises:
         DataError: a part is empty.

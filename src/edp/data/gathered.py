@@ -132,7 +132,10 @@ def make_lazy_array(shape: tuple[int, int], make: Make, slot: LastMade) -> Float
 
 
 def some_columns(values: FloatArray, places: Sequence[int]) -> FloatArray:
-    """Columns of an array that may be a gathered one: a view where they lie side by side, rows on demand otherwise."""
+    """Return the columns of an array that may be a gathered one.
+
+    A view where they lie side by side, rows on demand otherwise.
+    """
     if list(places) == list(range(values.shape[1])):
         return values
     if isinstance(values, np.ndarray):
@@ -154,7 +157,7 @@ def some_rows(values: FloatArray, start: int, stop: int) -> FloatArray:
 
 
 def on_demand(values: FloatArray, places: Sequence[int]) -> FloatArray:
-    """Columns of samples, ``(time, column)``: a view where they lie side by side, else gathered row by row."""
+    """Return columns of samples, ``(time, column)``: a view where they lie side by side, else gathered row by row."""
     first = places[0] if places else 0
     if list(places) == list(range(first, first + len(places))):
         return values[:, first : first + len(places)]

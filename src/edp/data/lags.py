@@ -54,7 +54,10 @@ class LagTask:
 
 
 def origins(series: Series, task: LagTask) -> range:
-    """Ticks with a full history behind them and the longest horizon before them: the same ones for all horizons."""
+    """Return the ticks with a full history behind them and the longest horizon before them.
+
+    The same ones for all horizons.
+    """
     # Empty instead of negative for a series that is too short.
     return range(task.history - 1, max(task.history - 1, series.samples - max(task.horizons)))
 
@@ -65,7 +68,7 @@ def future(series: Series, task: LagTask, ticks: NDArray[np.int64]) -> DoubleArr
 
 
 def target_means(series: Sequence[Series]) -> DoubleArray:
-    """Mean of each target over all ticks, ``(target,)``."""
+    """Return the mean of each target over all ticks, ``(target,)``."""
     total = sum(one.targets.sum(axis=0, dtype=np.float64) for one in series)
     return np.asarray(total / sum(one.samples for one in series), dtype=np.float64)
 

@@ -47,7 +47,7 @@ class RidgeSolution:
     history: NDArray[np.int64]
 
     def predict(self, inputs: FloatArray) -> DoubleArray:
-        """Predictions at ticks ``history - 1`` and later: ``(time - history + 1, horizon, target)``."""
+        """Return the predictions at ticks ``history - 1`` and later: ``(time - history + 1, horizon, target)``."""
         lags, channels, horizons, targets = self.weights.shape
         maps = self.weights.reshape(lags, channels, horizons * targets)
         used = int(self.history.max())
@@ -68,7 +68,7 @@ def ridge_solution(
     penalties: Sequence[float] = PENALTIES,
     histories: Sequence[int] | None = None,
 ) -> RidgeSolution:
-    """Ridge-regularised least squares for every horizon and target, in physical units.
+    """Return the ridge-regularised least squares for every horizon and target, in physical units.
 
     The map is fitted to the change from the present value where an input measures it, so a strong penalty leads back
     to persistence. Memory is a few Gram matrices of ``(history * input)`` squared, whatever the length of the series.
@@ -110,7 +110,7 @@ def cross_validate_ridge(
     penalties: Sequence[float] = PENALTIES,
     histories: Sequence[int] = CROSSED_HISTORIES,
 ) -> RidgeSolution:
-    """Ridge regression on all of `parts`; penalty and history by cross-validation over contiguous folds.
+    """Return the ridge regression on all of `parts`; penalty and history by cross-validation over contiguous folds.
 
     For little data, where one held-out segment is too short to choose by and too dear to leave out of the fit.
 
@@ -176,7 +176,7 @@ def _sum(parts: Sequence[RidgeMoments]) -> RidgeMoments:
 
 
 def _solve(fitted: RidgeMoments, size: int, relative: float) -> DoubleArray:
-    """Weights ``(size, output)`` on the first `size` standardised features, with an unpenalised intercept."""
+    """Return weights ``(size, output)`` on the first `size` standardised features, with an unpenalised intercept."""
     x, y = fitted.x[:size] / fitted.rows, fitted.y / fitted.rows
     covariance = fitted.xx[:size, :size] / fitted.rows - np.outer(x, x)
     # The penalty also makes the matrix definite when inputs are constant or copies of each other.

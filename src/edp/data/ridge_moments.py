@@ -57,7 +57,7 @@ class RidgeMoments:
 
 
 def standard_of(train: Sequence[Series], means: DoubleArray) -> Standard:
-    """Means and deviations of the inputs over all training ticks, block by block in double precision."""
+    """Return the means and deviations of the inputs over all training ticks, block by block in double precision."""
     rows = sum(series.samples for series in train)
     centre = sum(block.sum(axis=0) for block in _blocks(train)) / rows
     variance = sum(((block - centre) ** 2).sum(axis=0) for block in _blocks(train)) / rows
@@ -68,7 +68,10 @@ def standard_of(train: Sequence[Series], means: DoubleArray) -> Standard:
 
 
 def moments_of(series: Sequence[Series], task: LagTask, standard: Standard) -> RidgeMoments:
-    """Moments over all ticks with a full history and a known future (see `origins`), for ``task.history`` lags."""
+    """Return the moments over all ticks with a full history and a known future (see `origins`).
+
+    For ``task.history`` lags.
+    """
     lags, inputs = task.history, len(standard.centre)
     check_setting(
         4 * 8 * (lags * inputs) ** 2,  # the matrix, its corrections and two halves, as doubles
@@ -110,13 +113,13 @@ def _blocks(train: Sequence[Series]) -> Iterator[DoubleArray]:
 
 
 def _changes(series: Series, task: LagTask, standard: Standard, ticks: np.ndarray) -> DoubleArray:
-    """Future minus anchor at `ticks`, ``(tick, horizon * target)``."""
+    """Return the future minus anchor at `ticks`, ``(tick, horizon * target)``."""
     start = anchors(series.inputs[ticks], task, standard.means)
     return (future(series, task, ticks) - start[:, None, :]).reshape(len(ticks), task.outputs)
 
 
 def _reverse_rows(series: Series, standard: Standard, newest: int, count: int) -> DoubleArray:
-    """Standardised rows newest, newest - 1, ... as one vector ``(count * input,)``."""
+    """Return the standardised rows newest, newest - 1, ... as one vector ``(count * input,)``."""
     rows = series.inputs[newest - count + 1 : newest + 1][::-1]
     return ((rows - standard.centre) / standard.scale).ravel()
 

@@ -43,7 +43,7 @@ class Axis:
     conflux: tuple[str, ...] = ()
 
     def read_signed_command(self, recording: Recording) -> Array:
-        """Command, extension positive, shape ``(time,)``."""
+        """Return the command, extension positive, shape ``(time,)``."""
         return signed(recording, self.command)
 
 

@@ -119,7 +119,7 @@ def fit_scaler(task: Task, train: Sequence[Series], kinds: Sequence[Kind]) -> Sc
 
 
 def _moments(task: Task, train: Sequence[Series]) -> tuple[Moments, list[Moments]]:
-    """Moments of the features, and of the encoded targets at each horizon, in one pass over the series."""
+    """Return the moments of the features, and of the encoded targets at each horizon, in one pass over the series."""
     features = Moments(len(task.features.features))
     changes = [Moments(len(task.targets)) for _ in task.horizons]
     for series in train:

@@ -54,7 +54,7 @@ def hankel_gram(inputs: Sequence[Array], lags: int) -> tuple[Array, int]:
 
 
 def smallest_singular_values(inputs: Sequence[Array], lags: int = LAGS) -> dict[int, float]:
-    """Smallest singular value of the input Hankel matrix over the root of its columns, by number of lags.
+    """Return the smallest singular value of the input Hankel matrix over the root of its columns, by number of lags.
 
     Inputs are brought to mean 0 and deviation 1, so that white noise has the value 1. Inputs are persistently exciting
     of an order as long as the value is above zero; a small one says which models the data cannot tell apart.

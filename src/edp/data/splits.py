@@ -116,7 +116,7 @@ class ByRecording:
         return {recording.name: str(recording.meta.get(FAMILY, "")) for recording in recordings}
 
     def _shuffle_names(self, names: Sequence[str]) -> list[str]:
-        """Names in the order of the draw."""
+        """Return the names in the order of the draw."""
         return [names[i] for i in np.random.default_rng(self.seed).permutation(len(names))]
 
 
@@ -236,7 +236,7 @@ class ByBlocks:
         return _check_parts(parts, recordings, gap)
 
     def _owner(self, number: int, turn: Iterator[int]) -> str:
-        """Part of block `number`; `turn` counts the blocks that do not test, over all recordings."""
+        """Return the part of block `number`; `turn` counts the blocks that do not test, over all recordings."""
         if number % self.every == self.every - 1:
             return "test"
         other = next(turn)

@@ -145,7 +145,7 @@ class Task:
         return tuple(names.index(target) if target in names else None for target in self.targets)
 
     def kinds(self, recording: Recording | None = None) -> tuple[Kind, ...]:
-        """Kind of each target."""
+        """Return the kind of each target."""
         return tuple(kind_of(name, recording, self.derived) for name in self.targets)
 
     def series(self, recording: Recording, start: int = 0, stop: int | None = None, name: str | None = None) -> Series:

@@ -75,7 +75,7 @@ def look_ahead(twin: Twin, series: Sequence[Series], ticks: int, first: int = 0)
 
 
 def score_ahead(ahead: Ahead) -> AheadErrors:
-    """Velocity MAE, stroke error and pressure NRMSE that far ahead, never averaged together."""
+    """Return the velocity MAE, stroke error and pressure NRMSE that far ahead, never averaged together."""
     channels = ahead.channels
     errors = np.abs(ahead.answers - ahead.truth).astype(np.float64)
     velocities, strokes = (
@@ -94,7 +94,7 @@ def score_ahead(ahead: Ahead) -> AheadErrors:
 
 
 def predictor_scores(ahead: Ahead, predicted: Mapping[str, Array]) -> dict[str, ErrorPair]:
-    """Mean absolute errors of a look-ahead predictor at the same moments, by kind of channel.
+    """Return the mean absolute errors of a look-ahead predictor at the same moments, by kind of channel.
 
     Args:
         ahead: k-step-ahead outputs of the twin.

@@ -21,7 +21,7 @@ RANGES = "command_ranges"
 
 
 def command_ranges(channels: TwinChannels, series: Sequence[Series], before: Any = None) -> dict[str, list[float]]:
-    """Least and largest value of each command, SI units, by name.
+    """Return the least and largest value of each command, SI units, by name.
 
     Args:
         channels: channels of the twin.

@@ -172,7 +172,7 @@ class SituationTally:
                 self.errors[row, target] += size[ticks & scored, target].sum()
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """All that it holds, as arrays."""
+        """Return all that it holds, as arrays."""
         return {name: getattr(self, name) for name in ("ticks", "errors", "seen", "scored", "total")}
 
     def add(self, state: Mapping[str, NDArray[Any]]) -> None:

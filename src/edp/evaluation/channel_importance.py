@@ -120,12 +120,12 @@ class ChannelImportances:
     recordings: tuple[str, ...]
 
     def ranked(self, horizon: int) -> list[ChannelImportance]:
-        """Means over the targets at a horizon, the largest renewed growth first."""
+        """Return the means over the targets at a horizon, the largest renewed growth first."""
         chosen = [row for row in self.rows if row.horizon == horizon and row.target == "mean"]
         return sorted(chosen, key=lambda row: -row.renewed.mean)
 
     def to_json(self) -> dict[str, object]:
-        """Plain values."""
+        """Return the plain values."""
         return asdict(self)
 
 
@@ -173,7 +173,7 @@ def measure_channel_importance(
 
 
 def _groups(inputs: Sequence[str], asked_groups: Sequence[Sequence[str]]) -> list[tuple[str, ...]]:
-    """Each input alone, then the groups of several."""
+    """Return each input alone, then the groups of several."""
     for group in asked_groups:
         for name in group:
             if name not in inputs:
@@ -193,7 +193,7 @@ class _Donor:
 
 
 def _donors(series: Sequence[Series], rng: np.random.Generator) -> list[_Donor]:
-    """Another recording for each; the same one, far off in time, where there is only one."""
+    """Return another recording for each; the same one, far off in time, where there is only one."""
     count = len(series)
     if count == 1:
         samples = series[0].samples
@@ -272,7 +272,7 @@ class _Ruler:
         return Growth(mean, mean - reach, mean + reach)
 
     def table(self, errors: Array) -> dict[str, dict[str, float]]:
-        """Errors over all ticks by horizon and target."""
+        """Return the errors over all ticks by horizon and target."""
         share = self.weights / self.weights.sum()
         names = ("mean", *self.task.targets)
         means = np.tensordot(share, errors, axes=1)

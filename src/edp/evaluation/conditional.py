@@ -118,7 +118,7 @@ class OthersModel:
         return weights, float(np.clip(explained, 0.0, 1.0).mean())
 
     def _present(self, column: int) -> int:
-        """Term that is the channel itself at the present tick."""
+        """Return the term that is the channel itself at the present tick."""
         channels = len(self.owner) // (len(self.lags) + len(KNEES))
         return self.lags.index(0) * channels + column
 
@@ -149,7 +149,7 @@ def collinear(parts: Sequence[NDArray[np.float32]], least: float = 0.9, rows: in
 
 
 def _terms(part: NDArray[np.float32], lags: Sequence[int], knees: Array, rows: NDArray[np.int64]) -> Array:
-    """Terms at `rows`, shape ``(row, term)``; before the start the first row holds."""
+    """Return the terms at `rows`, shape ``(row, term)``; before the start the first row holds."""
     lagged = [part[np.maximum(rows - lag, 0)].astype(np.float64) for lag in lags]
     hinges = [np.maximum(part[rows].astype(np.float64) - knee, 0.0) for knee in knees]
     return np.concatenate([*lagged, *hinges], axis=1)

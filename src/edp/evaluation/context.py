@@ -41,7 +41,7 @@ class Contexts:
     dropped: tuple[float, ...] = ()
 
     def mean(self, horizon: int = 0) -> NDArray[np.float64]:
-        """Mean over targets and machines, ``(context,)``."""
+        """Return the mean over targets and machines, ``(context,)``."""
         errors: NDArray[np.float64] = self.errors[:, :, horizon].mean(axis=(1, 2))
         return errors
 
@@ -76,7 +76,7 @@ def context_errors(
     seconds: Sequence[float] = CONTEXTS_S,
     on_done: Callable[[float], None] | None = None,
 ) -> Contexts:
-    """Errors of a network on blocks of half a second, by how long before them its state was reset.
+    """Return the errors of a network on blocks of half a second, by how long before them its state was reset.
 
     A block begins every five seconds of a series, where the longest context fits before it.
 
@@ -127,7 +127,10 @@ def context_errors(
 def _block_errors(
     predictor: Predictor, blocks: Sequence[tuple[Series, int]], context: int, size: int
 ) -> NDArray[np.float64]:
-    """Absolute errors ``(block, tick, horizon, target)``, SI units, after a reset `context` ticks before each block."""
+    """Return absolute errors ``(block, tick, horizon, target)``, SI units.
+
+    After a reset `context` ticks before each block.
+    """
     pieces = [
         replace(
             part,

@@ -199,7 +199,7 @@ class Estimate:
         return self.parameter_bytes + self.program_bytes
 
     def to_json(self) -> dict[str, object]:
-        """Plain values."""
+        """Return the plain values."""
         return asdict(self) | {"flash_bytes": self.flash_bytes}
 
 

@@ -261,7 +261,7 @@ def free_run_scores(
     intervals: FreeRunIntervals | None = None,
     labels: Mapping[str, str] | None = None,
 ) -> FreeRunScores:
-    """Scores in the units of reports; velocities, strokes and pressures are never averaged together.
+    """Return the scores in the units of reports; velocities, strokes and pressures are never averaged together.
 
     Args:
         runs: free runs.

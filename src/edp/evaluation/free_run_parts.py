@@ -70,7 +70,7 @@ def _convert_to_report_units(channels: Sequence[Channel], values: NDArray[Any]) 
 def nrmse_by_channel(
     channels: TwinChannels, answers: Array, truth: Array, ticks: NDArray[np.bool_] | None = None
 ) -> PressureErrors:
-    """Root mean square error of each pressure in its deviations over all runs, and their mean.
+    """Return the root mean square error of each pressure in its deviations over all runs, and their mean.
 
     Args:
         channels: channels of the twin.

@@ -244,7 +244,7 @@ def _if_worse(verdict: ErrorVerdict | None) -> ErrorVerdict | None:
 
 
 def _compare_recordings(network: ModelScores, model: ModelScores, scores: ScoresFile) -> dict[str, float]:
-    """Logarithms of the ratio of errors of the recordings that both have."""
+    """Return the logarithms of the ratio of errors of the recordings that both have."""
     logs = {}
     for name, ours in network.recordings.items():
         theirs = model.recordings.get(name, {})
@@ -253,7 +253,7 @@ def _compare_recordings(network: ModelScores, model: ModelScores, scores: Scores
 
 
 def _interval(logs: list[float], mean: float) -> tuple[float, float] | None:
-    """95 % interval of the relative change over recordings, the pooled change included; None for too few."""
+    """Return 95 % interval of the relative change over recordings, the pooled change included; None for too few."""
     if len(logs) < FEWEST:
         return None
     ends = paired_t(np.array(logs)).interval()
@@ -341,7 +341,10 @@ def _verdict_on_free_runs(
 
 
 def _free_run_logs(own: FreeRunErrors, scores: FreeRunErrors) -> dict[str, list[float]]:
-    """Logarithms of the ratio of errors of each actuator, at the times that both have; without errors of zero."""
+    """Return the logarithms of the ratio of errors of each actuator, at the times that both have.
+
+    Without errors of zero.
+    """
     ours, theirs = _free_run_errors(own), _free_run_errors(scores)
     return {
         actuator: [math.log(errors[at] / theirs[actuator][at]) for at in errors

@@ -157,7 +157,7 @@ def judge(
 
 
 def sort_by_effort(names: Sequence[str]) -> list[str]:
-    """Names of baselines, the cheapest first."""
+    """Return the names of baselines, the cheapest first."""
     return sorted(names, key=lambda name: BASELINES[name].effort)
 
 
@@ -185,7 +185,7 @@ class JudgedPart:
 
 
 def network_parts(data: Prepared) -> int:
-    """Parts that a network is run along the test part in: by its size alone, whoever runs them."""
+    """Return the parts that a network is run along the test part in: by its size alone, whoever runs them."""
     ticks = sum(part.samples for part in data.test)
     return max(1, min(MAX_PARTS, ticks // PART_TICKS, len(stream_groups(data.test))))
 
@@ -294,7 +294,7 @@ class ModelBench:
 
 
 def _weight_intervals(overall: ByHorizon, intervals: Mapping[str, Sequence[IntervalScores]]) -> dict[str, Means]:
-    """Weighted interval score by horizon and target, of medians and intervals of the same ticks."""
+    """Return the weighted interval score by horizon and target, of medians and intervals of the same ticks."""
     return {
         horizon: {
             target: weighted_interval_score(

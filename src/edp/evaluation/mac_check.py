@@ -93,7 +93,7 @@ class Trace(TorchDispatchMode):
         self._data |= {_storage(value) for value in _tensors(values)}
 
     def within(self, name: str) -> int:
-        """Multiply-accumulates of a part and of the parts inside it."""
+        """Return the multiply-accumulates of a part and of the parts inside it."""
         inside = f"{name}." if name else ""
         return sum(macs for part, macs in self.macs.items() if f"{part}.".startswith(inside))
 
@@ -127,18 +127,18 @@ class Trace(TorchDispatchMode):
             into |= {_storage(value) for value in results}
 
     def _hides(self, operands: list[Tensor]) -> bool:
-        """Whether an operation could multiply: data by a matrix of weights, or data by data."""
+        """Return whether an operation could multiply: data by a matrix of weights, or data by data."""
         data = [value for value in operands if _storage(value) in self._data]
         matrices = [value for value in operands if value.dim() > 1 and self._constant(value)]
         return bool(data) and len(data) + len(matrices) > 1
 
     def _constant(self, value: Tensor) -> bool:
-        """Whether a tensor comes from weights alone."""
+        """Return whether a tensor comes from weights alone."""
         address = _storage(value)
         return address in self._weights and address not in self._data
 
     def _element_wise(self, name: str, operands: list[Tensor], results: list[Tensor]) -> int:
-        """Multiply-accumulates of matrix products that are written as products and sums."""
+        """Return the multiply-accumulates of matrix products that are written as products and sums."""
         places = [_storage(value) for value in operands]
         if name in ("sum", "mean", "cumsum") and places[0] in self._scaled:
             return operands[0].numel()
@@ -164,7 +164,7 @@ def _tensors(tree: Any) -> list[Tensor]:
 
 
 def macs_of(name: str, args: Any, result: Tensor) -> int:
-    """Multiply-accumulates of a matrix product or convolution."""
+    """Return the multiply-accumulates of a matrix product or convolution."""
     if name == "convolution":
         return int(result.numel() * math.prod(args[1].shape[1:]))
     terms = args[MATRIX[name]].shape[0 if name == "addbmm" else -1]

@@ -70,7 +70,7 @@ def _watch_doubles(view: WatchCode) -> float:
 
 
 def chain_cycles(parts: MonitorParts) -> ChainCycles:
-    """Cycles of the chain of a monitor."""
+    """Return the cycles of the chain of a monitor."""
     work, block = chain_work(parts), parts.chain.summaries.block
     flows = flow_cycles(parts)
     every = flows + sum(CORE_COSTS[name] * work[name] for name in ("residual", "driver", "input", "tick"))
@@ -82,7 +82,10 @@ def chain_cycles(parts: MonitorParts) -> ChainCycles:
 
 
 def flow_cycles(parts: MonitorParts) -> float:
-    """Cycles of the balances of flow of a monitor at a tick; they are counted with the chain, since no network runs."""
+    """Return the cycles of the balances of flow of a monitor at a tick.
+
+    They are counted with the chain, since no network runs.
+    """
     cycles = 0.0
     for flows in parts.flows:
         paths = sum(len(chamber.values) for chamber in flows.chambers)
@@ -92,7 +95,7 @@ def flow_cycles(parts: MonitorParts) -> float:
 
 
 def _slices(parts: MonitorParts) -> list[float]:
-    """Cycles of each part of the work on a block, in its order."""
+    """Return the cycles of each part of the work on a block, in its order."""
     product, double, summaries = CORE_COSTS["product"], CORE_COSTS["double"], parts.chain.summaries.width
     costs = [POINT * double * parts.points]
     of_summary = 2.0 * product * parts.points + 6.0 * double
@@ -166,7 +169,7 @@ class MonitorFootprint:
     state_bytes: int
 
     def to_json(self, budget: Budget) -> dict[str, object]:
-        """Plain values with the verdict against `budget`."""
+        """Return the plain values with the verdict against `budget`."""
         return {
             "networks": [
                 {

@@ -100,7 +100,10 @@ class Ruler:
         )
 
     def measure(self, predictions: Numbered) -> ModelScores:
-        """Scores of one model: overall, by recording with spread, by speed and situation, and of running integrals."""
+        """Return the scores of one model: overall, by recording with spread, by speed and situation.
+
+        And of running integrals.
+        """
         return self.scores(self.gathered(predictions))
 
     def unmeasured(self) -> Measured:
@@ -125,7 +128,7 @@ class Ruler:
         return measured
 
     def scores(self, measured: Measured) -> ModelScores:
-        """Scores of what all recordings measure together, as `measure` gives them."""
+        """Return the scores of what all recordings measure together, as `measure` gives them."""
         names = [str(horizon) for horizon in self.task.horizons]
         recordings: dict[str, dict[str, ByTarget]] = {}
         for number in sorted(measured.recordings):
@@ -195,14 +198,14 @@ class Ruler:
             tally.update(np.abs(predicted - truth), self._mask_scored(predicted), ticks_of)
 
     def _mask_scored(self, predicted: NDArray[Any]) -> NDArray[np.bool_]:
-        """Ticks after start-up at which the model has its history."""
+        """Return the ticks after start-up at which the model has its history."""
         # A baseline without its history says NaN; a tick counts only where all targets are predicted.
         scored: NDArray[np.bool_] = np.isfinite(predicted).all(axis=1)
         scored[: self.skip] = False
         return scored
 
     def _ticks(self, predicted: NDArray[Any], truth: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Scored ticks of both."""
+        """Return the evaluated samples of both."""
         scored = self._mask_scored(predicted)
         return predicted[scored], truth[scored]
 
@@ -217,7 +220,7 @@ class Ruler:
         }
 
     def _integrate_errors(self, target: str, predicted: NDArray[Any], truth: NDArray[Any]) -> Values:
-        """Ticks, and sum of the squared error of the running integral, in report unit times seconds."""
+        """Return the ticks, and sum of the squared error of the running integral, in report unit times seconds."""
         h, column = self.task.horizons.index(0), self.task.targets.index(target)
         difference = (predicted[:, h, column] - truth[:, h, column])[self.skip :]
         # Ticks without a prediction add nothing to the integral; NaN would end it.

@@ -130,6 +130,6 @@ class _Sums:
 
 
 def name_scores(targets: Sequence[str], each: Sequence[Scores]) -> ByTarget:
-    """Scores of each target by name and their mean, as plain values."""
+    """Return the scores of each target by name and their mean, as plain values."""
     named = {MEAN: mean_scores(each), **dict(zip(targets, each, strict=True))}
     return {name: values.to_json() for name, values in named.items()}

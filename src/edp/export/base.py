@@ -56,7 +56,7 @@ def make_target(name: str, options: Mapping[str, object] | None = None) -> Expor
 
 
 def _options(kind: type[ExportTarget]) -> dict[str, type]:
-    """Types of a target's options by name."""
+    """Return the types of a target's options by name."""
     if not is_dataclass(kind):
         return {}
     hints = get_type_hints(kind)

@@ -47,7 +47,7 @@ class Description:
         return {meaning: shape_of_result(self.graph, value, targets) for meaning, value in self.graph.results.items()}
 
     def content(self) -> Table:
-        """Plain values that JSON can hold."""
+        """Return the plain values that JSON can hold."""
         bundle, task = self.bundle, self.bundle.task
         kinds, texts = bundle.target_kinds, bundle.descriptions
         target_names = si_names(task.targets, kinds)
@@ -83,7 +83,7 @@ def entry_of(logged: str, name: str, kind: Kind, description: str) -> dict[str, 
 
 
 def shape_of_result(graph: Graph, value: str, targets: int) -> tuple[int, int]:
-    """Shape of a result as a matrix: horizons, or intervals and horizons, by targets."""
+    """Return the shape of a result as a matrix: horizons, or intervals and horizons, by targets."""
     return graph.width_of(value) // targets, targets
 
 

@@ -60,7 +60,7 @@ class Code(str):
 
 
 def visible(text: object, most: int = LONGEST_TEXT) -> str:
-    r"""Text as one line of printable characters.
+    r"""Return text as one line of printable characters.
 
     Control and format characters (bidirectional ones too), line separators, lone surrogates, and white space other than
     a blank become ``\uXXXX``; what is longer than `most` characters ends in ``...``.
@@ -77,7 +77,7 @@ def _code_point(character: str) -> str:
 
 
 def c_comment(text: object) -> Code:
-    """Text within ``/* */``: no end or beginning of a comment, no trigraph, and no backslash at its end."""
+    """Return text within ``/* */``: no end or beginning of a comment, no trigraph, and no backslash at its end."""
     # Twice: a run of three question marks leaves a pair after the first replacement. Trigraphs begin with two.
     plain = visible(text).replace("??", "? ?").replace("??", "? ?").replace("*/", "* /").replace("/*", "/ *")
     return Code(plain + " " if plain.endswith("\\") else plain)
@@ -95,7 +95,7 @@ def c_string(text: object) -> Code:
 
 
 def matlab_comment(text: object) -> Code:
-    """Text behind ``%``: of one line, which cannot begin or end a block of comments behind other text."""
+    """Return text behind ``%``: of one line, which cannot begin or end a block of comments behind other text."""
     return Code(visible(text))
 
 
@@ -112,7 +112,10 @@ def python_literal(text: object) -> Code:
 
 
 def xml_text(text: object) -> Code:
-    r"""Text between tags of XML or HTML, or within quotes in one; characters that XML cannot hold become ``\uXXXX``."""
+    r"""Return text between tags of XML or HTML, or within quotes in one.
+
+    Characters that XML cannot hold become ``\uXXXX``.
+    """
     return Code(html_escape(visible(text)))
 
 
@@ -128,7 +131,7 @@ def _yaml_point(character: str) -> str:
 
 
 def markdown_text(text: object) -> Code:
-    """Text within a line or a cell of a table of Markdown: no markup, no HTML, no link, no end of the cell."""
+    """Return text within a line or a cell of a table of Markdown: no markup, no HTML, no link, no end of the cell."""
     plain = re.sub(r"[\\`*\[\]|~$#!]|(?<![^\W_])_|_(?![^\W_])", r"\\\g<0>", visible(text))
     plain = plain.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     # A bare address becomes a link in many readers.
@@ -136,7 +139,7 @@ def markdown_text(text: object) -> Code:
 
 
 def c_names(names: Iterable[str], most: int) -> list[str]:
-    """Names as the ends of C identifiers, different ones for different names, of at most `most` characters.
+    """Return the names as the ends of C identifiers, different ones for different names, of at most `most` characters.
 
     What is no ASCII letter, digit or underscore becomes an underscore; see `distinct`.
     """
@@ -144,7 +147,7 @@ def c_names(names: Iterable[str], most: int) -> list[str]:
 
 
 def matlab_names(names: Iterable[str]) -> list[str]:
-    """Names as names of variables, fields and bus elements of MATLAB, different ones for different names.
+    """Return the names as names of variables, fields and bus elements of MATLAB, different ones for different names.
 
     As `c_names`; ``x`` comes before what does not begin with a letter, and before keywords of MATLAB, C and C++.
     """
@@ -154,7 +157,7 @@ def matlab_names(names: Iterable[str]) -> list[str]:
 
 
 def shown_names(names: Iterable[str]) -> list[str]:
-    """Names in XML, parameters and tables: `visible`, of at most `LONGEST_NAME` characters, all different.
+    """Return the names in XML, parameters and tables: `visible`, of at most `LONGEST_NAME` characters, all different.
 
     Runs of white space become a blank.
     """

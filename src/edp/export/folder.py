@@ -113,7 +113,7 @@ def _write_list(listed: Mapping[str, set[str]]) -> bytes:
 
 
 def _ours(path: Path, file: str, digests: set[str]) -> bool:
-    """Whether a file of an earlier export is there to be removed.
+    """Return whether a file of an earlier export is there to be removed.
 
     Raises:
         StorageError: it is there with another content.

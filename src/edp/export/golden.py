@@ -125,7 +125,7 @@ def at_thresholds(predictor: Predictor, inputs: Rows, near: float = NEAR) -> Row
 
 
 def golden_recording(predictor: Predictor, ticks: int) -> tuple[Rows, Rows, Rows]:
-    """Random inputs, what PyTorch streams from them, and how far another form may be from it.
+    """Return the random inputs, what PyTorch streams from them, and how far another form may be from it.
 
     Returns:
         ``(tick, input)``, ``(tick, number)``, ``(number,)``. No number meets a threshold of a tree where one of

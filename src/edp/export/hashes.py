@@ -12,7 +12,7 @@ from edp.networks.predictor import Predictor
 
 
 def model_hash(graph: Graph) -> str:
-    """Content address of layers, options and constants."""
+    """Return content address of layers, options and constants."""
     state = hashlib.blake2b(digest_size=16)
     for layer in graph.layers:
         # Arrays are hashed by their bytes, everything else by its text: `repr` of an array is cut off.

@@ -99,7 +99,7 @@ def _small_expm1(r: Rows) -> Rows:
 
 
 def runtime_exp(x: Rows) -> Rows:
-    """``edp_exp`` of the runtime."""
+    """Return ``edp_exp`` of the runtime."""
     f = np.float32
     # Limits of float32: beyond them exp is 0 or infinite, and the shift below would leave the exponent's bits.
     limited = np.clip(x, f(-87.0), f(88.0))
@@ -113,7 +113,7 @@ def runtime_exp(x: Rows) -> Rows:
 
 
 def runtime_tanh(x: Rows) -> Rows:
-    """``edp_tanh`` of the runtime."""
+    """Return ``edp_tanh`` of the runtime."""
     f = np.float32
     size = np.abs(x)
     # Near zero 1 - 2/(e+1) would cancel; the quotient of expm1 keeps relative accuracy.
@@ -125,13 +125,13 @@ def runtime_tanh(x: Rows) -> Rows:
 
 
 def runtime_sigmoid(x: Rows) -> Rows:
-    """``edp_sigmoid`` of the runtime."""
+    """Return ``edp_sigmoid`` of the runtime."""
     small = runtime_exp(-np.abs(x))
     return np.asarray(np.where(x >= 0, ONE, small) / (ONE + small))
 
 
 def runtime_log1p(x: Rows) -> Rows:
-    """log(1 + x) as the runtime has it, for x in [0, 1]."""
+    """Return the log(1 + x) as the runtime has it, for x in [0, 1]."""
     f = np.float32
     s = x / (f(2.0) + x)
     # The series of artanh: log(1+x) = 2 artanh(x / (2 + x)), whose argument stays below 1/3.
@@ -142,7 +142,7 @@ def runtime_log1p(x: Rows) -> Rows:
 
 
 def _runtime_log(x: Rows) -> Rows:
-    """``natural_log`` of the runtime."""
+    """Return ``natural_log`` of the runtime."""
     f = np.float32
     half, power = np.frexp(np.clip(x, f(LEAST), np.finfo(f).max))
     # Between 0.71 and 1.41 the logarithm of a number near 1 keeps its digits.

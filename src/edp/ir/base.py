@@ -188,7 +188,7 @@ class Layer(ABC):
         return {}
 
     def tensors(self) -> dict[str, NDArray[Any]]:
-        """Its constant arrays by name within the layer."""
+        """Return the constant arrays of the layer by name."""
         values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
@@ -232,19 +232,19 @@ class Graph:
         return self.inputs if value == INPUT else self.layer(value).width
 
     def tensors(self) -> Iterator[tuple[str, str, NDArray[Any]]]:
-        """Every constant array: layer, name within it, values."""
+        """Return every constant array: layer, name within it, values."""
         for layer in self.layers:
             for name, values in layer.tensors().items():
                 yield layer.name, name, values
 
     def slots(self) -> Iterator[tuple[str, Slot]]:
-        """Everything carried from tick to tick: layer and slot."""
+        """Return everything carried from tick to tick: layer and slot."""
         for layer in self.layers:
             for slot in layer.slots:
                 yield layer.name, slot
 
     def start(self, layer: str, slot: Slot) -> NDArray[Any]:
-        """Values of a slot after a reset."""
+        """Return the values of a slot after a reset."""
         # Slots without a learned start take their fill, so that graphs list only what differs.
         return self.initial.get((layer, slot.name), np.full(slot.shape, slot.fill, dtype=np.float32))
 

@@ -63,7 +63,7 @@ class Builder:
 
     @contextmanager
     def inside(self, name: str) -> Iterator[None]:
-        """Names of layers added within begin with `name`."""
+        """Return the names of layers added within begin with `name`."""
         self._scope.append(name)
         try:
             yield
@@ -86,7 +86,7 @@ class Builder:
         return full
 
     def combine(self, name: str, operation: BinaryOperation, a: str, b: str) -> str:
-        """Two values of the same width, number by number."""
+        """Return two values of the same width, number by number."""
         return self.add(Elementwise, name, a, b, operation=operation, size=self.width(a))
 
     def pick(self, name: str, x: str, columns: Sequence[int]) -> str:
@@ -98,7 +98,7 @@ class Builder:
         return self.add(Gather, name, x, columns=chosen)
 
     def join(self, name: str, *parts: str) -> str:
-        """Values end to end."""
+        """Return the values end to end."""
         if len(parts) == 1:
             return parts[0]
         return self.add(Gather, name, *parts, columns=tuple(range(sum(map(self.width, parts)))))

@@ -57,7 +57,7 @@ class Interpreter:
         return {name: np.concatenate([tick[name] for tick in ticks]) for name in (ticks[0] if ticks else ())}
 
     def _together(self, inputs: Values) -> dict[str, Values]:
-        """All ticks at once, layer by layer."""
+        """Return all ticks at once, layer by layer."""
         values: dict[str, Values] = {INPUT: np.asarray(inputs, dtype=self.dtype)}
         for layer, run in self._runs:
             values[layer.name] = layer.over_time(run, *[values[name] for name in layer.inputs])

@@ -69,7 +69,7 @@ class Executor(Protocol):
         ...
 
     def running(self) -> list[str]:
-        """Keys of the jobs under way; the others that were submitted wait."""
+        """Return the keys of the jobs under way; the others that were submitted wait."""
         ...
 
     def close(self) -> None:

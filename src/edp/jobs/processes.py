@@ -94,7 +94,7 @@ class _Worker:
         return self.turn
 
     def resident_mb(self) -> float:
-        """Memory of the process; 0 when it is gone."""
+        """Return the memory of the process; 0 when it is gone."""
         try:
             return int(Path(f"/proc/{self.process.pid}/statm").read_bytes().split()[1]) * PAGE / 2**20
         except (OSError, IndexError):
@@ -153,7 +153,7 @@ class LocalPool(ClosedAtExit):
         self._start()
 
     def running(self) -> list[str]:
-        """Keys of the jobs under way."""
+        """Return the keys of the jobs under way."""
         return list(self._busy)
 
     def processes(self) -> list[int]:

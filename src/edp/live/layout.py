@@ -105,7 +105,7 @@ class LiveLayout:
     ticks: int | None = None
 
     def to_dict(self) -> dict[str, object]:
-        """Plain JSON values, keys as the fields."""
+        """Return the plain JSON values, keys as the fields."""
         plain = asdict(self)
         for entry, forecast in zip(plain["forecasts"], self.forecasts, strict=True):
             entry["offset"] = forecast.offset

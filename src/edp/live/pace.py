@@ -41,7 +41,7 @@ class Pace:
         self._late_tick: int | None = None
 
     def is_late(self, tick: int) -> bool:
-        """Whether time was given up within the last `LATE_SHOWN_S` of the source's time before a tick."""
+        """Return whether time was given up within the last `LATE_SHOWN_S` of the source's time before a tick."""
         return self._late_tick is not None and tick - self._late_tick < LATE_SHOWN_S * self.rate_hz
 
     def wait(self, tick: int) -> bool:
@@ -68,7 +68,7 @@ class Pace:
             return False
 
     def is_due(self, tick: int) -> bool:
-        """Whether a tick would not have to wait: the source is behind, or runs as fast as it can."""
+        """Return whether a tick would not have to wait: the source is behind, or runs as fast as it can."""
         with self._changed:
             if self.stopped or self.paused:
                 return False

@@ -33,13 +33,13 @@ class Request:
 
 
 def rows_message(kind: int, first: int, rows: NDArray[np.float32], stamp: float) -> bytes:
-    """Rows, shape (ticks, columns), as a message; little endian, float32."""
+    """Return the rows, shape (ticks, columns), as a message; little endian, float32."""
     head = HEAD.pack(kind, first & 0xFFFFFFFF, *rows.shape, stamp)
     return head + np.ascontiguousarray(rows, dtype="<f4").tobytes()
 
 
 def text_message(kind: str, **values: Any) -> str:
-    """Everything but rows."""
+    """Return everything but rows."""
     return json.dumps({"type": kind, **values}, allow_nan=False, separators=(",", ":"))
 
 

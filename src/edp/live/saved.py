@@ -74,7 +74,7 @@ def write_session_page(session: LiveSession, target: str | Path) -> Path:
 
 @cache
 def parts() -> tuple[str, str]:
-    """Script and style of the page."""
+    """Return the script and style of the page."""
     return "\n".join(map(asset, _SCRIPTS)), stylesheet(*_STYLES)
 
 

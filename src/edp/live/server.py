@@ -181,7 +181,7 @@ class LiveServer:
         )
 
     async def _answer(self, connection: ServerConnection, request: HttpRequest) -> Response | None:
-        """Page, saved session or a refusal; None lets a socket open."""
+        """Return the page, saved session or a refusal; None lets a socket open."""
         host = request.headers.get("Host", "")
         if not self._ours(host):
             return _text(HTTPStatus.MISDIRECTED_REQUEST, "this address is not the one that edp live printed")
@@ -208,7 +208,7 @@ class LiveServer:
         return _text(HTTPStatus.NOT_FOUND, "there is no such page")
 
     def _ours(self, host: str) -> bool:
-        """Whether a request came under an address of this server, not under a name that someone points here."""
+        """Return whether a request came under an address of this server, not under a name that someone points here."""
         try:
             parts = urlsplit(f"//{host}")
             name, port = parts.hostname or "", parts.port or 80
@@ -225,7 +225,7 @@ class LiveServer:
         return address.is_loopback or not self.bind.is_loopback
 
     async def _serve_viewer(self, connection: ServerConnection) -> None:
-        """One viewer, from its first message to its end."""
+        """Serve one viewer, from its first message to its end."""
         viewer = Viewer(connection)
         session = self.session
         backlog = min(round(BACKLOG_S * session.layout.rate_hz), MAX_PAST)

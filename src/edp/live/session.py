@@ -40,7 +40,7 @@ class LiveEvent:
     group: str = ""
 
     def to_dict(self) -> dict[str, object]:
-        """Plain JSON values, keys as the fields."""
+        """Return the plain JSON values, keys as the fields."""
         return asdict(self)
 
 
@@ -107,7 +107,7 @@ class LiveSession:
             return list(self._breaks)
 
     def end(self, why: str) -> None:
-        """Nothing more comes."""
+        """End the session: no more data will be added."""
         with self._lock:
             self.ended = why[:MOST_TEXT]
 

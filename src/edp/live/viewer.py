@@ -40,14 +40,14 @@ class Viewer:
             tcp.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
 
     def offer(self, message: bytes, ticks: int) -> None:
-        """Rows; the oldest that wait are dropped where there are too many."""
+        """Queue rows for the viewer; the oldest rows are dropped if the queue is full."""
         if len(self._rows) >= MAX_WAITING:
             self.dropped += self._rows.popleft()[1]
         self._rows.append((message, ticks))
         self._ready.set()
 
     def tell(self, text: str) -> None:
-        """Anything else."""
+        """Queue any other message."""
         if len(self._texts) < MAX_TEXTS:
             self._texts.append(text)
             self._ready.set()

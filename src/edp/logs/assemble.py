@@ -125,7 +125,7 @@ class Assembly:
         return self._values(self.ticks.start + start, self.ticks.start + stop)
 
     def _values(self, first: int, last: int) -> FloatArray:
-        """Ticks ``first <= k < last`` of the grid, float32, shape ``(time, channel)``."""
+        """Return the ticks ``first <= k < last`` of the grid, float32, shape ``(time, channel)``."""
         # Before the array is made: a damaged time column may ask for years of samples.
         check_memory(
             self.raw.path,

@@ -73,12 +73,12 @@ _OTHERS = {
 
 
 def list_suffixes() -> tuple[str, ...]:
-    """All file endings that can be read, in the order of the registry."""
+    """Return all file endings that can be read, in the order of the registry."""
     return tuple(suffix for part in FORMATS.values() for suffix in part.suffixes)
 
 
 def is_text_log(path: Path) -> bool:
-    """Whether a file of an ending that measurement tools also give to files of bytes begins as text."""
+    """Return whether a file of an ending that measurement tools also give to files of bytes begins as text."""
     try:
         return FORMATS["csv"].claims(_begin(path)[0])
     except (OSError, DataError):
@@ -151,7 +151,7 @@ def _begin(path: Path) -> tuple[bytes, int]:
 
 
 def _size_of_folder(folder: Path) -> int:
-    """Bytes of the files of a bag."""
+    """Return the bytes of the files of a bag."""
     total = 0
     for entry in entries_of(folder):
         status = status_of(entry)

@@ -34,7 +34,7 @@ class Drawn:
 
 
 def check_hours(hours: float) -> float:
-    """Hours of a sample.
+    """Return the hours of a sample.
 
     Raises:
         ConfigError: not a positive, finite number.

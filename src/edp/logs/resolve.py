@@ -28,7 +28,7 @@ class ChannelSource:
     constant: float = float("nan")
 
     def convert(self, values: NDArray[Any]) -> NDArray[np.float32]:
-        """File values to SI, float32."""
+        """Return the file values to SI, float32."""
         if values.dtype == np.float32 and self.scale == 1.0 and self.unit.factor == 1.0 and not self.unit.offset:
             return values
         # Damaged files hold bits that are no numbers; what they become is reported as missing.
@@ -62,7 +62,7 @@ def resolve(raw: RawLog, signal_map: SignalMap) -> tuple[list[ChannelSource], li
 
 
 def _vocabulary_entries(raw: RawLog) -> list[ChannelMap]:
-    """Columns whose names are known; files that state kinds (EDP's own) are taken whole."""
+    """Return the columns whose names are known; files that state kinds (EDP's own) are taken whole."""
     stated = [signal for signal in raw.signals.values() if signal.kind is not None]
     if stated:
         return [ChannelMap(s.name, s.name, kind=s.kind, description=s.description) for s in stated]

@@ -154,11 +154,11 @@ class _Log:
         return header
 
     def load(self, signal_index: int) -> Column:
-        """One whole column of a log that has no tables."""
+        """Return one whole column of a log that has no tables."""
         return np.asarray(self.array({"do": "load", "of": signal_index}), dtype=np.float64)
 
     def array(self, request: Header) -> NDArray[Any]:
-        """One array, whose size is weighed before it comes."""
+        """Return one array, whose size is weighed before it comes."""
         with self.lock:
             self._drain()
             self._send(request)

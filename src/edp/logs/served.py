@@ -83,7 +83,10 @@ def _read(order: Header, path: Path) -> tuple[Header, _Served]:
 
 
 def _read_oddly_named(chosen: LogFormat, path: Path, signal_map: SignalMap) -> RawLog:
-    """Libraries take names in UTF-8 only; the link of an open file has one, but no suffix, which bags need."""
+    """Return a name in UTF-8 for libraries that accept only UTF-8.
+
+    The link of an open file has such a name, but no suffix, which bags need.
+    """
     if chosen.name in BAGS:
         raise DataError(f"'{path}' cannot be read: the name of a bag must be UTF-8; rename it")
     link = Path(f"/proc/self/fd/{os.open(path, os.O_RDONLY)}")
@@ -250,7 +253,7 @@ def check_plain(path: Path, arrays: Sequence[NDArray[Any]]) -> None:
 
 
 def _parts(table: ColumnTable, keys: Sequence[str], start: int, stop: int) -> Iterator[list[NDArray[Any]]]:
-    """Pieces, cut where a message would be too long."""
+    """Return the pieces, cut where a message would be too long."""
     for columns in table.pieces(keys, start, stop):
         row = sum(column.itemsize for column in columns)
         rows = max(MESSAGE_BYTES // max(row, 1), 1)

@@ -159,7 +159,7 @@ class DataSource:
         return bucket_address(self.path)
 
     def store_folder(self) -> Path:
-        """Folder of the store; for a store in a bucket, the folder of its copy."""
+        """Return the folder of the store; for a store in a bucket, the folder of its copy."""
         return local_store(self.address) if self.address else self.path
 
     def to_dict(self) -> dict[str, object]:
@@ -202,7 +202,7 @@ class DataSource:
         return [Log(path, self.signal_map, self.repair) for path in files]
 
     def read(self) -> list[Recording]:
-        """All recordings, at one rate.
+        """Return all recordings, at one rate.
 
         Raises:
             DataError: nothing to read, or a log that cannot be used as it is.
@@ -301,7 +301,7 @@ class DataSource:
         return compare(reports, sketches, self._note_selection(recordings))
 
     def _units_of_store(self, recordings: Sequence[Recording], are_at_hand: bool) -> list[WorkUnit]:
-        """Parts of the recordings of a store; recordings at hand are not read again."""
+        """Return the parts of the recordings of a store; recordings at hand are not read again."""
         folder = self.store_folder()
         # What decides all of them: a stretch is drawn by how many recordings there are, and how long.
         digests = "\n".join(entry.digest for entry in read_index(folder).recordings)
@@ -321,7 +321,7 @@ class DataSource:
         return () if whole else findings_of_part(recordings, read_index(self.store_folder()).hours())
 
     def _refuse_bucket_and_sample(self) -> None:
-        """Each command would copy logs in buckets again, and how long logs are is known once they are read."""
+        """Refuse `at_most` for logs in a bucket, since each command would download them again."""
         if self.address:
             raise ConfigError(
                 f"'{self.address}' holds logs and no store; read them once with `edp store build {self.address} --out "
@@ -458,7 +458,7 @@ def _check_listed(recordings: list[Recording], path: Path) -> None:
 
 
 def _expand_variables(entry: str, path: Path) -> str:
-    """`entry` with environment variables put in, so that a data-set file can name logs on another disk."""
+    """Return `entry` with environment variables put in, so that a data-set file can name logs on another disk."""
     full = os.path.expandvars(entry)
     if "$" in full:
         raise ConfigError(

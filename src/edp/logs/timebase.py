@@ -223,7 +223,7 @@ def _find_last_digit(stamps: Stamps, floor: float) -> float:
 
 
 def nice_rate(step_s: float, samples: int, jitter: float) -> float:
-    """1 / step, rounded to a plain number where that shifts the last of `samples` rows no more than stamps jitter.
+    """Return 1 / step, rounded to a simple number if this shifts the last row by no more than the jitter of stamps.
 
     The shift is at most a quarter step, and the rate changes by at most 0.1 %.
     """

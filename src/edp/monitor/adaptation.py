@@ -42,7 +42,7 @@ class SlowDrift:
         return out, offset
 
     def to_dict(self) -> dict[str, float]:
-        """Plain values of its file."""
+        """Return the plain values of its file."""
         return {"step": self.step, "most": self.most}
 
     @staticmethod

@@ -42,7 +42,7 @@ class MonitorAlarm:
     severity: Severity = "warning"
 
     def to_json(self) -> Table:
-        """Plain JSON values, keys as the fields."""
+        """Return the plain JSON values, keys as the fields."""
         plain = asdict(self)
         plain["evidence"] = [[name, value] for name, value in self.evidence]
         return plain

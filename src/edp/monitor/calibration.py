@@ -46,7 +46,7 @@ class AlarmLimit:
     high_hours: float
 
     def sentence(self) -> str:
-        """For a report."""
+        """Return the rates as a sentence for a report."""
         high = "any time" if math.isinf(self.high_hours) else f"{figure(self.high_hours, 3)} h"
         return (
             f"{count_of(self.alarms, 'false alarm')} in {figure(self.hours, 3)} h of healthy sessions: one in "
@@ -56,7 +56,7 @@ class AlarmLimit:
 
 
 def hours_between(count: int, hours: float) -> tuple[float, float]:
-    """Interval of the mean time between alarms, h, from their number (Garwood, Biometrika 28, 1936)."""
+    """Return the interval of the mean time between alarms, h, from their number (Garwood, Biometrika 28, 1936)."""
     tail = (1.0 - CONFIDENCE) / 2.0
     # Quantiles of chi-squared over two are those of the gamma distribution.
     least = float(special.gammaincinv(count, tail)) if count else 0.0
@@ -137,7 +137,7 @@ def _lowest(
 
 
 def _range(spec: DetectorSpec, session: Array) -> tuple[float, float]:
-    """Least and largest statistic of a session."""
+    """Return the least and largest statistic of a session."""
     values = statistics(spec.build(session.shape[1]), session[:, None, :])
     return float(values.min()), float(values.max())
 

@@ -107,7 +107,7 @@ class MonitorChain:
         return BankSpec(self.watches)
 
     def initial_state(self) -> ChainState:
-        """Before the first tick of one machine."""
+        """Return the state before the first sample of a machine."""
         width, directions = self.summaries.width, sum(watch.directions for watch in self.watches)
         none = np.zeros(width)
         bank = self.bank.build(directions)
@@ -169,7 +169,7 @@ class MonitorChain:
         return verdict
 
     def to_dict(self) -> dict[str, object]:
-        """Plain values of its file."""
+        """Return the plain values of its file."""
         return {
             "summaries": self.summaries.to_dict(),
             "clip": self.conditioning.clip,
@@ -183,7 +183,7 @@ class MonitorChain:
         }
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Numbers of its file."""
+        """Return the numbers of its file."""
         named: dict[str, NDArray[Any]] = {f"summaries.{k}": v for k, v in self.summaries.arrays().items()}
         named |= {f"conditioning.{name}": values for name, values in self.conditioning.arrays().items()}
         for index, watch in enumerate(self.watches):
@@ -192,7 +192,7 @@ class MonitorChain:
 
     @staticmethod
     def from_dict(plain: Table, arrays: Mapping[str, NDArray[Any]]) -> MonitorChain:
-        """From plain values and arrays.
+        """Create the chain from the result of `to_dict` and its arrays.
 
         Raises:
             ValueError: values that cannot be; files are data from outside.

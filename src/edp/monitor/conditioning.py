@@ -55,11 +55,11 @@ class Conditioning:
     clip: float
 
     def __call__(self, summaries: Array, points: Array) -> Array:
-        """Conditioned rows, shape (blocks, summaries), within `clip`; NaN stays NaN."""
+        """Return the conditioned rows, shape (blocks, summaries), within `clip`; NaN stays NaN."""
         return np.clip(self.unclipped(summaries, points), -self.clip, self.clip)
 
     def unclipped(self, summaries: Array, points: Array) -> Array:
-        """Conditioned rows within `GROSS` alone.
+        """Return the conditioned rows within `GROSS` alone.
 
         Each sum goes from the first operating number to the last, as in C.
         """
@@ -75,12 +75,12 @@ class Conditioning:
         return np.clip(z, -GROSS, GROSS)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Numbers of its file."""
+        """Return the numbers of its file."""
         return {name: getattr(self, name) for name in ARRAYS}
 
     @staticmethod
     def from_arrays(arrays: Mapping[str, NDArray[Any]], clip: float, summaries: int, points: int) -> Conditioning:
-        """From arrays.
+        """Create the conditioning from its arrays.
 
         Raises:
             ValueError: values that cannot be.
@@ -106,7 +106,7 @@ def check_blocks(blocks: int, points: int) -> None:
 
 
 def fit_conditioning(summaries: Sequence[Array], points: Sequence[Array], clip: float) -> Conditioning:
-    """From healthy sessions, shapes (blocks, summaries) and (blocks, points) each.
+    """Fit to healthy sessions, shapes (blocks, summaries) and (blocks, points) each.
 
     Two rounds of ridge regression for what is usual, the second without rows far off the first, and one for the width
     from what is left: absolute deviations, whose median is made the width.

@@ -260,7 +260,7 @@ def _alarms(monitor: Monitor, recording: Recording) -> Sequence[Any]:
 
 
 def _any_machine(monitor: Monitor) -> Any:
-    """Session means that accept every log: a large shift is a fault here, not another machine."""
+    """Return the session means that accept every log: a large shift is a fault here, not another machine."""
     middle, width = monitor.session_means
     return np.stack([middle, np.full_like(width, np.inf)])
 
@@ -317,7 +317,7 @@ def effort_line(provenance: Table) -> str:
 
 
 def _measure_changes(sizes: Sequence[FoundSize]) -> list[list[FoundSize]]:
-    """Sizes of each change that was injected, in the order of `INJECTIONS`."""
+    """Return the sizes of each change that was injected, in the order of `INJECTIONS`."""
     groups = [[size for size in sizes if size.change == change] for change in INJECTIONS]
     return [group for group in groups if group]
 

@@ -193,7 +193,7 @@ def _check_sessions(spec: ChainSpec, count: int) -> None:
 
 
 def _settle_blocks(spec: ChainSpec, sessions: Sequence[Recording], block: int) -> int:
-    """Blocks at the start of every session that are not watched."""
+    """Return the blocks at the start of every session that are not watched."""
     shortest = min(session.samples for session in sessions)
     # A tenth: one-minute cycles of a rig would otherwise lose most of what they have.
     settle_ticks = min(round(spec.settle_s * sessions[0].rate_hz), shortest // 10)
@@ -324,7 +324,7 @@ def _condition(
 def _drop_doubtful(
     spec: ChainSpec, sessions: Sequence[SessionBlocks], settle: int
 ) -> tuple[list[SessionBlocks], tuple[str, ...]]:
-    """Sessions without those whose means lie far from all others, and the names of those."""
+    """Return the sessions without those whose means lie far from all others, and the names of those."""
     bad = _doubtful(spec, sessions, sessions, settle)
     remaining = [session for session, out in zip(sessions, bad, strict=True) if not out]
     return remaining, tuple(session.name for session, out in zip(sessions, bad, strict=True) if out)

@@ -94,7 +94,10 @@ def _blocks(block_s: float) -> int:
 
 
 def _means(rows: Array, first: int) -> Array:
-    """Means over the rows of a log, or over its first ones; NaN for a summary that is missing in most of the start."""
+    """Return the means over the rows of a log, or over its first ones.
+
+    NaN for a summary that is missing in most of the start.
+    """
     there = np.isfinite(rows)
     counts = there.sum(axis=0)
     means = np.where(there, rows, 0.0).sum(axis=0) / np.maximum(counts, 1)

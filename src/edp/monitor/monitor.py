@@ -137,12 +137,15 @@ class Monitor:
         return self.chain.summaries.block / self.rate_hz
 
     def initial_state(self) -> MonitorState:
-        """Before the first tick."""
+        """Return the state before the first sample."""
         states = tuple(source.initial_state(1) for source in self.sources)
         return MonitorState(states, self.chain.initial_state(), 0, np.zeros(len(self.channels), np.int64))
 
     def plausible(self, rows: Rows) -> Rows:
-        """Rows in which a value that no sensor gives is missing: not finite, or beyond `IMPOSSIBLE` deviations."""
+        """Return the rows in which a value that no sensor gives is missing.
+
+        Not finite, or beyond `IMPOSSIBLE` deviations.
+        """
         summaries = self.chain.summaries
         with np.errstate(invalid="ignore", over="ignore"):
             possible = np.abs(rows.astype(np.float64) - summaries.centre) * summaries.spread <= IMPOSSIBLE
@@ -184,7 +187,7 @@ class Monitor:
             yield from verdicts
 
     def run(self, recording: Recording) -> list[MonitorAlarm]:
-        """All alarms of a recording; the detectors are reset at each, and a fault that stays alarms again.
+        """Return all alarms of a recording; the detectors are reset at each, and a fault that stays alarms again.
 
         Raises:
             DataError: another rate, or a log of another machine.
@@ -192,7 +195,7 @@ class Monitor:
         return list(self.watch(recording).alarms)
 
     def watch(self, recording: Recording, start: datetime | None = None) -> Watched:
-        """Alarms of a recording with their causes, and what led to them block by block.
+        """Return alarms of a recording with their causes, and what led to them block by block.
 
         Causes are named from the rows up to `AFTER_S` behind an alarm, as far as the recording has them.
 
@@ -225,7 +228,10 @@ class Monitor:
         return Watched(tuple(alarms), np.array(statistics).reshape(shape), table)
 
     def conditioned_rows(self, recording: Recording) -> Array:
-        """Conditioned summaries of each block, NaN where missing, shape (blocks, summaries); see `summary_names`."""
+        """Return the conditioned summaries of each block, NaN where missing, shape (blocks, summaries).
+
+        See `summary_names`.
+        """
         return self._condition(recording)[0]
 
     def _condition(self, recording: Recording) -> tuple[Array, Array]:
@@ -243,7 +249,7 @@ class Monitor:
         return np.concatenate(near), np.concatenate(far)
 
     def white_rows(self, recording: Recording) -> Array:
-        """White rows as the detectors see them, shape (blocks, directions of all watches)."""
+        """Return the white rows as the detectors see them, shape (blocks, directions of all watches)."""
         return self.chain.bank.white(*self._condition(recording))
 
     def alarm(self, verdict: BlockVerdict, recording: str = "") -> MonitorAlarm:
@@ -292,7 +298,7 @@ class Monitor:
         return lacking
 
     def unlearned(self, recording: Recording) -> tuple[str, ...]:
-        """Sentences on residuals that are silent in parts of a recording that healthy logs do not cover."""
+        """Return the sentences on residuals that are silent in parts of a recording that healthy logs do not cover."""
         return tuple(filter(None, (source.unlearned(recording) for source in self.sources)))
 
     def unlike(self, watched: Watched) -> str:

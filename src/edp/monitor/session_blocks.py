@@ -37,7 +37,7 @@ class SessionBlocks:
 def fit_summaries(
     block_s: float, sources: Sequence[ResidualSource], channels: Sequence[Channel], sessions: Sequence[Recording]
 ) -> BlockSummaries:
-    """Blocks and scales from some healthy sessions."""
+    """Return the blocks and scales from some healthy sessions."""
     names, block, chosen = [channel.name for channel in channels], block_ticks(block_s, sessions), _scaling(sessions)
     scales = []
     for source in sources:
@@ -65,7 +65,7 @@ def fit_summaries(
 
 
 def block_ticks(block_s: float, sessions: Sequence[Recording]) -> int:
-    """Ticks of a block of these sessions."""
+    """Return the ticks of a block of these sessions."""
     block = max(round(block_s * sessions[0].rate_hz), MIN_TICKS)
     return min(block, max(1, min(session.samples for session in sessions) // 2))
 
@@ -78,7 +78,7 @@ def operating_numbers(channels: Sequence[Channel], sessions: Sequence[Recording]
 
 
 def _scaling(sessions: Sequence[Recording]) -> list[Recording]:
-    """Sessions that scales and operating points are taken from, evenly chosen."""
+    """Return the sessions that scales and operating points are taken from, evenly chosen."""
     places = np.unique(np.linspace(0, len(sessions) - 1, min(len(sessions), SCALED_SESSIONS)).astype(int))
     return [sessions[i] for i in places]
 
@@ -122,7 +122,7 @@ def _likely_axis(axes: Sequence[Axis], session: Recording, name: str) -> Axis | 
 
 
 def _robust_width(values: Array) -> Array:
-    """Deviation of each column, half of it from the middle of the distribution and half from all."""
+    """Return the deviation of each column, half of it from the middle of the distribution and half from all."""
     centred = np.abs(values - np.nanmedian(values, axis=0))
     width = 0.5 * (1.4826 * np.nanmedian(centred, axis=0) + np.sqrt(np.nanmean(np.square(centred), axis=0)))
     widest: Array = np.where(np.nan_to_num(width) > 0.0, width, 1.0)
@@ -143,7 +143,7 @@ def _operating_channels(
 def blocks_of(
     summaries: BlockSummaries, sources: Sequence[ResidualSource], channels: Sequence[Channel], session: Recording
 ) -> SessionBlocks:
-    """Summaries and operating points of a session."""
+    """Return the summaries and operating points of a session."""
     residuals = np.concatenate([residuals_of(source, [session])[0] for source in sources], axis=1)
     rows = rows_of(session, [channel.name for channel in channels])
     raw, points, _ = summaries.run(residuals, rows, summaries.initial_state())
@@ -166,12 +166,15 @@ class BlocksJob:
 
 
 def summarised(job: BlocksJob) -> SessionBlocks:
-    """`blocks_of` of a job."""
+    """Return `blocks_of` of a job."""
     return blocks_of(job.summaries, job.sources, job.channels, job.session)
 
 
 def session_means(channels: Sequence[Channel], sessions: Sequence[Recording]) -> Array:
-    """Mean over sessions of each channel's mean, and a generous deviation between sessions, shape (2, inputs)."""
+    """Return the mean over sessions of each channel's mean, and a generous deviation between sessions.
+
+    Shape (2, inputs).
+    """
     names = [channel.name for channel in channels]
     means, within = [], []
     # One session at a time: hundreds of hours in double precision would not fit into memory.

@@ -93,7 +93,7 @@ class BlockSummaries:
         return 1 + len(self.level) + len(self.moving)
 
     def initial_state(self) -> SummaryState:
-        """Before the first tick of one machine."""
+        """Return the state before the first sample of a machine."""
         sums = {name: np.zeros(self.residuals) for name in ("n", "r", "rr", "ru", "uu", "rd", "dd", "peak")}
         inputs, driven = len(self.centre), (len(self.drivers), self.residuals)
         sums |= {"rw": np.zeros(driven), "ww": np.zeros(driven)}
@@ -186,21 +186,21 @@ class BlockSummaries:
         return summary, np.concatenate([np.ones((*levels.shape[:-1], 1)), levels, sizes], axis=-1)
 
     def names(self, residuals: Sequence[str]) -> tuple[str, ...]:
-        """Names of the summaries, such as ``virtual:CylVels_1.mean``."""
+        """Return the names of the summaries, such as ``virtual:CylVels_1.mean``."""
         summaries = (*SUMMARIES, *(f"drive{number + 1}" for number in range(len(self.drivers))))
         return tuple(f"{residual}.{summary}" for residual in residuals for summary in summaries)
 
     def to_dict(self) -> dict[str, object]:
-        """Plain values of its file."""
+        """Return the plain values of its file."""
         return {"block": self.block}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Numbers of its file."""
+        """Return the numbers of its file."""
         return {name: getattr(self, name) for name in ARRAYS}
 
     @staticmethod
     def from_dict(plain: Mapping[str, object], arrays: Mapping[str, NDArray[Any]]) -> BlockSummaries:
-        """From plain values and arrays.
+        """Create the summaries from the result of `to_dict` and their arrays.
 
         Raises:
             ValueError: values that cannot be.

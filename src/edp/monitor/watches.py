@@ -76,7 +76,7 @@ class Watch:
         return self.matrix.ndim == 1
 
     def __call__(self, rows: Array) -> Array:
-        """White rows, shape (blocks, directions); a missing summary counts as healthy.
+        """Return the white rows, shape (blocks, directions); a missing summary counts as healthy.
 
         Each sum goes from the first summary to the last in single precision, as in C.
         """
@@ -160,7 +160,7 @@ def fit_watch(spec: WatchSpec, sessions: Sequence[Array], blocks_per_s: float, s
 
 
 def _own(spec: WatchSpec, sessions: Sequence[Array], settle: int) -> Watch:
-    """Each summary over the largest size that it has on healthy machines."""
+    """Return each summary over the largest size that it has on healthy machines."""
     peaks = [np.abs(np.nan_to_num(session[settle:])).max(axis=0) for session in sessions if len(session) > settle]
     if not peaks:
         raise DataError("no healthy session is longer than the start that is not watched: bring longer ones")
@@ -216,7 +216,7 @@ class BankSpec(DetectorSpec):
         return bank
 
     def white(self, rows: Array, gross: Array) -> Array:
-        """Rows as the bank takes them, of conditioned ones that are clipped and of those that are not."""
+        """Return the rows as the bank takes them, of conditioned ones that are clipped and of those that are not."""
         return np.concatenate([watch(gross if watch.own else rows) for watch in self.watches], axis=1)
 
 

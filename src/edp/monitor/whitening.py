@@ -29,7 +29,7 @@ class Whitening:
 
     @staticmethod
     def fit(sessions: Sequence[Array]) -> Whitening:
-        """From healthy sessions, shape (time, channels) each; rows that are not finite are left out.
+        """Fit to healthy sessions, shape (time, channels) each; rows with values that are not finite are omitted.
 
         Raises:
             DataError: there are too few rows for a covariance.
@@ -54,7 +54,10 @@ class Whitening:
         return Whitening(mean, vectors[:, kept_directions] / np.sqrt(variances[kept_directions]) / size[:, None])
 
     def __call__(self, rows: Array) -> Array:
-        """White residuals, shape (..., directions), of rows of shape (..., channels); missing ones count as healthy."""
+        """Return the white residuals, shape (..., directions), of rows of shape (..., channels).
+
+        Missing ones count as healthy.
+        """
         centred = np.asarray(rows, dtype=float) - self.mean
         white: Array = np.where(np.isfinite(centred), centred, 0.0) @ self.matrix
         return white

@@ -46,7 +46,7 @@ class Identity:
         return _Identity()
 
     def bound(self) -> float | None:
-        """No limit."""
+        """Return None: the activation is unbounded."""
         return None
 
 
@@ -65,7 +65,7 @@ class Tanh:
         return _Tanh()
 
     def bound(self) -> float | None:
-        """One standard deviation of the target."""
+        """Return one standard deviation of the target."""
         return 1.0
 
 
@@ -125,7 +125,7 @@ class _ScaledTanh(nn.Module):
         self.free = nn.Parameter(torch.full((outputs,), share).logit())
 
     def amplitude(self) -> Tensor:
-        """Learned amplitudes, ``(output,)``."""
+        """Return the learned amplitudes, ``(output,)``."""
         return self.spec.low + (self.spec.high - self.spec.low) * torch.sigmoid(self.free)
 
     def forward(self, x: Tensor) -> Tensor:

@@ -99,7 +99,7 @@ class LstmSpec:
         check_cell("lstm", self.cell, self.zoneout, families=("lstm",))
 
     def slots(self) -> tuple[BlockSlot, ...]:
-        """Features derived from the recurrent states."""
+        """Return the features derived from the recurrent states."""
         return (BlockSlot.FEATURES,)
 
     def parts(self) -> tuple[str, ...]:
@@ -137,7 +137,7 @@ class GruSpec:
         check_cell("gru", self.cell, 0.0, families=("gru",))
 
     def slots(self) -> tuple[BlockSlot, ...]:
-        """Features derived from the recurrent states."""
+        """Return the features derived from the recurrent states."""
         return (BlockSlot.FEATURES,)
 
     def parts(self) -> tuple[str, ...]:
@@ -171,7 +171,7 @@ class TcnSpec:
         check_bounds("backbone", self, channels=CHANNELS, kernel=KERNEL, dropout=DROPOUT)
 
     def slots(self) -> tuple[BlockSlot, ...]:
-        """Parallel stacks, and what works on their channels."""
+        """Return the parallel stacks, and what works on their channels."""
         return (BlockSlot.BRANCHES, BlockSlot.CHANNELS)
 
     def parts(self) -> tuple[str, ...]:
@@ -224,7 +224,7 @@ class HybridSpec:
         check_cell("hybrid", self.cell, self.zoneout)
 
     def slots(self) -> tuple[BlockSlot, ...]:
-        """Parallel stacks, what works on their channels, and features derived from the recurrent states."""
+        """Return the parallel stacks, what works on their channels, and features derived from the recurrent states."""
         return (BlockSlot.BRANCHES, BlockSlot.CHANNELS, BlockSlot.FEATURES)
 
     def parts(self) -> tuple[str, ...]:
@@ -232,7 +232,7 @@ class HybridSpec:
         return ("encoder", "recurrent", "pooling", "extras")
 
     def build(self, features: int, window: int, blocks: Blocks, outputs: int = 1) -> tuple[Streaming, int]:
-        """Convolutions and the recurrent backbone on their channels."""
+        """Return the convolutions and the recurrent backbone on their channels."""
         encoder, width = _convolutions(features, self.channels, self.kernel, self.dropout, window, blocks)
         stack = Stack(self.cell, width, self.units, self.layers, self.dropout, self.zoneout)
         net = RecurrentBackbone(encoder, self.initial.build(stack, width), self.units, self.dropout, window, blocks)
@@ -297,7 +297,7 @@ class CommitteeSpec:
                 )
 
     def conflicts(self, model: object, task: Task) -> str | None:
-        """Trees that read more columns than their tables can name."""
+        """Return the trees that read more columns than their tables can name."""
         columns = len(task.features.features) * (1 + len(self.lags) + len(self.smoothed))
         if self.trees and columns > MAX_INDEX + 1:
             return (
@@ -307,7 +307,7 @@ class CommitteeSpec:
         return None
 
     def slots(self) -> tuple[BlockSlot, ...]:
-        """None: the members are all there is."""
+        """Return None, since the members are the complete network."""
         return ()
 
     def parts(self) -> tuple[str, ...]:

@@ -148,6 +148,6 @@ class ConvolutionStack(Streaming):
 
 
 def receptive_field(levels: int, kernel: int) -> int:
-    """Receptive field of a stack with dilations 1, 2, 4, ... in samples (eq. 3.37)."""
+    """Return the receptive field of a stack with dilations 1, 2, 4, ... in samples (eq. 3.37)."""
     # Two convolutions a level give the factor 2 (eq. 3.37).
     return int(1 + 2 * (kernel - 1) * (2**levels - 1))

@@ -110,18 +110,18 @@ class FrontEnd(Streaming):
         return [columns[entry] for entry in range(len(self.derived))], tuple(after)
 
     def _start(self, x: Tensor, age: Tensor) -> list[Tensor]:
-        """Channels of the start ``(batch, time, channel)``, and whether they are read at a tick."""
+        """Return the channels of the start ``(batch, time, channel)``, and whether they are read at a tick."""
         read = age + torch.arange(x.shape[1], device=x.device).view(1, -1, 1) < self.starting_ticks
         # Behind its ticks a channel of the start is replaced by its mean, which is zero after scaling.
         mean = self.offset[self.lasting : self.lasting + len(self.starting)]
         return [torch.where(read, x, mean), read.to(x)]
 
     def scale(self, features: Tensor) -> Tensor:
-        """Standardised features."""
+        """Return the standardised features."""
         return (features - self.offset) / self.width
 
     def lower(self, build: Builder, x: str) -> str:
-        """Physical features."""
+        """Return the physical features."""
         parts = [build.pick("logged", x, range(self.logged))]
         if self.derived:
             parts.append(self._lower_derived(build, x))
@@ -151,7 +151,7 @@ class FrontEnd(Streaming):
         return build.pick("derived_in_order", together, [order.index(entry) for entry in range(len(order))])
 
     def lower_scale(self, build: Builder, features: str) -> str:
-        """Standardised features."""
+        """Return the standardised features."""
         return build.add(Standardise, "scaled", features, offset=self.offset, scale=self.width)
 
     def costs(self) -> list[Cost]:
@@ -185,11 +185,11 @@ class TargetTransform(nn.Module):
         return base / self.width if isinstance(base, Tensor) else features.new_zeros(*features.shape[:2], 1, 1)
 
     def encode(self, future: Tensor, features: Tensor) -> Tensor:
-        """Standardised targets from future SI values ``(batch, time, horizon, target)``."""
+        """Return the standardised targets from future SI values ``(batch, time, horizon, target)``."""
         return (future - self._base(features) - self.offset) / self.width
 
     def decode(self, code: Tensor, features: Tensor) -> Tensor:
-        """SI predictions from the network's output, same shape."""
+        """Return SI predictions from the network's output, same shape."""
         return code * self.width + self.offset + self._base(features)
 
     def lower_base(self, build: Builder, features: str) -> str | None:
@@ -197,13 +197,13 @@ class TargetTransform(nn.Module):
         return build.pick("present", features, self.present * len(self.width)) if self.delta else None
 
     def lower_encode(self, build: Builder, future: str, base: str | None) -> str:
-        """Standardised targets from future SI values."""
+        """Return the standardised targets from future SI values."""
         if base is not None:
             future = build.combine("change", BinaryOperation.SUBTRACT, future, base)
         return build.add(Standardise, "encoded", future, offset=self.offset.flatten(), scale=self.width.flatten())
 
     def lower_decode(self, build: Builder, name: str, code: str, base: str | None) -> str:
-        """SI values from one or several sets of standardised ones, ``set * horizon * target``."""
+        """Return SI values from one or several sets of standardised ones, ``set * horizon * target``."""
         one = self.width.numel()
         # Bounds carry several sets of the same numbers; gains repeat once for each set.
         sets = build.width(code) // one

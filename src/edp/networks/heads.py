@@ -58,7 +58,7 @@ class MlpHead:
         check_bounds("head", self, hidden=integer(1, MAX_UNITS), layers=integer(1, MAX_LAYERS))
 
     def build(self, width: int, outputs: int, values: int, mix: Streaming | None = None) -> Heads:
-        """Heads with ReLU."""
+        """Return the heads with ReLU."""
         return Heads(width, outputs, values, [RELU] * self.layers, self.hidden, mix)
 
 
@@ -87,7 +87,7 @@ class GluHead:
         check_bounds("head", self, hidden=integer(1, MAX_UNITS), layers=integer(1, MAX_LAYERS))
 
     def build(self, width: int, outputs: int, values: int, mix: Streaming | None = None) -> Heads:
-        """Heads that begin with a gated linear unit."""
+        """Return the heads that begin with a gated linear unit."""
         return Heads(width, outputs, values, [GATED] + [RELU] * (self.layers - 1), self.hidden, mix)
 
 
@@ -120,7 +120,7 @@ class LinearHead:
         return None
 
     def build(self, width: int, outputs: int, values: int, mix: Streaming | None = None) -> Heads:
-        """Heads of one linear layer."""
+        """Return the heads of one linear layer."""
         return Heads(width, outputs, values, [], 1, mix, OutputBand(values, outputs) if self.dead_band else None)
 
 
@@ -231,7 +231,7 @@ class Heads(Streaming):
         return self._layer(len(self.units), y).transpose(2, 3), state
 
     def _layer(self, layer: int, x: Tensor) -> Tensor:
-        """``(batch, time, output, in)`` to ``(batch, time, output, out)``."""
+        """Return ``(batch, time, output, in)`` to ``(batch, time, output, out)``."""
         result: Tensor = torch.einsum("btci,cio->btco", x, self.weights[layer]) + self.biases[layer]
         return result
 

@@ -45,7 +45,7 @@ def usual_range(predictor: Predictor) -> tuple[Array, Array]:
 
 
 def input_limits(predictor: Predictor) -> tuple[Array, Array]:
-    """Least and largest accepted value of each input, SI units, each ``(input,)``."""
+    """Return the least and largest accepted value of each input, SI units, each ``(input,)``."""
     centre, spread = usual_range(predictor)
     # Clipping keeps the limit representable in float32, in which the exported code compares.
     low, high = (np.clip(centre + side * LIMIT * spread, -LARGEST, LARGEST) for side in (-1.0, 1.0))

@@ -65,12 +65,15 @@ class IntegerPredictor(Predictor):
         return Integers(self.integers, batch)
 
     def predict(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        """Predictions in SI units, ``(batch, time, horizon, target)``, and the next state."""
+        """Return the predictions in SI units, ``(batch, time, horizon, target)``, and the next state."""
         results, new = self._run(x, state)
         return self._reshape_outputs(results["prediction"], x), new
 
     def intervals(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        """Bounds in SI units ``(batch, time, coverage, 2, horizon, target)``, lower then upper, and the next state."""
+        """Return the bounds in SI units ``(batch, time, coverage, 2, horizon, target)``, lower then upper.
+
+        And the next state.
+        """
         results, new = self._run(x, state)
         return self._sides(results, x), new
 
@@ -84,12 +87,12 @@ class IntegerPredictor(Predictor):
         return self._reshape_outputs(results["prediction"], x), bounds, new
 
     def _sides(self, results: dict[str, np.ndarray], x: Tensor) -> Tensor:
-        """Bounds in SI units ``(batch, time, coverage, 2, horizon, target)``."""
+        """Return the bounds in SI units ``(batch, time, coverage, 2, horizon, target)``."""
         sides = [self._reshape_outputs(results[side], x, len(self.output.coverages)) for side in ("lower", "upper")]
         return torch.stack(sides, dim=3)
 
     def forward_features(self, x: Tensor, state: State) -> NoReturn:
-        """Not in integer arithmetic.
+        """Raise an error: hidden features do not exist in integer arithmetic.
 
         Raises:
             ExportError: always.
@@ -127,7 +130,7 @@ def spread(series: Sequence[Series], ticks: int) -> list[Series]:
 
 
 def _error_with(predictor: Predictor, series: Sequence[Series], frac: int) -> float:
-    """Mean absolute error of the float network with standardised inputs in a 16-bit format."""
+    """Return the mean absolute error of the float network with standardised inputs in a 16-bit format."""
     rounded = deepcopy(predictor)
     scale, unit = rounded.front.scale, 2.0**-frac
 

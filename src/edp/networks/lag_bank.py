@@ -115,7 +115,7 @@ class LagBank(Streaming):
             self.high.copy_(high)
 
     def _means(self) -> list[StreamingTrailingMean]:
-        """Means of changes, then means of some of these."""
+        """Return the means of changes, then means of some of these."""
         return [mean for mean in (*self.means, *self.means_of_means) if isinstance(mean, StreamingTrailingMean)]
 
     def initial_state(self, batch: int, like: Tensor) -> State:
@@ -159,5 +159,5 @@ class LagBank(Streaming):
         return build.add(Clip, "within", columns, low=self.low, high=self.high)
 
     def costs(self) -> list[Cost]:
-        """Differences and sums only: no multiply-accumulates."""
+        """Return the differences and sums only: no multiply-accumulates."""
         return [Cost(f"changes over {len(self.spans)} spans", 0, width_in=self.width, width_out=self.columns)]

@@ -40,7 +40,7 @@ class Matrix:
 
 
 def matrices_of(network: nn.Module, recurrent: bool = True) -> list[Matrix]:
-    """Weights of the convolutions, recurrent layers, linear layers and heads of a network.
+    """Return the weights of the convolutions, recurrent layers, linear layers and heads of a network.
 
     Args:
         network: its parts say which of their parameters they multiply with (`Streaming.matrices`).

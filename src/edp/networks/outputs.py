@@ -77,7 +77,7 @@ class Output(nn.Module):
         return Prediction(center, raw)
 
     def reach(self, answer: Prediction, which: int) -> tuple[Tensor, Tensor]:
-        """Distances of the bounds of interval `which` below and above the centre, before calibration."""
+        """Return the distances of the bounds of interval `which` below and above the centre, before calibration."""
         raise ConfigError("a point output has no intervals; train with model.output kind 'quantiles' or 'normal'")
 
     def interval(self, answer: Prediction, which: int) -> tuple[Tensor, Tensor]:

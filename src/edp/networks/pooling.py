@@ -43,7 +43,7 @@ class AttentionPooling(Streaming):
         return torch.cat([pooled, x], dim=-1), (states[:, ticks:], scores[:, ticks:])
 
     def _pool(self, states: Tensor, scores: Tensor, start: int, stop: int) -> Tensor:
-        """Pooled states for ticks start..stop: a softmax over a band of `window` columns."""
+        """Return the pooled states for ticks start..stop: a softmax over a band of `window` columns."""
         keys = slice(start, stop + self.window - 1)
         ticks, columns = stop - start, stop - start + self.window - 1
         lag = torch.arange(columns, device=scores.device) - torch.arange(ticks, device=scores.device)[:, None]

@@ -117,7 +117,7 @@ class Predictor(Streaming):
         return slot_blocks[0].build(*sizes) if slot_blocks else None  # type: ignore[attr-defined]
 
     def _present(self) -> tuple[Tensor, Tensor]:
-        """Gain and shift, ``(horizon, target)``, from scaled features to present values in target space."""
+        """Return the gain and shift, ``(horizon, target)``, from scaled features to present values in target space."""
         # A target without a feature takes any column; blocks that read present values refuse that case.
         columns = [column or 0 for column in self.task.present]
         gain = self.front.width[columns] / self.code.width
@@ -149,7 +149,7 @@ class Predictor(Streaming):
         return state | {name: part.initial_state(batch, like) for name, part in self._parts().items()}
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        """Standardised predictions ``(batch, time, horizon, target)`` and the next state."""
+        """Return the standardised predictions ``(batch, time, horizon, target)`` and the next state."""
         answer, _, new = self.run(x, state)
         return answer.center, new
 
@@ -181,12 +181,14 @@ class Predictor(Streaming):
         return self.output.answer(center, values[..., 1:, :]), features, hidden, new
 
     def predict(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        """Predictions in SI units, ``(batch, time, horizon, target)``, and the next state."""
+        """Return the predictions in SI units, ``(batch, time, horizon, target)``, and the next state."""
         answer, features, new = self.run(x, state)
         return self.code.decode(answer.center, features), new
 
     def intervals(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        """Bounds in SI units ``(batch, time, coverage, 2, horizon, target)``, lower then upper, and the next state.
+        """Return the bounds in SI units ``(batch, time, coverage, 2, horizon, target)``, lower then upper.
+
+        And the next state.
 
         The coverages are those of ``spec.output.coverages``, in their order.
         """
@@ -203,7 +205,7 @@ class Predictor(Streaming):
         return self.code.decode(answer.center, features), bounds, new
 
     def _bounds(self, answer: Prediction, features: Tensor) -> Tensor:
-        """Bounds in SI units ``(batch, time, coverage, 2, horizon, target)``."""
+        """Return the bounds in SI units ``(batch, time, coverage, 2, horizon, target)``."""
         bounds = [
             torch.stack([self.code.decode(bound, features) for bound in self.output.interval(answer, which)], dim=2)
             for which in range(len(self.output.coverages))
@@ -266,7 +268,7 @@ class Predictor(Streaming):
         return center
 
     def costs(self) -> list[Cost]:
-        """Analytic costs of every part."""
+        """Return analytic costs of every part."""
         rows = self.front.costs()
         for part in self._parts().values():
             rows += part.costs()
@@ -312,7 +314,7 @@ def build_model(task: Task, spec: ModelSpec, scaler: Scaler, seed: int) -> Predi
 
 
 def trainable(module: nn.Module) -> list[nn.Parameter]:
-    """Parameters that training changes."""
+    """Return the parameters that training changes."""
     return [parameter for parameter in module.parameters() if parameter.requires_grad]
 
 

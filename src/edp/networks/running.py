@@ -25,7 +25,7 @@ PIECE = 512  # ticks per call, or windows: long enough for speed, short enough f
 
 
 def stream_predictions(predictor: Predictor, series: Sequence[Series], batch: int = 16) -> list[NDArray[np.float32]]:
-    """Predictions for every tick of every series, each from reset, state carried to its end.
+    """Return the predictions for every tick of every series, each from reset, state carried to its end.
 
     Returns:
         For each series float32 ``(time, horizon, target)`` in SI units: row t is the prediction made at t.
@@ -42,7 +42,9 @@ def window_predictions(predictor: Predictor, series: Sequence[Series]) -> list[N
 
 
 def mean_error(predictor: Predictor, series: Sequence[Series]) -> float:
-    """Mean absolute error over series, horizons and targets, SI units; each series from reset, after a whole window.
+    """Return the mean absolute error over series, horizons and targets, SI units.
+
+    Each series from reset, after a whole window.
 
     Not a number where no series is longer than that.
     """
@@ -64,7 +66,7 @@ def stream_errors(predictor: Predictor, series: Sequence[Series]) -> Iterator[tu
 
 
 def stream_intervals(predictor: Predictor, series: Sequence[Series], batch: int = 16) -> list[NDArray[np.float32]]:
-    """Interval bounds for every tick of every series, each from reset.
+    """Return the interval bounds for every tick of every series, each from reset.
 
     Returns:
         For each series float32 ``(time, coverage, 2, horizon, target)`` in SI units, lower then upper, in the order of
@@ -136,7 +138,7 @@ def streamed(
 
 
 def stream_groups(series: Sequence[Series], batch: int = 16) -> list[list[int]]:
-    """Numbers of series whose streams run side by side, in the order in which they run: shorter ones come first.
+    """Return numbers of series whose streams run side by side, in the order in which they run: shorter ones come first.
 
     A stream's answers may differ in their last bits with its neighbours, which these groups settle once for all.
     """

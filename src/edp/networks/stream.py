@@ -212,7 +212,7 @@ class Stream:
         self._state = self.predictor.initial_state(1, self._like)
 
     def _run(self, holding: bool) -> StreamStatus:
-        """One tick of the network from the last accepted inputs."""
+        """Return one tick of the network from the last accepted inputs."""
         self.ticks += 1
         # Non-finite results would stay in the recurrent state for ever; clearing it is the only way back.
         numbers = self._compute_rows(self._last[None])[0]
@@ -227,7 +227,7 @@ class Stream:
         return StreamStatus.OK if self.warm else StreamStatus.WARMING
 
     def _compute_rows(self, rows: NDArray[np.floating]) -> Rows:
-        """Predictions, then lower and upper bounds, ``(ticks, 1 + 2 * coverage, horizon, target)``, SI units."""
+        """Return predictions, then lower and upper bounds, ``(ticks, 1 + 2 * coverage, horizon, target)``, SI units."""
         x = torch.from_numpy(rows).to(dtype=self._like.dtype, device=self._like.device).unsqueeze(0)
         with torch.inference_mode(), _threads(self._threads):
             center, bounds, self._state = self.predictor.predict_with_intervals(x, self._state)

@@ -102,7 +102,7 @@ class Streaming(nn.Module, ABC):
 
     @abstractmethod
     def costs(self) -> list[Cost]:
-        """Analytic costs, a row for each part."""
+        """Return analytic costs, a row for each part."""
 
     def lower(self, build: Builder, x: str) -> str:
         """Add the layers that compute this part tick by tick to a graph, as in evaluation.
@@ -129,12 +129,12 @@ class Streaming(nn.Module, ABC):
 
 
 def list_fixed_parameters(model: nn.Module) -> set[str]:
-    """Full names of the parameters that parts of a model declare as `Streaming.fixed`."""
+    """Return the full names of the parameters that parts of a model declare as `Streaming.fixed`."""
     return _list_declared(model, "fixed")
 
 
 def indifferent_parameters(model: nn.Module) -> set[str]:
-    """Full names of the parameters that parts of a model declare as `Streaming.indifferent`."""
+    """Return the full names of the parameters that parts of a model declare as `Streaming.indifferent`."""
     return _list_declared(model, "indifferent")
 
 
@@ -174,7 +174,7 @@ class Chain(Streaming):
 
 
 def operations_of(module: nn.Module) -> frozenset[Operation]:
-    """Every primitive operation that a network declares, the parts inside it included."""
+    """Return every primitive operation that a network declares, the parts inside it included."""
     return frozenset().union(*(getattr(part, "operations", ()) for part in module.modules()))
 
 

@@ -38,7 +38,7 @@ class StreamingTrailingMean(Streaming):
         return build.add(TrailingMeanLayer, "mean", x, size=self.width, window=self.window)
 
     def costs(self) -> list[Cost]:
-        """Additions only: no multiply-accumulates."""
+        """Return additions only: no multiply-accumulates."""
         return [Cost(f"mean over {self.window}", 0, width_in=self.width, width_out=self.width)]
 
 

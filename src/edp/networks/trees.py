@@ -86,7 +86,7 @@ class Trees(Streaming):
         return torch.cat(sums).view(*x.shape[:-1], self.outputs), state
 
     def _sums(self, rows: Tensor) -> Tensor:
-        """``(row, output)``."""
+        """Return ``(row, output)``."""
         nodes, count = 2**self.depth - 1, self.outputs * self.trees
         tree = torch.arange(count, device=rows.device)
         feature, threshold, leaf = (table.flatten() for table in (self.feature, self.threshold, self.leaf))

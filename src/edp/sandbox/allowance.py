@@ -77,7 +77,7 @@ class Allowance:
             self._rearm(work / WORK_PER_S + parts * PART_S)
 
     def seconds(self, values: int = 0) -> float:
-        """Processor time of a request that wants some values."""
+        """Return the processor time of a request that wants some values."""
         return min(START_S + self.size / BYTES_PER_S + self.work_s + values / VALUES_PER_S, MAX_S)
 
     @contextlib.contextmanager
@@ -146,7 +146,7 @@ class Allowance:
 
 
 def is_exhausted(error: BaseException | None) -> bool:
-    """Whether an exception comes from a lack of memory, however a library calls it."""
+    """Return whether an exception comes from a lack of memory, however a library calls it."""
     depth = 0
     # Chains of exceptions may be circular.
     while error is not None and depth < 20:
@@ -157,7 +157,7 @@ def is_exhausted(error: BaseException | None) -> bool:
 
 
 def _measure_memory() -> tuple[int, int]:
-    """Address space and data of this process, in bytes."""
+    """Return address space and data of this process, in bytes."""
     try:
         pages = [int(part) for part in Path("/proc/self/statm").read_text(encoding="ascii").split()]
         return pages[0] * os.sysconf("SC_PAGE_SIZE"), pages[5] * os.sysconf("SC_PAGE_SIZE")

@@ -83,7 +83,7 @@ def divide(pipes: Sequence[int]) -> None:
 
 
 def is_available() -> bool:
-    """Whether the kernel hands system calls to another process."""
+    """Return whether the kernel hands system calls to another process."""
     if not sys.platform.startswith("linux") or platform.machine() not in _SECCOMP:
         return False
     sizes = ctypes.create_string_buffer(6)

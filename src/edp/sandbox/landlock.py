@@ -30,7 +30,7 @@ _SCOPE_FROM, _SCOPES = 6, 3
 
 
 def restrict(readable: Iterable[Path]) -> None:
-    """Forbid this process for good to open anything for writing, and anything but `readable` for reading.
+    """Permanently forbid this process to open files for writing, and files other than `readable` for reading.
 
     Proves the ban on a folder that is not among `readable`.
 
@@ -74,7 +74,7 @@ def restrict(readable: Iterable[Path]) -> None:
 
 
 def is_available() -> bool:
-    """Whether the kernel has Landlock."""
+    """Return whether the kernel has Landlock."""
     return sys.platform.startswith("linux") and _version(ctypes.CDLL(None, use_errno=True)) >= 1
 
 

@@ -97,7 +97,7 @@ def get_seen_layers() -> Mapping[str, str] | None:
 
 
 def are_layers_required() -> bool:
-    """Whether a log is to be refused where a layer is missing.
+    """Return whether a log is to be refused where a layer is missing.
 
     Raises:
         ConfigError: the environment variable holds another word.

@@ -111,7 +111,7 @@ def _drop(name: str) -> None:
 
 
 def _forget() -> None:
-    """In a fork of this process: its ends of the pipes are shared with its parent, and must not be used."""
+    """Forget the pipes in a fork of this process, which shares them with its parent and must not use them."""
     global _lock, _workers
     _lock = threading.RLock()
     # Not waited for: they are children of the parent process, not of this fork.

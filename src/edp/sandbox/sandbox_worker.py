@@ -175,7 +175,7 @@ def _obey(orders: socket.socket, forks: _Forks, serve: Serve, inherited: list[in
 
 
 def _order(orders: socket.socket) -> tuple[bytes, list[int]]:
-    """One line, and the pipes that came with it."""
+    """Return one line, and the pipes that came with it."""
     try:
         line, handles, _, _ = socket.recv_fds(orders, ORDER_BYTES, 2)
         while line and not line.endswith(b"\n"):

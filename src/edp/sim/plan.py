@@ -120,7 +120,7 @@ class DataSetSpec:
                 raise ConfigError(f"materials are given, but no family of mix works the ground; add one of {working}")
 
     def scenarios(self) -> tuple[Scenario, ...]:
-        """Equally long scenarios, each with its own seed derived from `seed`; only these seeds depend on it."""
+        """Return equally long scenarios, each with its own seed derived from `seed`; only these seeds depend on it."""
         seeds = np.random.SeedSequence(self.seed).spawn(self.recordings)
         excitations = hand_out(self.mix, self.recordings)
         soils = self._soils(excitations)

@@ -102,7 +102,7 @@ class LimitJob:
 
 
 def least_mae(values: Array) -> Array:
-    """Least mean absolute error of any guess of values like these, shape (branch, ...), over the branches.
+    """Return the least mean absolute error of any guess of values like these, shape (branch, ...), over the branches.
 
     The mean distance from the samples' own median is too small, because the median was fitted to them; the mean
     distance of each sample from the median of the others is too large, because that median is not the best guess. To
@@ -117,7 +117,7 @@ def least_mae(values: Array) -> Array:
 
 
 def branch_recording(job: LimitJob) -> Array:
-    """Errors at each moment of one recording, shape (moment, kind, horizon, target), m/s; kinds are `KINDS`."""
+    """Return errors at each moment of one recording, shape (moment, kind, horizon, target), m/s; kinds are `KINDS`."""
     simulation, spec = Simulation(job.scenario), job.spec
     root = np.random.SeedSequence(job.seed)
     errors = np.empty((len(job.moments), len(KINDS), len(spec.horizons), len(TARGETS)))
@@ -139,7 +139,7 @@ def branch_recording(job: LimitJob) -> Array:
 def _futures(
     simulation: Simulation, past: Array, spec: LimitSpec, seed: np.random.SeedSequence, commands_known: bool
 ) -> Array:
-    """Measured velocities now and at the horizons in each future, shape (branch, 1 + horizon, target), m/s."""
+    """Return measured velocities now and at the horizons in each future, shape (branch, 1 + horizon, target), m/s."""
     snapshot = simulation.snapshot()
     length = spec.horizons[-1] + 1
     rows = simulation.run(length)
@@ -270,7 +270,7 @@ def branch_unit(identity: TrainingIdentity, where: Table) -> WithState:
 
 
 def _confidence(parts: Sequence[Array], rng: np.random.Generator) -> tuple[Array, Array]:
-    """Percentile bounds of the mean by resampling recordings; moments, where there is one recording."""
+    """Return the percentile bounds of the mean by resampling recordings; moments, where there is one recording."""
     # Moments of one recording depend on one another, so whole recordings are drawn where there are several.
     units = parts if len(parts) > 1 else [moment[None] for moment in parts[0]]
     sums = np.stack([unit.sum(axis=0) for unit in units])

@@ -61,7 +61,7 @@ def read_scenario_file(path: str | Path) -> dict[str, object]:
 
 
 def scenario_changes(overrides: Sequence[str]) -> dict[str, object]:
-    """Values of ``key.path=value`` overrides of a scenario file, in the form of `read_scenario_file`.
+    """Return the values of ``key.path=value`` overrides of a scenario file, in the form of `read_scenario_file`.
 
     Raises:
         ConfigError: a key that a scenario file does not have, or a value of another kind.
@@ -90,7 +90,7 @@ def _merge_overrides(overrides: Sequence[str]) -> dict[str, object]:
 
 
 def suffix_of(form: str) -> str:
-    """``parquet`` or ``.parquet`` to ``.parquet``."""
+    """Return ``parquet`` or ``.parquet`` to ``.parquet``."""
     return f".{form.lstrip('.')}"
 
 

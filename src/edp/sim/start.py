@@ -17,7 +17,7 @@ START_CLEARANCE_M, START_TRIES = 0.3, 100
 
 
 def seeds_of(scenario: Scenario) -> list[np.random.SeedSequence]:
-    """Seeds of start, operator, sensors, soil and faults, in this order."""
+    """Return the seeds of start, operator, sensors, soil and faults, in this order."""
     # The order is fixed: another one would give other recordings for the same seed.
     return np.random.SeedSequence(scenario.seed).spawn(5)
 

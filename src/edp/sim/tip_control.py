@@ -42,7 +42,7 @@ def progress(time: float, length: float, ramp: float) -> float:
 
 @compiled
 def inverse_lever(speed: float, speeds: Array, levers: Array, rest: float) -> float:
-    """Lever for a cylinder speed (m/s); `speeds` and `levers` have rows for extension and retraction."""
+    """Return the lever for a cylinder speed (m/s); `speeds` and `levers` have rows for extension and retraction."""
     size = abs(speed)
     if size < rest:
         return 0.0
@@ -72,7 +72,7 @@ def reference(leg: Array, time: float, ramp: float, setup: tuple[Any, ...], reac
 def control(
     leg: Array, strokes: Array, queue: Array, memory: Array, gains: Array, setup: tuple[Any, ...], targets: Array
 ) -> None:
-    """Levers of one control step into `targets`, shape (samples, 3), in a straight line from the last ones.
+    """Write the levers of one control step to `targets`, shape (samples, 3), linearly from the last levers.
 
     `queue` holds reference strokes (shares), the oldest belonging to now; `setup` is the curves of `inverse_lever`
     for each axis, `axes`, `plant`, `pose.joint_limits` and scratch of `pose.REACHED_VALUES`.

@@ -15,7 +15,7 @@ Mask: TypeAlias = NDArray[np.bool_]
 
 
 def finite(values: ArrayLike, what: str, axes: int) -> Array:
-    """`values` in double precision with at least `axes` axes.
+    """Return `values` in double precision with at least `axes` axes.
 
     Raises:
         DataError: too few axes, an empty axis, or values that are not finite.
@@ -50,7 +50,7 @@ def check_tested_mask(tested: ArrayLike | None, shape: tuple[int, ...]) -> Mask:
 
 
 def check_tested_cells(differences: ArrayLike, tested: ArrayLike | None) -> tuple[Array, Mask]:
-    """Differences ``(..., run, session)``, zero outside the tested cells, and the mask of these.
+    """Return the differences ``(..., run, session)``, zero outside the tested cells, and the mask of these.
 
     Runs and sessions without a cell, as a design that is not finished has, are left out of both.
 
@@ -69,7 +69,9 @@ def check_tested_cells(differences: ArrayLike, tested: ArrayLike | None) -> tupl
 
 
 def lower_p(mean: Array, error: Array, df: float) -> tuple[Array, Array]:
-    """Statistic and one-sided p-value for a mean below zero; equal differences have no error and speak for themselves.
+    """Return the statistic and one-sided p-value for a mean below zero.
+
+    Equal differences have no error and speak for themselves.
 
     Where the error is zero the p-value is 0 for a negative mean and 1 otherwise: a module that changes nothing,
     to the last bit, is no improvement.

@@ -36,14 +36,14 @@ class MeanTest:
         return two_sided_p(self.statistic, self.df)
 
     def interval(self, level: float = 0.95) -> tuple[Array, Array]:
-        """Two-sided interval of the mean at `level`."""
+        """Return two-sided interval of the mean at `level`."""
         tail = 0.5 + 0.5 * level
         reach = (ndtri(tail) if np.isinf(self.df) else stdtrit(self.df, tail)) * self.error
         return np.asarray(self.mean - reach), np.asarray(self.mean + reach)
 
 
 def clustered_t(differences: ArrayLike, tested: ArrayLike | None = None) -> MeanTest:
-    """Two-way clustered t-test over sessions and training runs.
+    """Return two-way clustered t-test over sessions and training runs.
 
     Cells of one session share its difficulty for the module, cells of one run share its weights; a cell is in one
     of each, so both variances add and what they count twice comes off. With e the differences less their mean, N

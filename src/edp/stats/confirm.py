@@ -140,7 +140,7 @@ class _Cells:
 
 
 def _evidence(name: str, cells: _Cells, dropped: int, adjusted: float, rule: Rule) -> ModuleEvidence:
-    """All figures on one module."""
+    """Return all figures on one module."""
     module, baseline, mask = cells.module, cells.baseline, cells.mask
     difference = module - baseline
     reference = float(baseline[mask].mean())
@@ -185,7 +185,7 @@ def _evidence(name: str, cells: _Cells, dropped: int, adjusted: float, rule: Rul
 
 
 def _reason(change: tuple[float, float, float], adjusted: float, dropped: int, p: float, rule: Rule) -> str:
-    """Why a module is in or out, with the figures."""
+    """Return why a module is in or out, with the figures."""
     middle, low, high = change
     figures = f"{percent(middle, signed=True)} ({percent_interval(low, high)})"
     if dropped:

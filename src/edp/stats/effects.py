@@ -29,7 +29,7 @@ class EffectSize:
 
 
 def cohens_dz(differences: ArrayLike) -> Array:
-    """d_z over the last axis, ``(..., split)``; zero where all differences are zero.
+    """Return the d_z over the last axis, ``(..., split)``; zero where all differences are zero.
 
     Raises:
         DataError: fewer than two splits or values that are not finite.
@@ -45,7 +45,7 @@ def cohens_dz(differences: ArrayLike) -> Array:
 
 
 def effect_size(differences: ArrayLike, level: float = 0.95) -> EffectSize:
-    """d_z of one list of split differences, with its interval.
+    """Return the d_z of one list of split differences, with its interval.
 
     Raises:
         DataError: see `cohens_dz`.
@@ -55,7 +55,7 @@ def effect_size(differences: ArrayLike, level: float = 0.95) -> EffectSize:
 
 
 def effect_interval(d_z: float, splits: int, level: float = 0.95) -> EffectSize:
-    """Interval of a d_z that was measured on `splits` splits: the noncentralities that would just yield its t.
+    """Return interval of a d_z that was measured on `splits` splits: the noncentralities that would just yield its t.
 
     Raises:
         DataError: fewer than two splits.

@@ -100,7 +100,7 @@ def _check_runs(names: tuple[str, ...], runs: int | None) -> int:
 
 
 def _regular(factors: int, runs: int) -> Mask:
-    """Columns of odd weight; greedily the one that adds the fewest words of four letters."""
+    """Return the columns of odd weight; greedily the one that adds the fewest words of four letters."""
     words = [word for word in range(1, runs) if word.bit_count() % 2]
     basic = [1 << bit for bit in range(runs.bit_length() - 1)]
     chosen = basic[:factors]
@@ -127,7 +127,7 @@ def _repair_runs(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
 
 
 def _exchange_levels(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
-    """Flip a level of a run, or move it within a group, as long as this lowers the cost."""
+    """Return the flip a level of a run, or move it within a group, as long as this lowers the cost."""
     best, cost = levels.copy(), float(_quality(levels, groups)[0])
     moves: list[tuple[int, ...]] = [(factor,) for factor in range(levels.shape[1])]
     moves += sorted(pair for group in groups for pair in combinations(group, 2))

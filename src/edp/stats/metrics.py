@@ -56,13 +56,13 @@ class Spread:
 
 
 def composite(mae: float, rmse: float, p95: float, p99: float) -> float:
-    """Weighted sum 0.4 MAE + 0.15 RMSE + 0.25 P95 + 0.20 P99, thesis eq. 3.41."""
+    """Return the weighted sum 0.4 MAE + 0.15 RMSE + 0.25 P95 + 0.20 P99, thesis eq. 3.41."""
     weights = COMPOSITE_WEIGHTS
     return weights["mae"] * mae + weights["rmse"] * rmse + weights["p95"] * p95 + weights["p99"] * p99
 
 
 def score(prediction: ArrayLike, truth: ArrayLike) -> Scores:
-    """Scores of one output.
+    """Return the scores of one output.
 
     Sums and percentiles are exact and in double precision. Beside its arguments it holds two double-precision
     arrays of their length (16 bytes per sample).
@@ -111,7 +111,7 @@ def interval_scores(lower: ArrayLike, upper: ArrayLike, truth: ArrayLike) -> tup
 
 
 def interval_score(lower: ArrayLike, upper: ArrayLike, truth: ArrayLike, coverage: float) -> float:
-    """Mean interval score: width, plus ``2 / (1 - coverage)`` times the distance of a true value outside.
+    """Return the mean interval score: width, plus ``2 / (1 - coverage)`` times the distance of a true value outside.
 
     Least in expectation where the bounds are the true quantiles (Gneiting and Raftery 2007, eq. 43).
 
@@ -133,7 +133,7 @@ def interval_score(lower: ArrayLike, upper: ArrayLike, truth: ArrayLike, coverag
 
 
 def weighted_interval_score(mae: float, scores: Mapping[float, float]) -> float:
-    """Weighted interval score of a median and its intervals, in the unit of both.
+    """Return the weighted interval score of a median and its intervals, in the unit of both.
 
     ``(mae / 2 + sum over intervals of (1 - coverage) / 2 score) / (1/2 + their number)``: the pinball loss, mean over
     the levels of median and bounds, times two. It is the mean absolute error of a prediction without intervals, and
@@ -148,7 +148,7 @@ def weighted_interval_score(mae: float, scores: Mapping[float, float]) -> float:
 
 
 def mean_scores(scores: Sequence[Scores]) -> Scores:
-    """Mean over outputs (the thesis's mean over cylinders); `count` is the sum.
+    """Return the mean over outputs (the thesis's mean over cylinders); `count` is the sum.
 
     `r2` is None as soon as one output has none: a mean over the others would not compare with another run's.
 
@@ -171,7 +171,7 @@ def mean_scores(scores: Sequence[Scores]) -> Scores:
 
 
 def spread(values: Sequence[float]) -> Spread:
-    """Median, quartiles, extremes and sample standard deviation (n - 1) of repeated measurements.
+    """Return the median, quartiles, extremes and sample standard deviation (n - 1) of repeated measurements.
 
     Raises:
         DataError: `values` is empty or holds NaN or infinite values.
@@ -183,7 +183,7 @@ def spread(values: Sequence[float]) -> Spread:
 
 
 def _vector(values: ArrayLike, what: str) -> NDArray[np.generic]:
-    """`values` as a non-empty, finite, one-dimensional array."""
+    """Return `values` as a non-empty, finite, one-dimensional array."""
     array = np.asarray(values)
     if array.ndim != 1:
         raise DataError(f"the {what} has shape {array.shape}; give one output at a time, as a one-dimensional array")
@@ -200,7 +200,7 @@ def _vector(values: ArrayLike, what: str) -> NDArray[np.generic]:
 
 
 def _r2(squared_errors: float, truth: NDArray[np.generic]) -> float | None:
-    """1 - residual / total sum of squares, or None where the truth does not vary."""
+    """Return 1 - residual / total sum of squares, or None where the truth does not vary."""
     # Asked of the values themselves: the mean of a constant may differ from it by rounding.
     if truth.min() == truth.max():
         return None

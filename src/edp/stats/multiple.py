@@ -39,7 +39,7 @@ def holm(p: ArrayLike) -> Array:
 
 
 def adjust_registered(p: Mapping[str, float], registered: Iterable[str]) -> dict[str, float]:
-    """Benjamini-Hochberg over all registered modules; one that was dropped before its test enters with p = 1.
+    """Apply Benjamini-Hochberg to all registered modules; a module without a test has p = 1.
 
     Adjusting only for the survivors of a screening would forget that the others were tried on the same sessions.
 

@@ -10,7 +10,7 @@ from edp.stats.checks import Array, check_tested_mask
 
 
 def fill_worst(scores: ArrayLike, tested: ArrayLike | None = None, worst: ArrayLike | None = None) -> Array:
-    """Scores of all arms with each planned cell that is missing or diverged set to the session's worst.
+    """Return the scores of all arms with each planned cell that is missing or diverged set to the session's worst.
 
     Leaving such a pair out would reward the arm that fails where it is hard. An infinite score would decide a
     mean alone. So a failed cell gets the largest finite score that any arm had on that session, or `worst`, where

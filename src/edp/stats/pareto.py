@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 
 def pareto(points: Sequence[Sequence[float]]) -> list[int]:
-    """Places of the points that no other one betters in one value without being worse in another, in order."""
+    """Return places of the points that no other one betters in one value without being worse in another, in order."""
     optimal = []
     for index, point in enumerate(points):
         better = (

@@ -36,7 +36,7 @@ class ConfirmationPlan:
 
 
 def power(delta: float, variance: PairedVariance, sessions: int, runs: float, folds: int, alpha: float) -> float:
-    """Power of the clustered t-test in closed form, from the noncentral t-distribution.
+    """Return the power of the clustered t-test in closed form, from the noncentral t-distribution.
 
     Args:
         delta: improvement of the mean score to be seen, above zero.
@@ -65,7 +65,7 @@ def plan_runs(
     target: float = 0.80,
     most: int = 200,
 ) -> ConfirmationPlan:
-    """Smallest number of runs, in whole repeats of the folds, that reaches the target power.
+    """Return the smallest number of runs, in whole repeats of the folds, that reaches the target power.
 
     With several modules give ``alpha / modules``: the first step of Benjamini-Hochberg, which a single true module
     among null ones has to pass.
@@ -110,7 +110,7 @@ def plan_runs(
 
 
 def _sessions_needed(delta: float, variance: PairedVariance, folds: int, alpha: float, target: float) -> int | None:
-    """Smallest number of sessions with which endlessly many runs reach the target; None above 10,000."""
+    """Return the smallest number of sessions with which endlessly many runs reach the target; None above 10,000."""
     # Bisection: the power rises with the sessions.
     low, high = folds, 10_000
     if power(delta, variance, high, math.inf, folds, alpha) < target:
@@ -145,7 +145,7 @@ def simulated_power(
     repetitions: int = 2000,
     seed: int = 0,
 ) -> float:
-    """Power of the clustered t-test by Monte Carlo on the very cells that a study would fill.
+    """Return the power of the clustered t-test by Monte Carlo on the very cells that a study would fill.
 
     Args:
         delta: improvement, in the unit of the scores.

@@ -109,7 +109,7 @@ def race_rates(
     repetitions: int = 2000,
     seed: int = 0,
 ) -> RaceRates:
-    """Error rates of a race by Monte Carlo on the cells of a design: alpha at ``delta = 0``, power above.
+    """Return the error rates of a race by Monte Carlo on the cells of a design: alpha at ``delta = 0``, power above.
 
     Args:
         delta: improvement, in the unit of the scores.

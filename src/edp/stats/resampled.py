@@ -14,7 +14,7 @@ from edp.stats.clustered import MeanTest
 
 
 def resampled_t(differences: ArrayLike, test_over_train: float) -> MeanTest:
-    """Nadeau and Bengio's corrected resampled t-test (2003), one-sided.
+    """Return the nadeau and Bengio's corrected resampled t-test (2003), one-sided.
 
     ``t = mean / (s_d sqrt(1 / J + n_test / n_train))`` with J - 1 degrees of freedom: splits that share training
     data are not independent, and 1 / J alone would let any difference become significant by more splits.

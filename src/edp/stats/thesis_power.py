@@ -32,7 +32,7 @@ class ThesisPlan:
 def thesis_splits_analytical(
     delta: float, sigma_seed: float, seeds: int, alpha: float = 0.05, power: float = 0.80
 ) -> float:
-    """Eq. 2.21: ``((z_{1-alpha} + z_{1-beta}) sigma_seed / sqrt(S) / delta)^2``.
+    """Return the eq. 2.21: ``((z_{1-alpha} + z_{1-beta}) sigma_seed / sqrt(S) / delta)^2``.
 
     A paired difference of two runs has twice the seeds' variance, and a module may suit one split and not
     another; neither is in the formula, so it plans too few splits. `plan_runs` has both.

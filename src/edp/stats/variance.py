@@ -48,7 +48,7 @@ def thesis_variance(scores: ArrayLike) -> SplitVariance:
 
 
 def split_variance(scores: ArrayLike, level: float = 0.95) -> SplitVariance:
-    """Variance components of one arm by analysis of variance, with intervals.
+    """Return the variance components of one arm by analysis of variance, with intervals.
 
     The seed variance is pooled over the splits, its interval exact for normal scores. The split variance is the
     variance of the split means less their share of the seeds'; its interval is Graybill and Wang's (1980). With
@@ -92,7 +92,7 @@ class _MeanSquare:
 
 
 def _difference_interval(first: _MeanSquare, second: _MeanSquare, tail: float) -> tuple[float, float]:
-    """Interval for the difference of two expected mean squares."""
+    """Return the interval for the difference of two expected mean squares."""
     from scipy.stats import f as f_distribution  # late: see edp.stats.effects
 
     between, df1, within, df2 = first.value, first.freedom, second.value, second.freedom
@@ -143,7 +143,7 @@ class PairedVariance:
     cell: float = 0.0
 
     def of_mean(self, sessions: int, runs: float, cells_per_run: float) -> float:
-        """Variance of the mean difference: ``sigma_h^2 / R + (run + cell / cells) / n_runs``."""
+        """Return the variance of the mean difference: ``sigma_h^2 / R + (run + cell / cells) / n_runs``."""
         return self.session / sessions + (self.run + self.cell / cells_per_run) / runs
 
 

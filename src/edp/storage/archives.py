@@ -325,7 +325,7 @@ def _wide(extra: bytes, size: int, packed: int, at: int) -> tuple[int, int, int]
 
 
 def _is_inside(name: str) -> bool:
-    """Whether a name stays inside the folder it is unpacked into, on every system."""
+    """Return whether a name stays inside the folder it is unpacked into, on every system."""
     parts = name.removesuffix("/").split("/")
     return (
         len(name) <= _LONGEST_NAME

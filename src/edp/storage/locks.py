@@ -90,7 +90,10 @@ def holding(path: str | Path, what: str) -> Iterator[None]:
 
 
 def still_ours(path: str | Path, stream: IO[str]) -> bool:
-    """Whether the file at `path` is the one that `hold` locked; it is not once somebody removed or replaced it."""
+    """Return whether the file at `path` is the one that `hold` locked.
+
+    It is not once somebody removed or replaced it.
+    """
     try:
         there, here = os.lstat(path), os.fstat(stream.fileno())
     except FileNotFoundError:
@@ -101,7 +104,7 @@ def still_ours(path: str | Path, stream: IO[str]) -> bool:
 
 
 def release(path: str | Path, stream: IO[str]) -> None:
-    """Free a lock and remove its file, where it is still ours; who waits for it locks a new one."""
+    """Release a lock and remove its file if it is still ours; waiting processes lock a new file."""
     ours = still_ours(path, stream)
     if os.name != "nt" and ours:
         Path(path).unlink(missing_ok=True)  # first, so that nobody can lock what is about to go

@@ -124,7 +124,7 @@ def read_object(
 
 
 def object_with(value: Any, keys: Iterable[str], where: str, error: type[Exception] = StorageError) -> Table:
-    """`value`, which is checked to be an object with these keys.
+    """Return `value`, which is checked to be an object with these keys.
 
     Raises:
         Exception: `error`; the message says what it is, or which keys it lacks.

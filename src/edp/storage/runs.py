@@ -34,7 +34,7 @@ PARTS = "parts"
 
 
 def run_key(config: Mapping[str, object], data_digest: str) -> str:
-    """Content address of a run: equal settings, data and code version give an equal key."""
+    """Return content address of a run: equal settings, data and code version give an equal key."""
     plain = {"config": config, "data": data_digest, "edp": __version__}
     text = json.dumps(plain, sort_keys=True, allow_nan=False, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
@@ -111,7 +111,7 @@ class Run:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Free the lock."""
+        """Release the lock."""
         self._lock.close()
 
     def file(self, name: str) -> Path:

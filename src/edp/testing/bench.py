@@ -41,7 +41,7 @@ def bench_grey_box(**options: Any) -> GreyBox:
 
 
 def bench_series(ticks: int = 800, seed: int = 0) -> Series:
-    """Levers held for 0.4 s each ``(ticks, 1)``, and values between `LOWEST` and `HIGHEST` ``(ticks, 5)``."""
+    """Return levers held for 0.4 s each ``(ticks, 1)``, and values between `LOWEST` and `HIGHEST` ``(ticks, 5)``."""
     rng = np.random.default_rng(seed)
     lever = np.repeat(rng.uniform(-1, 1, ticks // 40 + 1), 40)[:ticks]
     targets = rng.uniform(np.array(LOWEST), np.array(HIGHEST), (ticks, 5))

@@ -61,7 +61,7 @@ def sample_grey_box(machine: str = "M22", is_fitted: bool = False) -> TwinBundle
 
 
 def _sample(machine: str) -> tuple[TwinChannels, TwinScales, list[Series]]:
-    """Channels, scales and series of two minutes of a simulated machine."""
+    """Return the channels, scales and series of two minutes of a simulated machine."""
     recordings = [
         simulate(Scenario(machine=machine, excitation=way, duration_s=SECONDS, seed=seed))
         for seed, way in enumerate(WAYS)

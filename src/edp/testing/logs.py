@@ -24,7 +24,7 @@ HEAD_BYTES = 4096
 
 
 def sample_recording(rate_hz: float = 100.0, ticks: int = 400) -> Recording:
-    """Three channels of the vocabulary, of sizes from 0.1 to 1e7."""
+    """Return three channels of the vocabulary, of sizes from 0.1 to 1e7."""
     channels = tuple(TABLE_A1[name] for name in ("CylVels_1", "CylPressures_1", "BmUp"))
     # Sizes from 0.1 to 1e7 show whether a format keeps the digits of each channel.
     values = np.random.default_rng(0).standard_normal((ticks, 3)) * np.array([0.1, 1e7, 1e6])
@@ -94,7 +94,7 @@ def check_damage(form: LogFormat) -> None:
 
 
 def check_log_format(form: LogFormat) -> None:
-    """Everything that EDP relies on of a log format.
+    """Check the contract of a log format.
 
     Args:
         form: an object like those that are entered with ``FORMATS.register("name")``.

@@ -93,7 +93,7 @@ def check_order_of_streams(loss: str, output: str) -> None:
 
 
 def check_masked_ticks(loss: str, output: str) -> None:
-    """Ticks that do not count do not matter."""
+    """Check that masked samples have no effect."""
     network = loss_network(output)
     x, future, valid = loss_batch()
     # A value far from all others: a masked tick that leaks shows at once.
@@ -128,7 +128,7 @@ def check_least_value(loss: str, output: str) -> None:
 
 
 def check_loss(loss: type[Any]) -> None:
-    """Everything that EDP relies on of a main loss, with every output that it trains.
+    """Check the contract of a main loss with every output that it trains.
 
     Args:
         loss: a class entered with ``@LOSSES.register("name")``.

@@ -18,7 +18,7 @@ RIG = (
 
 
 def rig_sessions(count: int, ticks: int, seed: int = 0, rate_hz: float = 100.0, first: int = 0) -> list[Recording]:
-    """Healthy sessions of a linear rig with sensor noise, all channels of `RIG` in SI units.
+    """Return the healthy sessions of a linear rig with sensor noise, all channels of `RIG` in SI units.
 
     Args:
         count: number of sessions.

@@ -139,7 +139,7 @@ def check_space(block: type[Any]) -> None:
 
 
 def check_block(block: type[Any], **options: Any) -> None:
-    """Everything that EDP relies on of a structural module, with every backbone that offers its slot.
+    """Check the contract of a structural module with every backbone that offers its slot.
 
     Args:
         block: a class entered with ``@BLOCKS.register("name")``.

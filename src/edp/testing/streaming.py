@@ -42,13 +42,13 @@ def draw_inputs(predictor: Predictor, batch: int = 2, ticks: int = TICKS, seed: 
 
 
 def run_network(predictor: Predictor, x: Tensor, state: State | None = None) -> tuple[Tensor, State]:
-    """Standardised predictions and the next state, from reset or from a state; no gradients."""
+    """Return the standardised predictions and the next state, from reset or from a state; no gradients."""
     with torch.no_grad():
         return predictor(x, predictor.initial_state(len(x), x) if state is None else state)
 
 
 def check_shapes(predictor: Predictor) -> None:
-    """Predictions have the shape and type of the contract, the state keeps its own; encoding undoes decoding.
+    """Check shape and type of predictions and state, and that encoding undoes decoding.
 
     Args:
         predictor: predictor in single precision.
@@ -74,7 +74,7 @@ def check_shapes(predictor: Predictor) -> None:
 
 
 def check_causality(predictor: Predictor) -> None:
-    """No prediction depends on a later tick, and the present tick is read.
+    """Check that no prediction depends on a later sample, and that the present sample is read.
 
     Args:
         predictor: predictor in double precision, in evaluation mode.
@@ -162,7 +162,7 @@ def check_determinism(predictor: Predictor) -> None:
 
 
 def check_batch(predictor: Predictor) -> None:
-    """Streams side by side do not meet.
+    """Check that parallel streams do not affect each other.
 
     Args:
         predictor: predictor in double precision, in evaluation mode.
@@ -271,7 +271,7 @@ def check_graph_costs(predictor: Predictor) -> None:
 
 
 def check_network(predictor: Predictor) -> None:
-    """All of these contracts.
+    """Check all contracts of this module.
 
     Args:
         predictor: any network; it is left as it is.
@@ -291,7 +291,7 @@ def check_network(predictor: Predictor) -> None:
 
 
 def _layout(state: State) -> list[tuple[torch.Size, torch.dtype]]:
-    """Shapes and types of a state's tensors, in their order."""
+    """Return the shapes and types of a state's tensors, in their order."""
     layout = []
 
     def note(tensor: Tensor) -> Tensor:

@@ -80,7 +80,7 @@ def check_names_refused(target: str, bundle: Bundle, folder: Path, options: Opti
 
 
 def check_export_target(target: type, **options: object) -> None:
-    """Everything that EDP relies on of an export target, on four small networks.
+    """Check the contract of an export target on four small networks.
 
     Args:
         target: a class entered with ``@TARGETS.register("name")``.

@@ -259,7 +259,7 @@ def _refusals(twin: Twin, commands: Array, measured: Array, state: TwinState, wh
 
 
 def sample_series(count: int) -> tuple[TwinChannels, list[Series]]:
-    """Several sample recordings as series of a twin."""
+    """Return the several sample recordings as series of a twin."""
     recordings = [sample_actuators(seed=seed) for seed in range(count)]
     channels = twin_channels(recordings[0])
     return channels, [channels.task().series(recording) for recording in recordings]

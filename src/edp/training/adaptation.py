@@ -54,7 +54,7 @@ def adapt(
     steps: Sequence[float],
     second_order: bool = False,
 ) -> Weights:
-    """``w <- w - rate * gradient of the support's loss``, once for each rate of `steps`.
+    """Return ``w <- w - rate * gradient of the support's loss``, once for each rate of `steps`.
 
     Args:
         net: the network.

@@ -43,7 +43,7 @@ class NoAverage:
         return factor
 
     def may_stop(self) -> bool:
-        """At any time."""
+        """Return True: training may stop at any time."""
         return True
 
 
@@ -67,7 +67,7 @@ class Exponential:
             raise ConfigError(f"ema: decay = {self.decay}; 0 < decay < 1 must hold (kind = 'none' averages nothing)")
 
     def step(self, update: int, updates: int) -> float:
-        """Towards the weights by ``1 - decay``, at first by ``9 / (10 + n)``."""
+        """Move the average towards the weights by ``1 - decay``, at first by ``9 / (10 + n)``."""
         # A young average would otherwise hold on to the random start.
         return 1.0 - min(self.decay, (1 + update) / (10 + update))
 
@@ -76,7 +76,7 @@ class Exponential:
         return factor
 
     def may_stop(self) -> bool:
-        """At any time."""
+        """Return True: training may stop at any time."""
         return True
 
 
@@ -114,5 +114,5 @@ class Stochastic:
         return self.rate if self.rate and update > self._begin(updates) else factor
 
     def may_stop(self) -> bool:
-        """Not before the average is whole."""
+        """Return whether the average is complete."""
         return False

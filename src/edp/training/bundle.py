@@ -96,7 +96,7 @@ def make_bundle(
 
 def weights_digest(predictor: Predictor) -> str:
     # Weights and formats together decide what an integer network computes; one without the other is another network.
-    """Content address of the weights of a predictor, and of their integer form."""
+    """Return content address of the weights of a predictor, and of their integer form."""
     state = hashlib.blake2b(_weights_bytes(predictor), digest_size=16)
     if isinstance(predictor, IntegerPredictor):
         state.update(repr(sorted(predictor.formats.fracs.items())).encode() + _integers_bytes(predictor))

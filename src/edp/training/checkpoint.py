@@ -179,7 +179,7 @@ def _check_digest(data: bytes) -> None:
 
 
 def _strip(value: Any, path: str, tensors: dict[str, Tensor]) -> Any:
-    """Plain JSON of a tree; its tensors go to `tensors` and leave a reference."""
+    """Return the plain JSON of a tree; its tensors go to `tensors` and leave a reference."""
     if isinstance(value, Tensor):
         tensors[path] = value.detach().cpu().contiguous()
         # The order in memory decides how a matrix product rounds; without it a resumed run drifts by a last bit.

@@ -28,7 +28,7 @@ class EagerAdamW(torch.optim.AdamW):
 
     @torch.no_grad()  # what the wrapper does besides, where the step is not itself differentiated
     def step(self, closure: Any = None) -> Any:
-        """One step; see `torch.optim.AdamW.step`."""
+        """Return one step; see `torch.optim.AdamW.step`."""
         return _adam_step(self, closure)
 
 
@@ -37,7 +37,7 @@ class EagerSgd(torch.optim.SGD):
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> Any:
-        """One step; see `torch.optim.SGD.step`."""
+        """Return one step; see `torch.optim.SGD.step`."""
         return _sgd_step(self, closure)
 
 

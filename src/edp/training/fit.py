@@ -233,7 +233,7 @@ class Loop:
         return self.refitted is None and 0 < self.spec.patience <= waited and self.spec.average.may_stop()
 
     def _batches(self) -> Iterator[Batch]:
-        """Exactly `updates` batches; the order depends on the seed and the epoch alone."""
+        """Return the exactly `updates` batches; the order depends on the seed and the epoch alone."""
         passes, batches = 0, 0
         while batches < self.updates:
             for batch in self.sampler.epoch(self.progress.epoch * 1000 + passes):  # orders of epochs do not meet
@@ -363,7 +363,7 @@ class Loop:
         }
 
     def _validate(self) -> tuple[float, float, float]:
-        """Standardised and reported mean absolute error of the averaged weights, and their loss."""
+        """Return the standardised and reported mean absolute error of the averaged weights, and their loss."""
         current_weights = {name: parameter.detach().clone() for name, parameter in self.net.named_parameters()}
         with torch.no_grad():
             for name, parameter in self.net.named_parameters():

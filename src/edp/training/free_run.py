@@ -247,7 +247,7 @@ def _load_checkpoint(
 
 
 def _is_stalled(progress: TrainingPosition, spec: FreeRunSpec, total: int) -> bool:
-    """Whether the last stage has gone on for too long without an improvement."""
+    """Return whether the last stage has gone on for too long without an improvement."""
     since = sum(row["update"] > progress.best_epoch for row in progress.history)
     judged = progress.history[-1]["update"] if progress.history else 0
     return bool(spec.patience) and since >= spec.patience and judged > total - spec.updates[-1]
@@ -325,7 +325,9 @@ class FreeRunValidation:
         self.commands, self.truth = runs.commands, runs.outputs
 
     def error(self) -> float:
-        """Error over the free runs in deviations: the geometric mean over actuators, of velocities and of strokes.
+        """Return the error over the free runs in deviations.
+
+        The geometric mean over actuators, of velocities and of strokes.
 
         By velocities alone weights are chosen that drift: their errors are mostly the sensors' noise, those of strokes
         are not.

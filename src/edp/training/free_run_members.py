@@ -152,7 +152,7 @@ def fit_members(
 
 
 def join_members(fits: Sequence[FittedTwin]) -> FittedTwin:
-    """Members that were trained apart, on one map and with one scale, as one twin.
+    """Return the members that were trained apart, on one map and with one scale, as one twin.
 
     Returns:
         The average, the rows of all trainings one behind the other (each with its ``member`` where there are

@@ -59,7 +59,7 @@ def fit_ground(
 
 
 def read_forces(twin: GreyTwin, series: Series) -> Log:
-    """Strokes (m), velocities (m/s) and forces (N) against each actuator ``(tick, actuator)`` along a log.
+    """Return the strokes (m), velocities (m/s) and forces (N) against each actuator ``(tick, actuator)`` along a log.
 
     Forces are `DisturbanceObserver`'s, told all channels tick by tick; ticks of the prefix have no row.
     """

@@ -85,7 +85,7 @@ def _backward(net: Predictor, spec: TrainingSpec) -> float:
 
 
 def _measure_saved(net: Predictor, ticks: int) -> int:
-    """Bytes of tensors that a forward pass of one stream keeps for the way back."""
+    """Return the bytes of tensors that a forward pass of one stream keeps for the way back."""
     like = next(net.parameters())
     counted_storages = {parameter.untyped_storage().data_ptr() for parameter in net.parameters()}
     total = 0

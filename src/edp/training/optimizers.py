@@ -24,7 +24,7 @@ class OptimizerSpec(Protocol):
         ...
 
     def remembers(self, shape: Sequence[int]) -> int:
-        """Numbers that it keeps for a parameter of this shape."""
+        """Return the numbers that it keeps for a parameter of this shape."""
         ...
 
 
@@ -62,7 +62,7 @@ class AdamW:
         return EagerAdamW(groups, lr=self.learning_rate, betas=(self.beta1, self.beta2), fused=True)
 
     def remembers(self, shape: Sequence[int]) -> int:
-        """Two means."""
+        """Return two means."""
         return 2 * math.prod(shape)
 
 
@@ -85,7 +85,7 @@ class Sgd:
         return EagerSgd([parameter for _, parameter in named], lr=self.learning_rate)
 
     def remembers(self, shape: Sequence[int]) -> int:
-        """Nothing."""
+        """Return an empty state."""
         return 0
 
 
@@ -129,7 +129,7 @@ class Discriminative:
         return EagerAdamW(groups, lr=self.learning_rate, betas=(self.beta1, self.beta2), fused=True)
 
     def remembers(self, shape: Sequence[int]) -> int:
-        """Two means."""
+        """Return two means."""
         return 2 * math.prod(shape)
 
     def _rate(self, name: str) -> float:
@@ -184,13 +184,13 @@ class Soap:
         )
 
     def remembers(self, shape: Sequence[int]) -> int:
-        """Two means, and two square matrices for each axis of a matrix or kernel."""
+        """Return two means, and two square matrices for each axis of a matrix or kernel."""
         # Vectors are not preconditioned: their matrices would have the square of their length.
         return 2 * math.prod(shape) + (2 * sum(size**2 for size in shape) if len(shape) > 1 else 0)
 
 
 def _decaying(named: Iterable[tuple[str, nn.Parameter]]) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
-    """Matrices, on which decay acts, and biases and gains, on which it does not."""
+    """Return the matrices, on which decay acts, and biases and gains, on which it does not."""
     matrices: list[nn.Parameter] = []
     vectors: list[nn.Parameter] = []
     for name, parameter in named:

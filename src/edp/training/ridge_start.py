@@ -82,7 +82,7 @@ def start_bypass(predictor: Predictor, train: Sequence[Series], validation: Sequ
 
 
 def _columns(task: Task) -> list[int]:
-    """Features that the regression reads, in order."""
+    """Return the features that the regression reads, in order."""
     features = task.features
     new = {entry.name for entry in features.derived if entry.source in features.hidden}
     # Derived columns of measured channels are sums of lags already; only those of hidden channels add something.

@@ -57,7 +57,7 @@ class Constant:
         return _ramp(progress, self.warmup)
 
     def observe(self, validation: float, state: ScheduleState) -> None:
-        """Nothing to remember."""
+        """Ignore the validation error."""
 
 
 @SCHEDULES.register("cosine")
@@ -85,7 +85,7 @@ class Cosine:
         return self.floor + (1.0 - self.floor) * 0.5 * (1.0 + math.cos(math.pi * min(1.0, done)))
 
     def observe(self, validation: float, state: ScheduleState) -> None:
-        """Nothing to remember."""
+        """Ignore the validation error."""
 
 
 @SCHEDULES.register("one_cycle")
@@ -112,7 +112,7 @@ class OneCycle:
         return _interpolate_cosine(1.0, self.floor, min(1.0, (progress - self.rise) / max(1e-9, 1.0 - self.rise)))
 
     def observe(self, validation: float, state: ScheduleState) -> None:
-        """Nothing to remember."""
+        """Ignore the validation error."""
 
 
 @SCHEDULES.register("plateau")

@@ -150,7 +150,7 @@ def to_gradient_training(spec: TrainingSpec) -> TrainingSpec:
 
 
 def thread_count(spec: TrainingSpec) -> int:
-    """CPU threads that a training uses."""
+    """Return the CPU threads that a training uses."""
     return spec.threads or os.cpu_count() or 1
 
 

@@ -46,7 +46,7 @@ def complete_tables(model: HistGradientBoostingRegressor, depth: int) -> Tables:
 
 
 def stack_tables(tables: Sequence[Tables], trees: int) -> Tables:
-    """Tables of several outputs, ``(output, tree, ...)``; missing trees give zero.
+    """Return the tables of several outputs, ``(output, tree, ...)``; missing trees give zero.
 
     Args:
         tables: tables of each output, with equal depth.
@@ -63,7 +63,7 @@ def stack_tables(tables: Sequence[Tables], trees: int) -> Tables:
 
 
 def _stack_rows(rows: Sequence[NDArray[_Number]], trees: int, fill: float) -> NDArray[_Number]:
-    """Rows of each output ``(output, tree, ...)``, with rows of `fill` where it has fewer."""
+    """Return the rows of each output ``(output, tree, ...)``, with rows of `fill` where it has fewer."""
     full = np.full((len(rows), trees, rows[0].shape[1]), fill, dtype=rows[0].dtype)
     for target, own in zip(full, rows, strict=True):
         target[: len(own)] = own

@@ -27,7 +27,7 @@ STARTS_A_STRETCH = 100
 def validation_scores(
     net: Predictor, series: Sequence[Series], spec: TrainingSpec, data: Prepared, windowed: bool = False
 ) -> tuple[float, float, float]:
-    """Mean absolute error in standard deviations, in report units, and the loss, streamed over `series`.
+    """Return the mean absolute error in standard deviations, in report units, and the loss, streamed over `series`.
 
     The loss is the main one, without weights and terms. With `windowed` every prediction is from reset over its window.
     """
@@ -96,7 +96,9 @@ def _answers(
 
 
 def standard_targets(net: Predictor, part: Series) -> Tensor:
-    """Targets of a whole series as the network is trained on them, ``(1, tick, horizon, output)``, double precision.
+    """Return the targets of a whole series as the network is trained on them, ``(1, tick, horizon, output)``.
+
+    Double precision.
 
     Ticks whose targets lie beyond the end are left out.
     """

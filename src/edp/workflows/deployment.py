@@ -128,7 +128,7 @@ def load_exported(path: str | Path) -> Bundle:
 
 
 def unheld_adaptation(path: str | Path, to: str) -> bool:
-    """Whether a bundle has an adaptation that the form `to` leaves out."""
+    """Return whether a bundle has an adaptation that the form `to` leaves out."""
     return load_exported(path).adaptation is not None and not getattr(TARGETS[to], "adapts", False)
 
 

@@ -106,7 +106,7 @@ class InversionController(Controller):
         self.model.begin(measured[: len(self.model.reads)], self.plant.commands(np.zeros(AXES)))
 
     def levers(self, measured: Array, tick: int) -> Array:
-        """Levers whose velocities ahead are the reference's, corrected by the error now."""
+        """Return the levers whose velocities ahead are the reference's, corrected by the error now."""
         if self._row is not None:
             # After the limits: what was given, not what was asked for.
             self.model.advance(self._row, self.plant.commands(self.before))
@@ -130,7 +130,7 @@ class InversionController(Controller):
             self.model.advance(self._row, self.plant.commands(self.before))
 
     def _solve_levers(self, speed: Array, row: Array) -> Array:
-        """Levers for wanted speeds, each axis with the others at the last solution."""
+        """Return the levers for wanted speeds, each axis with the others at the last solution."""
         low, high = np.array(self.limits.lever_low), np.array(self.limits.lever_high)
         tried = np.clip(self._solution[:, None] + self._offsets, low[:, None], high[:, None])
         candidates = np.repeat(self._solution[None], tried.size, axis=0)

@@ -109,7 +109,7 @@ class PredictiveControl:
             check_bounds("controller 'nmpc'", self, attitude_m=span(0.0, 1e3))
 
     def attitude_with(self, twin: Twin) -> float:
-        """`attitude_m` with this twin."""
+        """Return `attitude_m` with this twin."""
         if self.attitude_m is not None:
             return self.attitude_m
         return LOADED_ATTITUDE_M if twin.runner().resistance is not None else ATTITUDE_M
@@ -213,7 +213,7 @@ class NmpcController(Controller):
         return self._valves.levers(self._latest)
 
     def fallback(self, measured: Array, tick: int, reason: str) -> Array:
-        """Levers of the PI loop, while the twin's memory follows."""
+        """Return the levers of the PI loop, while the twin's memory follows."""
         fault = ControlFault(f"a guard does not trust the model{f' ({reason})' if reason else ''}")
         return self._give_up(self._update_models(measured, tick), tick, fault)
 
@@ -277,7 +277,7 @@ class NmpcController(Controller):
         self.info |= {"disturbance_1": first, "disturbance_2": second, "disturbance_3": third}
 
     def _normal(self, strokes: Array, steps: Array, tick: int) -> Array:
-        """Products of the derivatives of weighted tip errors by the variables, and of these with the errors.
+        """Return the products of the derivatives of weighted tip errors by the variables, and of these with the errors.
 
         Args:
             strokes: strokes of all runs, the base first, m, shape (variable + 1, tick, 3).
@@ -296,7 +296,7 @@ class NmpcController(Controller):
         return normal
 
     def _limits(self, strokes: Array, pressures: Array, steps: Array) -> tuple[Array, Array, Array]:
-        """Soft rows of the program at the ends of the blocks: strokes and pressures that come near a limit.
+        """Return the soft rows of the program at the ends of the blocks: strokes and pressures that come near a limit.
 
         Args:
             strokes: strokes of all runs, the base first, m, shape (variable + 1, tick, 3).
@@ -334,7 +334,10 @@ class NmpcController(Controller):
 
 
 def _speeds_ahead(reference: TipReference, moves: Moves) -> Array:
-    """Mean speeds of the reference's strokes in each block, for a plan from each tick, m/s, shape (tick, variable)."""
+    """Return the mean speeds of the reference's strokes in each block, for a plan from each tick, m/s.
+
+    Shape (tick, variable).
+    """
     strokes, last = reference.strokes, reference.ticks - 1
     now = np.arange(reference.ticks)[:, None]
     ends = now + 1 + moves.last_ticks
@@ -344,7 +347,10 @@ def _speeds_ahead(reference: TipReference, moves: Moves) -> Array:
 
 
 def _directions(reference: TipReference, along: float, attitude_m: float) -> Array:
-    """Rows that turn tip errors (x, y, attitude) to weighted ones across and along the path, shape (ticks, 3, 3)."""
+    """Return the rows that turn tip errors (x, y, attitude) to weighted ones across and along the path.
+
+    Shape (ticks, 3, 3).
+    """
     velocity = np.gradient(reference.tip[:, :2], 1.0 / reference.rate_hz, axis=0)
     speed = np.hypot(*velocity.T)
     moving = speed > FAST_TIP_M_S

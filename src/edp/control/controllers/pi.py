@@ -86,7 +86,7 @@ class PiController(Controller):
         return self._sum
 
     def levers(self, measured: Array, tick: int) -> Array:
-        """Inverse map of the speed that the reference has ahead, corrected by the error now."""
+        """Return the inverse map of the speed that the reference has ahead, corrected by the error now."""
         last = len(self._strokes) - 1
         error = self._strokes[min(tick, last)] - measured
         ahead = self._speeds[min(tick + self._lead, last)]

@@ -202,7 +202,7 @@ def _units(root: ET.Element) -> dict[str, dict[str, float]]:
 
 
 def _types(root: ET.Element, version: int) -> dict[str, str]:
-    """Units of declared types, by name."""
+    """Return the units of declared types, by name."""
     if version == 3:
         return {kind.get("name", ""): kind.get("unit", "") for kind in root.iterfind("TypeDefinitions/Float64Type")}
     pairs = ((kind, kind.find("Real")) for kind in root.iterfind("TypeDefinitions/SimpleType"))
@@ -210,7 +210,7 @@ def _types(root: ET.Element, version: int) -> dict[str, str]:
 
 
 def _window(root: ET.Element) -> int:
-    """Measured ticks of an exported twin, by its annotation."""
+    """Return the measured ticks of an exported twin, by its annotation."""
     for note in (*root.iterfind("VendorAnnotations/Tool/edp"), *root.iterfind("Annotations/Annotation/edp")):
         text = note.get("window", "")
         if REFERENCE.fullmatch(text):

@@ -47,7 +47,7 @@ class FmuBatch(ModelBatch):
         self._elapsed = [0] * count
 
     def close(self) -> None:
-        """Free the FMUs; afterwards they cannot run."""
+        """Unload the FMUs; afterwards they cannot run."""
         for fmu in self._fmus:
             fmu.close()
 
@@ -134,7 +134,7 @@ class FmuEnvironment(ModelEnvironment):
         super().__init__(FmuBatch(path, machine, duration_s, rate_hz))
 
     def close(self) -> None:
-        """Free the FMU; afterwards it cannot run."""
+        """Unload the FMU; afterwards it cannot run."""
         self._batch.close()
         self._idle = "has not begun"
 

@@ -87,7 +87,7 @@ class FmuInstance:
         self._call("set", lambda: put(references, values))
 
     def read(self, references: Sequence[int]) -> list[float]:
-        """Values of real variables.
+        """Return the values of real variables.
 
         Raises:
             SimulationError: it refuses.
@@ -105,7 +105,7 @@ class FmuInstance:
         self._call("doStep", lambda: self._fmu.doStep(at_s, size_s))
 
     def close(self) -> None:
-        """Free the instance and its files; repeated calls are allowed."""
+        """Unload the instance and remove its files; repeated calls are allowed."""
         if self._ending.alive:
             self._fmu.freeInstance()
             self._ending()

@@ -74,7 +74,7 @@ class TaskFeatures:
         self.names = (*names, *(f"{axis} lever of {spec.base}" for axis in axes if spec.base))
 
     def _scale(self, channel: Channel) -> tuple[float, float]:
-        """Offset and width by which a channel becomes about one."""
+        """Return the offset and width by which a channel becomes about one."""
         if channel.name in STROKES:
             half = 0.5 * float(self._geometry.full_m[STROKES.index(channel.name)])
             return half, half

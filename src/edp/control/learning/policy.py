@@ -92,7 +92,7 @@ class PolicyController(Controller):
         return np.asarray(np.clip(action, -1.0, 1.0))
 
     def missed(self, tick: int) -> None:
-        """Levers went back to neutral: they are remembered as they were applied."""
+        """Store the levers that were applied during a missed sample, on their way to neutral."""
         self.info = {}
         self._remember(tick)
 

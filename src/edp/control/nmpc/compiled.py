@@ -19,7 +19,7 @@ compiler = Compiler("control", lambda: (Path(__file__),))
 
 @compiler.inner
 def _interpolate(value: float, xs: Array, ys: Array, count: int) -> float:
-    """`np.interp` on the first `count` points; the end values beyond them."""
+    """Return `np.interp` on the first `count` points; the end values beyond them."""
     if value <= xs[0]:
         return float(ys[0])
     for i in range(1, count):
@@ -30,7 +30,7 @@ def _interpolate(value: float, xs: Array, ys: Array, count: int) -> float:
 
 @compiler.compiled
 def fill_levers(speeds: Array, xs: Array, ys: Array, counts: NDArray[np.int64], levers: Array) -> None:
-    """Levers of speeds by tables of both sides.
+    """Compute levers from speeds by the tables of both directions.
 
     Args:
         speeds: m/s, shape (rows, axis).
@@ -49,7 +49,7 @@ def fill_levers(speeds: Array, xs: Array, ys: Array, counts: NDArray[np.int64], 
 
 @compiler.compiled
 def fill_ways(targets: Array, before: Array, step: Array, last_ticks: NDArray[np.int64], levers: Array) -> None:
-    """Levers that go to the target of each block, by at most `step` a tick.
+    """Compute the levers on the way to the target of each block, with at most `step` per sample.
 
     Args:
         targets: shape (run, block, axis).
@@ -71,7 +71,7 @@ def fill_ways(targets: Array, before: Array, step: Array, last_ticks: NDArray[np
 
 @compiler.compiled
 def fill_poses(strokes: Array, angles: Array, full: Array, lengths: Array, tips: Array, jacobians: Array) -> None:
-    """Poses of the tip and their slopes, see `edp.control.nmpc.tip.TipTable`.
+    """Compute tip poses and their derivatives, see `edp.control.nmpc.tip.TipTable`.
 
     Args:
         strokes: m, shape (rows, axis).
@@ -149,7 +149,7 @@ def fill_limits(
     ends: tuple[Array, Array, float],
     room: tuple[Array, Array, Array],
 ) -> int:
-    """Rows of values that come near a limit; their number.
+    """Return the rows of values that come near a limit; their number.
 
     Args:
         values: values of all runs at the ends of the blocks, the base first, shape (variable + 1, block, number).

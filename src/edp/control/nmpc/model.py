@@ -69,7 +69,7 @@ class TwinModel:
         return np.zeros(AXES) if forces is None else np.asarray(forces[self._velocities])
 
     def begin(self, measured: Array) -> None:
-        """Form the memory as if the machine had rested with this row of `reads` and neutral levers."""
+        """Initialise the memory in steady state for this row of `reads` and neutral levers."""
         ticks = max(1, self.twin.prefix_ticks)
         command = np.asarray(self.plant.commands(np.zeros(AXES))[self._pilots], np.float32)
         row = self.row(measured)

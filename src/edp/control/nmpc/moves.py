@@ -51,7 +51,7 @@ class SpeedToLever:
         return self._tables
 
     def levers(self, speeds: Array) -> Array:
-        """Levers for speeds (m/s), shape (..., 3) both."""
+        """Return the levers for speeds (m/s), shape (..., 3) both."""
         levers = np.empty(speeds.shape)
         rows = np.ascontiguousarray(speeds).reshape(-1, AXES)
         fill_levers(rows, *self._packed, levers.reshape(-1, AXES))
@@ -59,7 +59,7 @@ class SpeedToLever:
 
 
 def _packed(tables: list[list[tuple[Array, Array]]]) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Speeds, levers ``(axis, side, point)``, and the points in use, of tables of different lengths."""
+    """Return the speeds, levers ``(axis, side, point)``, and the points in use, of tables of different lengths."""
     counts = np.array([[len(speeds) for speeds, _ in sides] for sides in tables], np.int64)
     arrays = np.zeros((2, *counts.shape, counts.max()))
     for axis, sides in enumerate(tables):
@@ -105,7 +105,7 @@ class Moves:
         return runs
 
     def levers(self, targets: Array, before: Array, step: Array) -> Array:
-        """Levers tick by tick that go to targets of each block at a bounded speed.
+        """Return the levers tick by tick that go to targets of each block at a bounded speed.
 
         Args:
             targets: shape (run, block, 3).

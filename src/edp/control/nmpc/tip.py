@@ -41,7 +41,7 @@ class TipTable:
         return self._angles
 
     def poses(self, strokes: Array) -> tuple[Array, Array]:
-        """Poses and Jacobians.
+        """Return the poses and Jacobians.
 
         Args:
             strokes: m, shape (..., 3); those beyond an end stop count as at the stop.

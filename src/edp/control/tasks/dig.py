@@ -65,5 +65,5 @@ class DigCycle(TaskSpec):
 
 
 def _tip_of(x: float, y: float, attitude: float, bucket: float) -> list[float]:
-    """Tip pose whose bucket pin is at x, y (m)."""
+    """Return the tip pose whose bucket pin is at x, y (m)."""
     return [x + bucket * math.cos(attitude), y + bucket * math.sin(attitude), attitude]

@@ -46,7 +46,7 @@ def progress(time_s: Array, length_s: float, ramp_s: float, law: str) -> Array:
 
 
 def duration_s(length: float, speed: float, ramp_s: float) -> float:
-    """Seconds of a way at a top speed with a ramp at either end; short ways are ramps only, and slower."""
+    """Return the seconds of a way at a top speed with a ramp at either end; short ways are ramps only, and slower."""
     return max(length / speed + ramp_s, 2.0 * ramp_s)
 
 

@@ -43,7 +43,7 @@ def dead_flags(table: CandidateTable) -> list[Flag]:
 
 
 def clock_flags(table: CandidateTable, live: Sequence[int]) -> list[Flag]:
-    """Channels that rise or fall throughout every recording."""
+    """Return the channels that rise or fall throughout every recording."""
 
     def of_channel(i: int) -> float:
         flags = []
@@ -147,7 +147,7 @@ def flag_broken(
 
 
 def _find_break(relation: Array, slope: Array, squares: Array) -> tuple[float, str] | None:
-    """Mean correlation where there is one, and in words how it breaks; None where it does not.
+    """Return the mean correlation where there is one, and in words how it breaks; None where it does not.
 
     Args:
         relation: correlation of channel and source, ``(stretch,)``.

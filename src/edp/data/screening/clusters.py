@@ -36,6 +36,6 @@ def clusters_of(spearman: Array, least: float) -> list[list[int]]:
 
 
 def least_of(spearman: Array, group: Sequence[int]) -> float:
-    """Smallest absolute rank correlation of two members."""
+    """Return the smallest absolute rank correlation of two members."""
     part = np.abs(spearman[np.ix_(group, group)])
     return float(part.min())

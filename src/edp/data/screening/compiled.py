@@ -26,7 +26,7 @@ compiled = compiler.compiled
 
 
 def threads() -> int:
-    """Processors that this process may use."""
+    """Return the processors that this process may use."""
     # Containers and schedulers may give a process fewer processors than the machine has.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 

@@ -70,7 +70,7 @@ class CopiedChannel:
 def find_leaks(
     names: Sequence[str], correlations: Array, trusted: Sequence[int], targets: Sequence[int], flagged: Sequence[int]
 ) -> list[Flag]:
-    """Channels that the future of a trusted channel explains.
+    """Return the channels that the future of a trusted channel explains.
 
     Args:
         names: channels.
@@ -168,7 +168,7 @@ def find_copies(correlations: Array, least: float) -> list[CopiedChannel]:
 
 
 def rest_related(correlations: Array, i: int, j: int, lag: int, value: float) -> float:
-    """Largest correlation of ``x_i[t] - value x_j[t - lag]`` with any channel but i, at any lag.
+    """Return the largest correlation of ``x_i[t] - value x_j[t - lag]`` with any channel but i, at any lag.
 
     Where i leads, also with the steps of the channels from sample to sample: what a reference tells of a machine that
     follows it shows there, however slow both are.
@@ -239,7 +239,7 @@ def _copy_flag(names: Sequence[str], pair: CopiedChannel, trusted: bool) -> Flag
 
 
 def flag_explained(names: Sequence[str], correlations: Array, judged: Sequence[int], base: Sequence[int]) -> list[Flag]:
-    """Channels that the presents and pasts of others make up, one after the other, so that something remains.
+    """Return channels that the presents and pasts of others make up, one after the other, so that something remains.
 
     Args:
         names: channels.

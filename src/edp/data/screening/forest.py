@@ -68,7 +68,7 @@ def rows_of(table: CandidateTable, pieces: Sequence[int], columns: Ints, count: 
 def _leaves(
     inputs: FloatArray, rows: Ints, swapped: Ints, columns: NDArray[np.bool_], tree: TreeArrays, out: Ints
 ) -> None:
-    """Leaf of each of `rows`; channels in `columns` are read from row ``swapped[row]`` instead."""
+    """Return the leaf of each of `rows`; channels in `columns` are read from row ``swapped[row]`` instead."""
     left, right, feature, threshold = tree
     for out_index in range(len(rows)):
         row = rows[out_index]

@@ -21,7 +21,7 @@ Orders = NDArray[np.int64]
 
 @compiled
 def _count_neighbours(values: Array, row: int, radius: float) -> int:
-    """How many other values of a sorted array are nearer than `radius` to the one at `row`."""
+    """Return how many other values of a sorted array are nearer than `radius` to the one at `row`."""
     # doubling steps, then halving ones
     n = len(values)
     centre = values[row]
@@ -56,7 +56,7 @@ def _closer(distance: float, nearest: Array) -> None:
 
 @compiled
 def _radius(x: Array, y: Array, row: int, nearest: Array) -> tuple[float, int]:
-    """Distance to the k-th neighbour of point `row`, and how many points are nearer in x alone.
+    """Return the distance to the k-th neighbour of point `row`, and how many points are nearer in x alone.
 
     Points are sorted by x; `nearest` is room for k values. First a few points to either side, then one side after the
     other for as long as x alone does not rule them out.

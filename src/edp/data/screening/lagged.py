@@ -105,7 +105,7 @@ class _Spectra:
         return np.ascontiguousarray(spectra.transpose(1, 0, 2), dtype=np.complex64)
 
     def back(self, product: NDArray[np.complex64]) -> FloatArray:
-        """From summed cross spectra ``(frequency, i, j)`` to sums at lags -reach to reach."""
+        """Transform summed cross spectra ``(frequency, i, j)`` to sums at lags -reach to reach."""
         flat = np.ascontiguousarray(product.reshape(len(product), -1).T)
         sums = scipy.fft.irfft(flat, n=self.size, axis=1)
         shown = np.concatenate([sums[:, -self.reach :], sums[:, : self.reach + 1]], axis=1)

@@ -17,7 +17,7 @@ Tap = tuple[int, int]
 
 
 def gram(correlations: Array, left: Sequence[Tap], right: Sequence[Tap]) -> Array:
-    """Correlations of delayed channels with delayed channels, ``(left, right)``.
+    """Return the correlations of delayed channels with delayed channels, ``(left, right)``.
 
     Args:
         correlations: ``[reach + lag, i, j]`` of ``x_i[t + lag]`` and ``x_j[t]``.
@@ -45,7 +45,7 @@ def unexplained(
 
 
 def peaks(correlations: Array, low: int, high: int) -> tuple[NDArray[np.int64], Array]:
-    """Lag of the largest absolute correlation of each pair between two lags, and the correlation there."""
+    """Return the lag of the largest absolute correlation of each pair between two lags, and the correlation there."""
     reach = len(correlations) // 2
     part = correlations[reach + low : reach + high + 1]
     best = np.abs(part).argmax(axis=0)

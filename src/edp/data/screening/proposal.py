@@ -80,7 +80,7 @@ class ScreeningEvidence:
 
 
 def noise_flags(evidence: ScreeningEvidence, judged: Sequence[str]) -> list[Flag]:
-    """Channels that neither relate to a target nor help a forest or a linear model, held out."""
+    """Return the channels that neither relate to a target nor help a forest or a linear model, held out."""
     flags = []
     for live_index, column in enumerate(evidence.live):
         name = evidence.table.names[column]
@@ -147,7 +147,7 @@ def redundant_flags(evidence: ScreeningEvidence, judged: Sequence[str], free: Se
 
 
 def _adds(evidence: ScreeningEvidence, name: str) -> bool:
-    """Whether the past of a channel takes away some of the error that the others leave, held out."""
+    """Return whether the past of a channel takes away some of the error that the others leave, held out."""
     gain, low = evidence.gain(name)
     return low > 0 and gain > NEGLIGIBLE
 
@@ -199,7 +199,7 @@ def propose(
 
 
 def _scores(evidence: ScreeningEvidence) -> dict[str, float]:
-    """Half the importance, a quarter each of correlation and information, each relative to the largest; 0 to 1.
+    """Return half the importance, a quarter each of correlation and information, each relative to the largest; 0 to 1.
 
     Correlation and information are penalised where they spread among the segments: times ``m / (m + s)``, with mean m
     and deviation s.

@@ -16,7 +16,7 @@ Orders = NDArray[np.int64]
 
 @compiled
 def _rank(values: FloatArray, order: Orders, ranks: FloatArray) -> None:
-    """Ranks from 1 with the mean of equal values, given the order that sorts."""
+    """Return ranks from 1 in the given sorting order; equal values have their mean rank."""
     n = len(values)
     start = 0
     while start < n:
@@ -30,7 +30,10 @@ def _rank(values: FloatArray, order: Orders, ranks: FloatArray) -> None:
 
 
 def ranks_of(values: FloatArray) -> FloatArray:
-    """Ranks of one channel, equal values sharing their mean rank; float32 (halves are exact up to 8 million rows)."""
+    """Return the ranks of one channel, equal values sharing their mean rank.
+
+    Float32 (halves are exact up to 8 million rows).
+    """
     values = np.ascontiguousarray(values)
     ranks = np.empty(len(values), dtype=np.float32)
     _rank(values, np.argsort(values), ranks)
@@ -38,7 +41,7 @@ def ranks_of(values: FloatArray) -> FloatArray:
 
 
 def rank_columns(values: FloatArray) -> FloatArray:
-    """Ranks of every column, ``(row, channel)``, stored a channel after another."""
+    """Return the ranks of every column, ``(row, channel)``, stored a channel after another."""
     ranks = spread(lambda i: ranks_of(values[:, i]), range(values.shape[1]))
     return np.stack(ranks).T
 
@@ -97,7 +100,7 @@ def _swaps(keys: NDArray[np.int32], spare: NDArray[np.int32]) -> float:
 
 @compiled
 def _tau(order: Orders, x: NDArray[np.int32], y: NDArray[np.int32], tied_x: float, tied_y: float) -> float:
-    """Kendall's tau-b; `order` sorts x."""
+    """Return Kendall's tau-b; `order` sorts x."""
     n = len(x)
     keys = np.empty(n, dtype=np.int32)
     start = 0
@@ -153,7 +156,7 @@ class Kendall:
 
 
 def correlation(stretches: Sequence[FloatArray], rows: int = 32_768) -> Array:
-    """Pearson's correlation of the columns over all rows, ``(channel, channel)``, summed in float64 (eq. 2.11)."""
+    """Return Pearson's correlation of the columns over all rows, ``(channel, channel)``, in float64 (eq. 2.11)."""
     samples = sum(len(s) for s in stretches)
     mean = sum(s.sum(axis=0, dtype=np.float64) for s in stretches) / samples
     moments = np.zeros((len(mean), len(mean)))

@@ -300,7 +300,10 @@ class ScreeningResult:
         return next(c for c in self.lags if (c.channel, c.target) == (channel, target))
 
     def lag_table(self) -> tuple[LagRange, ...]:
-        """Table 4.2 for this data: a row for each group with a certain lag; targets and flagged channels left out."""
+        """Return the table 4.2 for this data: a row for each group with a certain lag.
+
+        Targets and flagged channels left out.
+        """
         left_out = {*self.targets, *(flag.channel for flag in self.flags)}
         best: dict[str, LagCurve] = {}
         for curve in self.lags:
@@ -318,7 +321,7 @@ class ScreeningResult:
         return tuple(rows)
 
     def to_json(self) -> dict[str, object]:
-        """Plain JSON values: arrays as lists, a number that is not finite as None."""
+        """Return the plain JSON values: arrays as lists, a number that is not finite as None."""
         proposal = {"kept": list(self.proposal.kept), "dropped": list(self.proposal.dropped)}
         lag_table = json_value(self.lag_table())
         return {**json_value(self), "proposal": {**json_value(self.proposal), **proposal}, "lag_table": lag_table}

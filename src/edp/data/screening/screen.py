@@ -129,7 +129,7 @@ class _Measured:
 
 
 def _matrices(table: CandidateTable, spec: ScreeningSpec, clock: _Clock) -> Matrices:
-    """Dependencies at one instant; rows and columns of constant channels are NaN."""
+    """Return the dependencies at one instant; rows and columns of constant channels are NaN."""
     live = np.flatnonzero(table.live)
     stretches = [stretch for piece in table.pieces for stretch in piece.stretches]
     with clock.stage("correlation") as tell:
@@ -161,7 +161,10 @@ def _expand_matrix(table: CandidateTable, matrix: Array) -> Array:
 
 
 def list_trusted(table: CandidateTable, spec: ScreeningSpec) -> set[str]:
-    """Channels known to be measured on the machine: targets, the names of Table A.1, and those that the user names."""
+    """Return the channels known to be measured on the machine.
+
+    Targets, the names of Table A.1, and those that the user names.
+    """
     return {*(table.names[i] for i in table.targets), *spec.trusted, *TABLE_A1}
 
 
@@ -197,7 +200,7 @@ def _evidence(
     used: list[int],
     clock: _Clock,
 ) -> ScreeningEvidence:
-    """Multivariate figures of the channels without a flag, and the tests of all live ones."""
+    """Return the multivariate figures of the channels without a flag, and the tests of all live ones."""
     spearman = measured.matrices.spearman
     columns = np.array(used, dtype=np.int64)
     targets = np.searchsorted(lagged.live, table.targets)
@@ -240,7 +243,10 @@ def _evidence(
 def _clusters(
     table: CandidateTable, spearman: Array, columns: NDArray[np.int64], groups: list[list[int]], linear: Array
 ) -> list[Cluster]:
-    """Clusters of two or more; a target speaks for its cluster, else a name of Table A.1, else the best correlated."""
+    """Return the clusters of two or more; a target speaks for its cluster, else a name of Table A.1.
+
+    Else the best correlated.
+    """
     clusters = []
     for group in groups:
         # One channel is no cluster.

@@ -78,7 +78,7 @@ def piece_rows(table: CandidateTable, piece_index: int, spec: ScreeningSpec) -> 
 
 
 def _metrics(channels: FloatArray, targets: FloatArray, spec: ScreeningSpec) -> Array:
-    """All metrics of all channels with all targets, ``(metric, channel, target)``; NaN where one is constant."""
+    """Return all metrics of all channels with all targets, ``(metric, channel, target)``; NaN where one is constant."""
     both = np.concatenate([channels, targets], axis=1)
     width, count = channels.shape[1], targets.shape[1]
     ranks = np.stack([ranks_of(both[:, i]) for i in range(both.shape[1])], axis=1)

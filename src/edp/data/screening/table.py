@@ -131,7 +131,7 @@ class CandidateTable:
 
 
 def chunks(stretches: Sequence[FloatArray], rows: int = 32_768) -> Iterator[Array]:
-    """Stretches in float64, some rows at a time."""
+    """Return the stretches in float64, some rows at a time."""
     return (s[i : i + rows].astype(np.float64) for s in stretches for i in range(0, len(s), rows))
 
 
@@ -233,7 +233,7 @@ def _long_enough(recordings: Sequence[Recording], max_lag: int) -> tuple[Sequenc
 
 
 def _missing(names: Sequence[str], columns: Sequence[FloatArray]) -> dict[str, int]:
-    """Channels with missing or infinite values and how many."""
+    """Return the channels with missing or infinite values and how many."""
     counts = np.zeros(len(names), dtype=np.int64)
     for values in columns:
         for start in range(0, len(values), 65_536):

@@ -52,7 +52,7 @@ class _Model:
         self.weights = scipy.linalg.cho_solve(self.factor, self.answers, check_finite=False)
 
     def answers_of(self, sums: Array) -> Array:
-        """Products of the regressors with ``y[t + ahead] - y[t]`` (with ``y[t]`` itself for 0 ahead)."""
+        """Return the products of the regressors with ``y[t + ahead] - y[t]`` (with ``y[t]`` itself for 0 ahead)."""
         ahead = gram(sums, self.taps, [(self.target, -self.ahead)])[:, 0]
         return ahead if self.ahead == 0 else ahead - gram(sums, self.taps, [(self.target, 0)])[:, 0]
 
@@ -74,7 +74,7 @@ class _Model:
         return np.asarray(weights)
 
     def error(self, weights: Array, moments: Array, answers: Array, power: float) -> float:
-        """Mean squared error on data with these sums."""
+        """Return the mean squared error on data with these sums."""
         # Rounding can leave a perfect fit below zero.
         return max(float(power - 2.0 * weights @ answers + weights @ (moments @ weights)), 1e-12)
 

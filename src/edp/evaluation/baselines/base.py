@@ -70,7 +70,9 @@ class Baseline(ABC):
         self._inputs = inputs
 
     def predict(self, series: Series) -> FloatArray:
-        """Predictions made at each tick t for t + horizon, from rows up to t: float32 ``(time, horizon, target)``.
+        """Return the predictions made at each tick t for t + horizon, from rows up to t.
+
+        Float32 ``(time, horizon, target)``.
 
         The first ``history - 1`` ticks are NaN. ``series.targets`` is not read.
 
@@ -95,7 +97,7 @@ class Baseline(ABC):
 
     @abstractmethod
     def _predict(self, inputs: FloatArray) -> DoubleArray:
-        """Predictions at ticks ``history - 1`` and later: ``(time - history + 1, horizon, target)``."""
+        """Return the predictions at ticks ``history - 1`` and later: ``(time - history + 1, horizon, target)``."""
 
     def _check_columns(self, series: Series, inputs: int) -> None:
         if series.inputs.ndim != 2 or series.inputs.shape[1] != inputs:

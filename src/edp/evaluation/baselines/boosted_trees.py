@@ -46,7 +46,7 @@ class BoostedTrees(Baseline):
         self._models = [self._grow(table, held_out, output) for output in range(self.task.outputs)]
 
     def _grow(self, table: LagTable, held_out: LagTable, output: int) -> tuple[HistGradientBoostingRegressor, int]:
-        """One ensemble and the number of its trees to use."""
+        """Return one ensemble and the number of its trees to use."""
         from sklearn.ensemble import HistGradientBoostingRegressor
 
         model = HistGradientBoostingRegressor(

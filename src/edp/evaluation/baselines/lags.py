@@ -83,7 +83,7 @@ def sample_table(series: Sequence[Series], task: BaselineTask, means: DoubleArra
 def predict_from_lags(
     inputs: FloatArray, task: BaselineTask, means: DoubleArray, change_of: Callable[[FloatArray], DoubleArray]
 ) -> DoubleArray:
-    """Anchor plus predicted change at every tick with a full history, block by block.
+    """Return anchor plus predicted change at every tick with a full history, block by block.
 
     Args:
         inputs: ``(time, input)``.

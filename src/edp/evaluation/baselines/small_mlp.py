@@ -58,7 +58,7 @@ class SmallMlp(Baseline):
         self._train(table, held_out)
 
     def _train(self, table: LagTable, held_out: LagTable) -> None:
-        """Epochs with early stopping on whole held-out series: random rows of a time series would flatter."""
+        """Train epochs with early stopping on whole held-out series, since random rows would be too optimistic."""
         features = self._standardise(table.features)
         changes = ((table.changes - self._out_centre) / self._out_scale).astype(np.float32)
         # scikit-learn wants a vector when there is one output.
@@ -96,7 +96,7 @@ class SmallMlp(Baseline):
 
 
 def _standard(values: FloatArray | DoubleArray) -> tuple[DoubleArray, DoubleArray]:
-    """Mean and deviation of each column; a column that does not vary gets deviation one."""
+    """Return the mean and deviation of each column; a column that does not vary gets deviation one."""
     # Double precision: the mean of pressures of 1e7 Pa in float32 has no digits left for their spread.
     centre = values.mean(axis=0, dtype=np.float64)
     scale = values.std(axis=0, dtype=np.float64)

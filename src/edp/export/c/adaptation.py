@@ -82,7 +82,7 @@ def constants(adaptation: Adaptation) -> list[CConstant]:
 
 
 def _intervals(upper: str) -> Code:
-    """Bounds of intervals move with the prediction."""
+    """Return the bounds of intervals move with the prediction."""
     # Bounds move with the prediction, so that the interval keeps its width.
     lines = [f"for (uint32_t i = 0; i < {upper}_INTERVALS; i++) {{"]
     for bound in ("lower", "upper"):

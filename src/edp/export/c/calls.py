@@ -60,7 +60,7 @@ class Calls:
         return write(self, layer)
 
     def simple(self, layer: Layer, function: str, *sizes: object) -> list[str]:
-        """``function(inputs, constants, sizes, y)``: the order of arguments of most functions."""
+        """Return ``function(inputs, constants, sizes, y)``: the order of arguments of most functions."""
         constants = [constant(layer, name) for name in layer.tensors()]
         inputs = [self.value(name) for name in layer.inputs]
         return [call(function, *inputs, *constants, *sizes, self.value(layer.name))]
@@ -91,7 +91,7 @@ def runs(calls: Calls, layer: layers.Gather | QGather) -> list[tuple[str, int, i
 
 
 def needs_columns(calls: Calls, layer: Layer) -> bool:
-    """Whether a layer's columns are written as a table."""
+    """Return whether a layer's columns are written as a table."""
     if not isinstance(layer, layers.Gather | QGather):
         return False
     # Columns of several inputs have no common address, so a table cannot reach them.
@@ -240,7 +240,7 @@ CALLS: dict[type[Layer], Write] = {
 
 
 def structs(layer: Layer) -> list[Code]:
-    """Constant structs that a layer's function reads, one a line."""
+    """Return the constant structs that a layer's function reads, one a line."""
     name = identifier(layer.name)
     at = {key: constant(layer, key) for key in layer.tensors()}
     if isinstance(layer, memory.Lstm | memory.LayerNormLstm):

@@ -122,7 +122,7 @@ CALLS |= INTEGER_CALLS
 
 
 def structs(layer: Layer) -> list[Code]:
-    """Constant structs that an integer layer's function reads, one a line."""
+    """Return the constant structs that an integer layer's function reads, one a line."""
     name = identifier(layer.name)
 
     def matrix(suffix: str, weight: str = "weight") -> list[str]:

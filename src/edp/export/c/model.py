@@ -275,12 +275,12 @@ def remembered(graph: Graph) -> tuple[list[str], list[str]]:
 
 
 def clear_work(plan: MemoryPlan) -> list[str]:
-    """Statements that clear the work memories."""
+    """Return the statements that clear the work memories."""
     return [f"{FILLS[kind]}{size}u, s->{WORK[kind]});" for kind, size in plan.sizes.items()]
 
 
 def computed(graph: Graph, plan: MemoryPlan) -> tuple[list[str], list[str]]:
-    """Statements of a tick: the layers one after the other, and what becomes of the results."""
+    """Return the statements of a tick: the layers one after the other, and what becomes of the results."""
     calls = Calls(graph, plan)
     lines = [line for layer in graph.layers for line in ("", describe(layer), *calls.translate(layer))]
     checks: list[str] = []
@@ -349,12 +349,12 @@ def _check(model: Model) -> None:
 
 
 def has_ring(layer: Layer) -> bool:
-    """Whether the C state of a layer has a ring or a counter."""
+    """Return whether the C state of a layer has a ring or a counter."""
     return layer.counted and bool(layer.slots)
 
 
 def crc(graph: Graph) -> int:
-    """CRC-32 of all constants, little-endian, in the order of the C code."""
+    """Return the CRC-32 of all constants, little-endian, in the order of the C code."""
     value = 0
     for layer in graph.layers:
         for name, values in layer.tensors().items():

@@ -52,12 +52,12 @@ def own_bytes(statements: Iterable[str]) -> int:
 
 
 def called(statements: Iterable[str]) -> set[str]:
-    """Functions of the runtime that statements call."""
+    """Return the functions of the runtime that statements call."""
     return {name for name, _ in CALL.findall(" ".join(statements))}
 
 
 def runtime_bytes(functions: Iterable[str]) -> int:
-    """Functions of the runtime, with the functions, tables and parts of the C library that they need."""
+    """Return the functions of the runtime, with the functions, tables and parts of the C library that they need."""
     sizes, needs = _read_measurements()
     # A set: functions share what they need, and the linker takes it once.
     every = {symbol for function in functions for symbol in needs[function]}

@@ -298,5 +298,5 @@ TANGENTS: dict[type[Layer], Write] = {
 
 
 def differentiable(graph: Graph) -> bool:
-    """Whether every layer has a tangent."""
+    """Return whether every layer has a tangent."""
     return all(type(layer) in TANGENTS for layer in graph.layers)

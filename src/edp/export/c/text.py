@@ -66,7 +66,7 @@ def unsigned_literals(values: Iterable[int]) -> list[str]:
 
 
 def filled(items: Iterable[str], indent: str = "    ") -> Code:
-    """Items with commas between them in lines of at most `WIDTH` characters."""
+    """Return the items with commas between them in lines of at most `WIDTH` characters."""
     return Code(textwrap.fill(", ".join(items), WIDTH, initial_indent=indent, subsequent_indent=indent))
 
 
@@ -155,7 +155,7 @@ def call(function: str, *arguments: object) -> str:
 
 
 def indented(lines: Iterable[str], indent: str = "    ") -> Code:
-    """Statements, broken where they are too long."""
+    """Return the statements, broken where they are too long."""
     indented_lines = []
     for line in lines:
         own = indent + line[: len(line) - len(line.lstrip())]

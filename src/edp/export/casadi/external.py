@@ -13,7 +13,7 @@ from edp.ir.memory import UNSEEN
 
 
 def blanks(graph: Graph, name: str) -> dict[str, object]:
-    """Values of the blanks of the template."""
+    """Return the values of the blanks of the template."""
     load: list[str] = []
     store: list[str] = []
     load_change: list[str] = []

@@ -33,7 +33,7 @@ class Horizon:
         self._work = np.zeros(size(ctypes.c_uint32(steps), ctypes.c_uint32(commands)))
 
     def __call__(self, x: Any, first: Any, base: Any, by: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Predictions ``(steps, prediction)`` and Jacobian ``(steps, prediction, steps, command)``.
+        """Return the predictions ``(steps, prediction)`` and Jacobian ``(steps, prediction, steps, command)``.
 
         Args:
             x: the state ``(state,)`` before the first tick.

@@ -64,10 +64,13 @@ def start(graph: Graph) -> Array:
 
 
 def is_ring(graph: Graph, state: Place) -> bool:
-    """Whether the rows are ticks that the C code keeps as a ring."""
+    """Return whether the rows are ticks that the C code keeps as a ring."""
     return state.slot.name in ("ring", "keys", "values", "scores")
 
 
 def counts(graph: Graph, state: Place) -> bool:
-    """Whether the ring of the C code knows how many ticks it has seen; a convolution takes all of them as seen."""
+    """Return whether the ring of the C code knows how many ticks it has seen.
+
+    A convolution takes all of them as seen.
+    """
     return not isinstance(graph.layer(state.layer), memory.Convolution)

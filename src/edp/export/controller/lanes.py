@@ -41,7 +41,7 @@ class LaneModel:
     fragments = ("fields.h", "pressures.c")
 
     def sizes(self, plan: PlanParts) -> dict[str, int]:
-        """Further sizes that the controller defines."""
+        """Return further sizes that the controller defines."""
         return {}
 
     def cost(self, plan: PlanParts) -> str:

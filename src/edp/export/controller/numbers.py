@@ -17,7 +17,7 @@ ROUNDED = 2.0**-23
 
 
 def constants_of_controller(parts: ControllerParts, near: bool = False) -> ConstantTables:
-    """Everything that is not the model's; `near`: a plan is on a grey box, whose load is estimated."""
+    """Return everything that is not the model's; `near`: a plan is on a grey box, whose load is estimated."""
     tables = ConstantTables("controller")
     tables.floats("input_low", parts.limits_low)
     tables.floats("input_high", parts.limits_high)
@@ -62,7 +62,7 @@ def _set_plan(tables: ConstantTables, parts: ControllerParts, plan: PlanParts, n
 
 
 def _set_sides(tables: ConstantTables, name: str, sides: Iterable[tuple[Side, Side]]) -> None:
-    """Polygons of levers by speed, by axis, extending and retracting."""
+    """Write the lever-by-speed polygons of each axis, extending and retracting."""
     rows = []
     for axis, pair in enumerate(sides):
         entries = []

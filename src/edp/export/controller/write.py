@@ -62,7 +62,7 @@ class ControllerFiles:
         return (*own, "edp_qp.c", *SOLVER, *self.model.sources)
 
     def texts(self) -> dict[str, str]:
-        """Every file by name, the one to read first in front."""
+        """Return every file by name, the one to read first in front."""
         name = self.name
         texts: dict[str, str] = {
             f"{name}_control.h": self._fill_template("control.h.in"),

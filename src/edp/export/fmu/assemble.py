@@ -93,7 +93,7 @@ def fmu_files(
 
 
 def _content(version: int, about: About, sources: Mapping[str, str], description: bytes) -> dict[str, bytes]:
-    """Content of an FMU without libraries, by path."""
+    """Return content of an FMU without libraries, by path."""
     compiled = c_files(tuple(sources))
     files = {"modelDescription.xml": fmi2(about, compiled) if version == 2 else fmi3(about)}
     files["documentation/index.html"] = page(about)
@@ -105,12 +105,12 @@ def _content(version: int, about: About, sources: Mapping[str, str], description
 
 
 def plumbing(*names: str) -> dict[str, str]:
-    """Files of the FMU's own code."""
+    """Return the files of the FMU's own code."""
     return {name: resources.files("edp.export.fmu").joinpath(f"plumbing/{name}").read_text() for name in names}
 
 
 def c_files(names: Sequence[str]) -> list[str]:
-    """Those that are compiled."""
+    """Return the C files to compile."""
     return [name for name in names if name.endswith(".c")]
 
 

@@ -62,7 +62,7 @@ class Sources:
 
 
 def libraries(sources: Sources, platforms: Sequence[str]) -> dict[int, dict[str, bytes]]:
-    """Path in the FMU and content of each library, by version of FMI.
+    """Return the path in the FMU and content of each library, by version of FMI.
 
     Where Zig builds for Windows for the first time, it builds the C library too, which takes minutes.
 

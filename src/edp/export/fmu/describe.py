@@ -103,7 +103,7 @@ def fmi3(about: About) -> bytes:
 
 
 def build_description(about: About, sources: Sequence[str]) -> bytes:
-    """``sources/buildDescription.xml`` of FMI 3.0."""
+    """Return ``sources/buildDescription.xml`` of FMI 3.0."""
     root = ET.Element("fmiBuildDescription", {"fmiVersion": "3.0"})
     configuration = ET.SubElement(root, "BuildConfiguration", {"modelIdentifier": about.name})
     files = ET.SubElement(

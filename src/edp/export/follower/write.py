@@ -71,7 +71,7 @@ class FollowerFiles:
         return (f"{self.name}.c", *(name for name in runtime if name.endswith(".c") and name != WITHIN))
 
     def texts(self) -> dict[str, str]:
-        """Every file by name, the one to read first in front."""
+        """Return every file by name, the one to read first in front."""
         name, values = self.name, self._values()
         texts: dict[str, str] = {
             f"{name}.{end}": fill_file(f"follower/templates/follower.{end}.in", values) for end in "hc"

@@ -13,7 +13,7 @@ SCHEMA = 1
 
 
 def description(parts: MonitorParts, name: str) -> Table:
-    """Plain values that JSON can hold."""
+    """Return the plain values that JSON can hold."""
     chain, summaries = parts.chain, parts.chain.summaries
     return {
         "schema": SCHEMA,

@@ -23,7 +23,7 @@ Rows = NDArray[np.float32]
 
 
 def golden_blocks(chain: MonitorChain) -> int:
-    """Blocks of the self-test."""
+    """Return the blocks of the self-test."""
     return min(chain.settle + JUDGED_BLOCKS, max(2, MOST_TICKS // chain.summaries.block))
 
 
@@ -48,14 +48,14 @@ def drawn_rows(chain: MonitorChain) -> tuple[Rows, Rows]:
 
 
 def usual_widths(chain: MonitorChain) -> tuple[Rows, Rows, Rows]:
-    """Middle and width of each input, and width of each residual, in single precision."""
+    """Return the middle and width of each input, and width of each residual, in single precision."""
     summaries = chain.summaries
     centre, spread, scale = summaries.centre, 1.0 / summaries.spread, 1.0 / summaries.scale
     return centre.astype(np.float32), spread.astype(np.float32), scale.astype(np.float32)
 
 
 def _lcg(count: int, seed: int) -> NDArray[np.uint32]:
-    """Numbers of the linear congruential generator of Numerical Recipes, modulo 2^32."""
+    """Return the numbers of the linear congruential generator of Numerical Recipes, modulo 2^32."""
     out = np.empty(count, np.uint32)
     x = seed
     for i in range(count):

@@ -44,7 +44,7 @@ class SourceCode(ABC):
 
     @abstractmethod
     def fields(self) -> list[str]:
-        """Members of the monitor's state."""
+        """Return the members of the monitor's state."""
 
     @property
     @abstractmethod
@@ -64,7 +64,7 @@ class SourceCode(ABC):
         """Return the values of the template of the function that are its own; `first` as in `code`."""
 
     def reset(self) -> list[str]:
-        """Statements that set the state at the start."""
+        """Return the statements that set the state at the start."""
         return [f"edp_copy({self.own}_middle, {len(self.reads)}u, s->{self.own}_in);"]
 
     def code(self, name: str, first: int) -> Code:
@@ -155,7 +155,7 @@ class NetworkCode(SourceCode):
         return [f"{self.prefix}_reset(&s->{self.own});", *seen, *self._unknown()]
 
     def _unknown(self) -> list[str]:
-        """Statements after which its residuals are not known until it runs."""
+        """Return the statements after which its residuals are not known until it runs."""
         return [f"edp_fill((float)edp_unknown(), {self.residuals}u, s->{self.own}_kept);"] if self.turns else []
 
 
@@ -344,7 +344,10 @@ class FlowCode(SourceCode):
 
 
 def _network_bytes(bundle: Bundle) -> int:
-    """Counters and the last inputs, which the state of every network has in addition to what its layers remember."""
+    """Return the counters and the last inputs.
+
+    Which the state of every network has in addition to what its layers remember.
+    """
     return 4 * (8 + len(bundle.inputs))
 
 

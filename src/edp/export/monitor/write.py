@@ -58,7 +58,7 @@ class MonitorFiles:
     sources: tuple[SourceCode, ...]
 
     def texts(self) -> dict[str, str]:
-        """Every file by name, the one to read first in front."""
+        """Return every file by name, the one to read first in front."""
         name = self.name
         texts: dict[str, str] = {
             f"{name}.h": self._fill_template("monitor.h.in"),

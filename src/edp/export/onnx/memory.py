@@ -150,7 +150,10 @@ def _attention_pool(nodes: Nodes, layer: memory.AttentionPool, state: Held, x: s
 
 
 def attend(nodes: Nodes, layer: memory.WindowAttention, qkv: tuple[str, str, str], hidden: str | None) -> str:
-    """Every row of the queries over all rows of keys and values, head by head; `hidden` is added to the scores."""
+    """Return every row of the queries over all rows of keys and values, head by head.
+
+    `hidden` is added to the scores.
+    """
     wide = layer.size // layer.heads
     parts = [nodes.split(x, [wide] * layer.heads, 1) for x in qkv]
     seen = []

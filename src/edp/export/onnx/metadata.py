@@ -52,7 +52,7 @@ def content(
 
 
 def expand_starts(about: Table, states: Sequence[State]) -> dict[str, object]:
-    """`content` with whole arrays as the starts of states, for MATLAB."""
+    """Return `content` with whole arrays as the starts of states, for MATLAB."""
     # MATLAB has no rule for the short form of a start.
     step = about["graphs"]["step"]
     full = [entry | {"start": state.start} for entry, state in zip(step["states"], states, strict=True)]
@@ -72,7 +72,7 @@ def _graph(described: Description, kind: str, data: bytes, opset: int) -> dict[s
 
 
 def _start(state: State) -> float | list[list[float]]:
-    """One number where all are the same."""
+    """Return one number where all are the same."""
     # A single number keeps the JSON readable; rings hold hundreds of equal ones.
     first = float(state.start.flat[0])
     same = np.all(state.start == state.start.flat[0])

@@ -64,7 +64,7 @@ class Nodes:
 
     @contextmanager
     def inside(self, scope: str) -> Iterator[None]:
-        """Names made within begin with `scope`."""
+        """Return the names made within begin with `scope`."""
         before, self._scope = self._scope, scope
         try:
             yield
@@ -96,7 +96,7 @@ class Nodes:
         return self._constants[key]
 
     def is_zero(self, name: str) -> bool:
-        """Whether a value is a constant of zeros."""
+        """Return whether a value is a constant of zeros."""
         return any(constant_name == name and not any(data) for (_, _, data), constant_name in self._constants.items())
 
     def add(self, operator: str, *inputs: str, **attributes: Any) -> str:
@@ -126,37 +126,37 @@ class Nodes:
         return self.several("Split", [x, self.constant(np.array(sizes, np.int64), "sizes")], len(sizes), axis=axis)
 
     def join(self, parts: Sequence[str], axis: int) -> str:
-        """Values end to end; the value itself where there is one."""
+        """Return the values end to end; the value itself where there is one."""
         return parts[0] if len(parts) == 1 else self.add("Concat", *parts, axis=axis)
 
     def columns(self, x: str, chosen: NDArray[Any]) -> str:
-        """Chosen columns of a matrix."""
+        """Return the chosen columns of a matrix."""
         return self.add("Gather", x, self.constant(chosen.astype(np.int64), "columns"), axis=1)
 
     def shaped(self, x: str, *shape: int) -> str:
-        """Reshape a value, keeping the order of its elements."""
+        """Return the reshape a value, keeping the order of its elements."""
         return self.add("Reshape", x, self.constant(np.array(shape, np.int64), "shape"))
 
     def clip(self, x: str, low: float, high: float) -> str:
-        """Each number, but no less than `low` and no more than `high`."""
+        """Return each number, but no less than `low` and no more than `high`."""
         # Before opset 11 the limits were attributes.
         if self.opset < 11:
             return self.add("Clip", x, min=float(low), max=float(high))
         return self.add("Clip", x, self.constant(np.float32(low)), self.constant(np.float32(high)))
 
     def mean(self, x: str, axis: int) -> str:
-        """Mean over an axis, which stays with length 1."""
+        """Return the mean over an axis, which stays with length 1."""
         if self.opset < 18:
             return self.add("ReduceMean", x, axes=[axis], keepdims=1)
         return self.add("ReduceMean", x, self.constant(np.array([axis], np.int64), "axis"), keepdims=1)
 
     def linear(self, x: str, weight: NDArray[np.float32], bias: NDArray[np.float32] | str) -> str:
-        """``x W^T + b``, row by row; `weight` ``(out, in)``, `bias` an array ``(out,)`` or a value."""
+        """Return ``x W^T + b``, row by row; `weight` ``(out, in)``, `bias` an array ``(out,)`` or a value."""
         added = bias if isinstance(bias, str) else self.constant(bias, "bias")
         return self.add("Gemm", x, self.constant(weight, "weight"), added, transB=1)
 
     def product(self, a: str, b: str, added: str | None = None, scale: float = 1.0, turn: bool = False) -> str:
-        """``scale a b`` plus a value, both matrices; with `turn`, b is transposed first."""
+        """Return ``scale a b`` plus a value, both matrices; with `turn`, b is transposed first."""
         third = added or self.constant(np.zeros((1, 1), np.float32), "zero")  # not optional before opset 11
         return self.add("Gemm", a, b, third, alpha=float(scale), transB=int(turn))
 
@@ -173,7 +173,7 @@ class Nodes:
         return self.add("Add", a, self.times(b, np.float32(-1.0)))
 
     def softmax(self, x: str) -> str:
-        """Weights that sum to 1 in each row of a matrix."""
+        """Return the weights that sum to 1 in each row of a matrix."""
         return self.add("Softmax", x, axis=1)
 
     def model(

@@ -48,7 +48,7 @@ OPERATORS = {
 
 
 def normed(nodes: Nodes, x: str, epsilon: float) -> str:
-    """Each row less its mean, over the root of its variance plus `epsilon`."""
+    """Return each row less its mean, over the root of its variance plus `epsilon`."""
     # Variance by its definition: the difference of squares cancels for large means.
     middle = nodes.less(x, nodes.mean(x, 1))
     spread = nodes.plus(nodes.mean(nodes.add("Mul", middle, middle), 1), np.float32(epsilon))
@@ -66,7 +66,7 @@ BINARY_OPERATORS = {
 
 
 def combine(nodes: Nodes, operation: BinaryOperation, a: str, b: str) -> str:
-    """Two values, number by number."""
+    """Return two values, number by number."""
     return nodes.less(a, b) if operation is BinaryOperation.SUBTRACT else nodes.add(BINARY_OPERATORS[operation], a, b)
 
 
@@ -145,7 +145,7 @@ def _grouped_dense(nodes: Nodes, layer: layers.GroupedDense, ticks: int, values:
 
 
 def _trees(nodes: Nodes, layer: layers.TreeSums, ticks: int, values: Sequence[str], *_: object) -> str:
-    """Every node compares at once, and from the leaves up each one hands on the number of its side."""
+    """Return every node compares at once, and from the leaves up each one hands on the number of its side."""
     outputs, trees = layer.leaf.shape[:2]
     levels = [[0]]
     for _level in range(layer.depth):

@@ -26,7 +26,7 @@ class Sequences:
         self._cut: dict[tuple[str, int, int], str] = {}
 
     def known(self, name: str) -> bool:
-        """Whether a value was given."""
+        """Return whether a value was given."""
         return name in self._values
 
     def give(self, name: str, rows: str, ticks: int, width: int) -> None:
@@ -38,7 +38,7 @@ class Sequences:
         self._values[name] = _Value(ticks, width, columns=columns)
 
     def in_columns(self, name: str, ticks: int) -> bool:
-        """Whether these last ticks are there as columns."""
+        """Return whether these last ticks are there as columns."""
         form = self._values[name]
         return bool(form.columns) and form.ticks == ticks
 

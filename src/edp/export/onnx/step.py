@@ -73,7 +73,7 @@ def refuse(layer: Layer) -> ExportError:
 
 
 def spoil(nodes: Nodes, inputs: str, ends: Iterable[str]) -> str:
-    """0 ``(tick, 1)`` where all inputs of a tick are finite, else NaN: ReLU and clipping may swallow a NaN.
+    """Return 0 ``(tick, 1)`` where all inputs of a tick are finite, else NaN: ReLU and clipping may swallow a NaN.
 
     Values that nothing reads are read here. ONNX Runtime up to 1.18 puts them, from the second run on, over values that
     are still needed.

@@ -221,7 +221,7 @@ class Window:
         return self._parts[layer.name]
 
     def _run(self, layer: Layer, source: str, ticks: int, state: dict[str, str]) -> tuple[str, dict[str, str]]:
-        """Values ``(ticks, width)`` and the states after them."""
+        """Return the values ``(ticks, width)`` and the states after them."""
         if isinstance(layer, memory.Lstm) and layer.share == 1.0:
             return lstm(self.nodes, layer, source, ticks, state)
         # PyTorch's GRU resets behind the product, hence `linear_before_reset`.
@@ -246,7 +246,7 @@ WINDOWS = {
 
 
 def _reorder_gates(array: np.ndarray, order: Sequence[int]) -> np.ndarray:
-    """Gates in another order; a leading axis of one direction."""
+    """Return the gates in another order; a leading axis of one direction."""
     return np.concatenate([np.split(array, len(order))[at] for at in order])[None]
 
 

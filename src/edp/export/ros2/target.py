@@ -85,7 +85,7 @@ def _content(described: Description) -> dict[str, object]:
 
 
 def message_names(names: Iterable[str]) -> list[str]:
-    """Names that fit into parameters and messages; see `_content`."""
+    """Return the names that fit into parameters and messages; see `_content`."""
     return shown_names(_plain(name) for name in names)
 
 

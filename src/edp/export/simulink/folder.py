@@ -100,7 +100,7 @@ class Folder:
         return tables
 
     def texts(self) -> dict[str, str]:
-        """All text files but the C code of the core; the README first."""
+        """Return all text files but the C code of the core; the README first."""
         name = self.model.name
         file_names = [*(f"{part}.m" for part in MATLAB_FILES), *C_FILES]
         file_names += [f"{part}.m" for part in NATIVE_FILES] if self.native is not None else []
@@ -221,7 +221,7 @@ class Folder:
         return values | {"code": code, "given": self.native.results(), "functions": functions_for(code)}
 
     def _readme(self, about: Table) -> dict[str, object]:
-        """Tables of the README."""
+        """Return the tables of the README."""
         name, there = self.model.name, self._there()
         rows = [f"| `{name}_{part}` | {what} | {needs} |" for part, (what, needs) in ABOUT.items() if part in there]
         rows += [

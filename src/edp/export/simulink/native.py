@@ -99,7 +99,7 @@ class Native:
         return f"s.{self._fields[layer, part]}"
 
     def weights(self) -> dict[str, object]:
-        """All constants by field."""
+        """Return all constants by field."""
         tensors = {
             (layer.name, part): values for layer in self.graph.layers for part, values in self.laid(layer).items()
         }
@@ -158,7 +158,7 @@ Write = Callable[[Native, Any, Sequence[str]], list[str]]
 
 
 def _column(values: Array) -> Array:
-    """Vectors as columns; rows of a matrix as columns."""
+    """Return the vectors as columns; rows of a matrix as columns."""
     return np.ascontiguousarray(values.reshape(-1, 1) if values.ndim == 1 else values.T)
 
 

@@ -163,12 +163,12 @@ class Adaptation:
         return np.asarray(np.float32(self.spec.dead_zone) * self.spread, dtype=np.float32)
 
     def arrays(self) -> dict[str, Array]:
-        """Its arrays by name."""
+        """Return the arrays by name."""
         values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
     def to_dict(self) -> Table:
-        """Everything but the arrays, as JSON gives it back."""
+        """Return everything but the arrays, as JSON gives it back."""
         columns, horizons = list(self.columns), list(self.horizons)
         return {"spec": asdict(self.spec), "rate_hz": self.rate_hz, "horizons": horizons, "columns": columns}
 

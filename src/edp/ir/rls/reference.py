@@ -172,7 +172,7 @@ class RlsCorrector:
         return bool((np.abs(values - self.adaptation.middle) > self.adaptation.dead_zone).any())
 
     def _error(self, h: int, measured: Array) -> Array:
-        """Error in units ``(J,)`` of the prediction that comes due."""
+        """Return the error in units ``(J,)`` of the prediction that comes due."""
         n, row = self.adaptation.features, self._rows[h][self._at[h]]
         return np.asarray((measured - row[n : n + len(measured)]) / self.adaptation.unit[h])
 
@@ -243,6 +243,6 @@ class RlsCorrector:
 
 
 def _clip(values: Array, limit: float | np.floating) -> Array:
-    """Numbers cut off at plus and minus `limit`."""
+    """Return the numbers cut off at plus and minus `limit`."""
     bound = np.float32(limit)
     return np.asarray(np.minimum(np.maximum(values, -bound), bound), dtype=np.float32)

@@ -45,7 +45,7 @@ def frac_for(largest: float, bits: int = 15) -> int:
 
 
 def round_shift(x: Any, bits: int) -> Fixed:
-    """``x 2^-bits``, rounded half up."""
+    """Return ``x 2^-bits``, rounded half up."""
     # Half up rather than half to even: one addition and a shift in C.
     x = np.asarray(x, dtype=np.int64)
     if bits <= 0:
@@ -54,7 +54,7 @@ def round_shift(x: Any, bits: int) -> Fixed:
 
 
 def saturated(x: Any, largest: int = LARGEST) -> Fixed:
-    """Kept in [-largest, largest]."""
+    """Limit values to [-largest, largest]."""
     return np.clip(np.asarray(x, dtype=np.int64), -largest, largest)
 
 
@@ -65,7 +65,7 @@ def to_fixed(values: Any, frac: int, largest: int = LARGEST) -> Fixed:
 
 
 def factor(real: Any) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
-    """Positive factors as ``multiplier 2^-shift``, multipliers of 31 bits, shifts between 1 and 62.
+    """Return the positive factors as ``multiplier 2^-shift``, multipliers of 31 bits, shifts between 1 and 62.
 
     Raises:
         ExportError: a factor of 2^30 and more.
@@ -86,7 +86,7 @@ def factor(real: Any) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
 
 
 def scaled(accumulator: Any, multiplier: Any, shift: Any) -> Fixed:
-    """``accumulator multiplier 2^-shift`` rounded half up; accumulators of 32 bits."""
+    """Return ``accumulator multiplier 2^-shift`` rounded half up; accumulators of 32 bits."""
     shift = np.asarray(shift, dtype=np.int64)
     product = np.asarray(accumulator, dtype=np.int64) * np.asarray(multiplier, dtype=np.int64)
     # A product of 32 and 31 bits needs 63: `int64` holds it in NumPy and in C.
@@ -123,38 +123,38 @@ def look_up(table: NDArray[np.uint16], x: Fixed, step: int) -> Fixed:
 
 
 def tanh(x: Fixed, frac: int) -> Fixed:
-    """In 2^-15, of x in ``2^-frac``, `frac` at least 6."""
+    """Return tanh in 2^-15, of x in ``2^-frac``, `frac` at least 6."""
     size = look_up(TANH, np.abs(x), frac - 6)
     result: Fixed = np.where(x < 0, -1, 1) * np.minimum((size + 1) >> 1, LARGEST)
     return result
 
 
 def sigmoid(x: Fixed) -> Fixed:
-    """In 2^-15, of x in 2^-16: ``(1 + tanh(x / 2)) / 2``."""
+    """Return the sigmoid in 2^-15, of x in 2^-16: ``(1 + tanh(x / 2)) / 2``."""
     # A half of x: one bit less of the step, instead of a shift that would lose that bit.
     half = look_up(TANH, np.abs(x), GATE_FRAC - 5)
     return np.minimum(round_shift(65536 + np.where(x < 0, -1, 1) * half, 2), LARGEST)
 
 
 def exp(x: Fixed) -> Fixed:
-    """In 2^-16, of x <= 0 in 2^-16."""
+    """Return exp in 2^-16, of x <= 0 in 2^-16."""
     return look_up(EXP, -x, GATE_FRAC - 5)
 
 
 def softplus(x: Fixed) -> Fixed:
-    """In 2^-16, of x in 2^-16."""
+    """Return softplus in 2^-16, of x in 2^-16."""
     return np.maximum(x, 0) + look_up(LOG1P_EXP, np.abs(x), GATE_FRAC - 5)
 
 
 def normal(x: Fixed) -> Fixed:
-    """Cumulated normal distribution in 2^-16, of x in 2^-16."""
+    """Return the cumulated normal distribution in 2^-16, of x in 2^-16."""
     above = look_up(NORMAL, np.abs(x), GATE_FRAC - 6)
     return np.where(x < 0, 65536 - above, above)
 
 
 def softmax(scores: Fixed) -> Fixed:
     # Differences to the largest score are never positive, which is the half that the table covers.
-    """Weights in 2^-15 over the last axis, of scores in 2^-16."""
+    """Return the weights in 2^-15 over the last axis, of scores in 2^-16."""
     raised = exp(scores - scores.max(axis=-1, keepdims=True))
     total = raised.sum(axis=-1, keepdims=True)
     # Half of the divisor is added first, so that the quotient is rounded and not cut.

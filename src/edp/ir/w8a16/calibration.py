@@ -103,7 +103,7 @@ def _compute_inputs(graph: Graph, rows: NDArray[np.floating]) -> dict[str, Value
 
 
 def _follow(graph: Graph, rows: NDArray[np.floating], ranges: dict[str, float]) -> dict[str, Values]:
-    """Values of every layer at every tick, ``(time, number)``."""
+    """Return the values of every layer at every tick, ``(time, number)``."""
     values = {name: value[:, 0] for name, value in Reference(graph).values(rows[:, None]).items()}
     for name, value in values.items():
         _raise(ranges, name, value)

@@ -536,7 +536,7 @@ class QAttentionPool(FixedLayer):
 
 
 def _product(x: Fixed, weight: NDArray[np.int8]) -> Fixed:
-    """``x W'`` of integers: double precision holds the sums exactly, and is fast."""
+    """Return ``x W'`` of integers: double precision holds the sums exactly, and is fast."""
     # Sums of 16 by 8-bit products stay far below 2^53.
     return np.asarray(x.astype(np.float64) @ weight.T.astype(np.float64)).astype(np.int64)
 

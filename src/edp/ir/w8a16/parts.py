@@ -8,7 +8,7 @@ from edp.ir.layers import Function
 
 
 def integer_part(graph: Graph) -> set[str]:
-    """Layers that are computed in integer arithmetic: after the scaling of the inputs, up to the last weights.
+    """Return layers that are computed in integer arithmetic: after the scaling of the inputs, up to the last weights.
 
     Functions and selections of integers behind the last weights belong to it too.
     """
@@ -35,7 +35,7 @@ def integer_part(graph: Graph) -> set[str]:
 
 
 def _ports(graph: Graph) -> set[str]:
-    """Layers between a feedback edge and the first weights: ports hand on sums that 16 bits would spoil."""
+    """Return the layers between a feedback edge and the first weights: ports hand on sums that 16 bits would spoil."""
     ports: set[str] = set()
     for layer in graph.layers:
         plain = not layer.macs and not isinstance(layer, layers.Gather)

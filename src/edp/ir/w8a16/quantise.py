@@ -66,11 +66,11 @@ class _Work:
     """Fractional bits of slots."""
 
     def rows(self, layer: Any, input_frac: int) -> dict[str, Any]:
-        """Integer weights and biases of a layer."""
+        """Return the integer weights and biases of a layer."""
         return rows(layer.name, layer.weight, layer.bias, (input_frac, self.frac(layer.name)), self.rounding)
 
     def gates(self, layer: Any, input_frac: int) -> dict[str, Any]:
-        """Integer matrices of a recurrent layer."""
+        """Return the integer matrices of a recurrent layer."""
         gate_constants: dict[str, object] = {}
         for side, frac in (("x", input_frac), ("h", fixed.UNIT_FRAC)):
             made_of = to_gates(f"{layer.name}/{side}", getattr(layer, f"weight_{side}"), frac, self.rounding)
@@ -345,7 +345,7 @@ def _pool(work: _Work, x: memory.AttentionPool, input_fracs: list[int]) -> quant
 
 
 def weights_of(graph: Graph) -> dict[str, NDArray[np.int8]]:
-    """8-bit weights of an integer graph, by matrix."""
+    """Return 8-bit weights of an integer graph, by matrix."""
     weights: dict[str, NDArray[np.int8]] = {}
     for layer, name, values in graph.tensors():
         if values.dtype == np.int8:

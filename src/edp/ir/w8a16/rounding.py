@@ -34,7 +34,7 @@ class WeightRounding:
     moments: Mapping[str, Array] = field(default_factory=dict)
 
     def round(self, matrix: str, weight: Array, scale: Array) -> NDArray[np.int8]:
-        """Whole multiples of a scale for each output.
+        """Return the whole multiples of a scale for each output.
 
         Args:
             matrix: its name.

@@ -22,7 +22,7 @@ MAX_COARSE = 4.0
 def rows(
     matrix: str, weight: Array, bias: Array, formats: tuple[int, int], rounding: WeightRounding
 ) -> dict[str, object]:
-    """Weights ``(..., out, terms ...)``, biases ``(..., out)``, and the way from accumulators to `frac`.
+    """Return the weights ``(..., out, terms ...)``, biases ``(..., out)``, and the way from accumulators to `frac`.
 
     Args:
         matrix: its name.

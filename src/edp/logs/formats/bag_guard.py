@@ -118,12 +118,12 @@ def _source(path: Any) -> Path | MemoryFile:
 
 
 def _to_size(kind: str, data: bytes, size: int) -> bytes:
-    """At most a byte more than announced, which the library then refuses."""
+    """Unpack at most one byte more than announced, which the library then refuses."""
     return unpack_to(kind, data, size)
 
 
 def _unpack_by_ratio(kind: str, data: bytes) -> bytes:
-    """For packed parts whose size unpacked is announced nowhere that the library looks."""
+    """Unpack parts whose unpacked size is not announced where the library looks."""
     # A chunk of ROS 1 announces its size in its header, which the library's call does not hand over.
     limit = RATIO * len(data) + SPARE
     unpacked_bytes = unpack_to(kind, data, limit)
@@ -156,7 +156,7 @@ def _check_folder(folder: Path) -> None:
 
 
 def _check_database(path: Path | MemoryFile) -> None:
-    """Plain tables only: views, virtual tables and computed columns would run what their author wrote.
+    """Accept plain tables only: views, virtual tables and computed columns would execute their author's code.
 
     Raises:
         DataError: any other thing in the file, topics with the same number, or texts that are too long.

@@ -85,7 +85,7 @@ class NoFolder:
 
 
 def place(*parts: Any) -> Any:
-    """`Path`, and in `NoFolder` a file in memory."""
+    """Return `Path`, and in `NoFolder` a file in memory."""
     if parts[0] != NoFolder.name:
         return Path(*parts)
     if len(parts) != 2:

@@ -36,7 +36,7 @@ class ColumnTable(Protocol):
 
 
 def load_column(table: ColumnTable, name: str, samples: int) -> Column:
-    """One whole column of a table, shape ``(samples,)``."""
+    """Return one whole column of a table, shape ``(samples,)``."""
     parts = [columns[0] for columns in table.pieces([name], 0, samples)]
     return np.concatenate(parts).astype(np.float64, copy=False) if parts else np.empty(0)
 
@@ -120,7 +120,7 @@ class RawLog:
         check_names(self.path, self.signals)
 
     def __contains__(self, name: str) -> bool:
-        """Whether the file has a column of this name or alias."""
+        """Return whether the file has a column of this name or alias."""
         return name in self.signals or name in self.aliases
 
     def signal(self, name: str) -> RawSignal:
@@ -230,7 +230,7 @@ class LogFormat(Protocol):
     content: str
 
     def claims(self, head: bytes) -> bool:
-        """Whether a file that begins with `head` (up to 4 KiB) holds this format."""
+        """Return whether a file that begins with `head` (up to 4 KiB) holds this format."""
 
     def read(self, path: Path, signal_map: SignalMap) -> RawLog:
         """Read a file; raises `DataError` if it cannot be read."""
@@ -243,7 +243,7 @@ FORMATS: Registry[LogFormat] = Registry("file format")
 
 
 def holds_truth_apart(log_format: LogFormat) -> bool:
-    """Whether one file of a format can hold the truth apart from what sensors show."""
+    """Return whether one file of a format can hold the truth apart from what sensors show."""
     return bool(getattr(log_format, "parts", False))
 
 
@@ -286,7 +286,7 @@ def find_time(names: Sequence[str], signal_map: SignalMap, path: Path) -> str | 
 
 
 def time_factor(name: str, unit: str | None, signal_map: SignalMap) -> float:
-    """Seconds per unit of the time column: the map's unit, else the header's, else the name's ending, else s."""
+    """Return seconds per unit of the time column: the map's unit, else the header's, else the name's ending, else s."""
     stated = _TIME_UNIT_NAMES.get(unit or "", unit or "")
     ending = name.lower().rpartition("_")[2]
     # s is the map's default, so it may not have been stated: the unit in the file then decides.

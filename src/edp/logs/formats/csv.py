@@ -66,7 +66,7 @@ class CsvFormat:
     libraries = ("pandas",)  # which pyarrow imports when columns become arrays
 
     def claims(self, head: bytes) -> bool:
-        """Text without NUL bytes, or UTF-16 with its mark."""
+        """Return text without NUL bytes, or UTF-16 with its mark."""
         if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
             return True
         printable = sum(byte >= 32 or byte in b"\t\r\n\f" for byte in head)
@@ -206,7 +206,7 @@ def _names_beside(
 
 
 def _units_between(rows: list[list[str]], units: tuple[str | None, ...]) -> tuple[str | None, ...]:
-    """Units from a row of them below the names, where there is one; else as the names state them."""
+    """Return the units from a row of them below the names, where there is one; else as the names state them."""
     for row in rows:
         if _is_unit_row(row):
             cells = [normalise_unit(cell.strip().strip("[]()")) for cell in row]
@@ -215,7 +215,7 @@ def _units_between(rows: list[list[str]], units: tuple[str | None, ...]) -> tupl
 
 
 def _units_above(rows: list[list[str]], units: tuple[str | None, ...]) -> tuple[str | None, ...]:
-    """Units from the row above the names, which some loggers write there; only where no name states any."""
+    """Return the units from the row above the names, which some loggers write there; only where no name states any."""
     if not rows or any(units) or len(rows[-1]) != len(units):
         return units
     cells = [normalise_unit(cell.strip().strip("[]()")) for cell in rows[-1]]
@@ -326,7 +326,7 @@ def _is_separated_by_blanks(lines: list[str]) -> bool:
 
 
 def _header(rows: list[list[str]]) -> tuple[tuple[str, ...], tuple[str | None, ...], int]:
-    """Names, units and the number of header rows (2 with a row of units)."""
+    """Return the names, units and the number of header rows (2 with a row of units)."""
     # A name may be broken into lines where it is quoted.
     pairs = [_name_and_unit(" ".join(cell.split())) for cell in rows[0]]
     names, units = tuple(name for name, _ in pairs), tuple(unit for _, unit in pairs)

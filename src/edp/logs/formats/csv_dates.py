@@ -20,7 +20,7 @@ _MIDNIGHT = "1970-01-01"
 
 
 def dates_of(cells: Sequence[str | None]) -> NDArray[np.datetime64]:
-    """Dates, times of day or both, shape ``(rows,)``, in nanoseconds; an empty cell is missing (NaT).
+    """Return the dates, times of day or both, shape ``(rows,)``, in nanoseconds; an empty cell is missing (NaT).
 
     Raises:
         ValueError: a cell is none of them.

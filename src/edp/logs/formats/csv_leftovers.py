@@ -41,7 +41,7 @@ class Leftovers:
     end_line: int | None
 
     def __bool__(self) -> bool:
-        """Whether there is anything to pass over."""
+        """Return whether there is anything to pass over."""
         return self.first is not None or self.end_line is not None
 
 

@@ -19,7 +19,7 @@ _SPARSE, _SPARSE_ROWS = 0.5, 1000
 
 
 def message_columns(table: CsvTable) -> set[int]:
-    """Places of the columns of a table of messages; empty for any other table."""
+    """Return the places of the columns of a table of messages; empty for any other table."""
     layout = table.layout
     numeric = [i for i, key in enumerate(table.keys) if table.types[key] != pa.string() and layout.names[i]]
     filled = dict.fromkeys(numeric, 0)

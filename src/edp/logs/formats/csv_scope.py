@@ -91,7 +91,7 @@ def scope_head(path: Path, lines: Sequence[str]) -> ScopeHead | None:
 
 
 def _time_places(steps: Sequence[str], width: int) -> list[int]:
-    """Places of time columns that a row of some cells reaches."""
+    """Return the places of time columns that a row of some cells reaches."""
     return [index for index, cell in enumerate(steps[:width]) if cell == _STEP_KEY]
 
 
@@ -136,7 +136,7 @@ def read_scope(path: Path, head: ScopeHead, sample: Sequence[str], encoding: str
 
 
 def _numbers(path: Path, head: ScopeHead, decimal: str, encoding: str) -> NDArray[np.float64]:
-    """All cells below the head, shape ``(row, cell)``, NaN where a row ends before."""
+    """Return all cells below the head, shape ``(row, cell)``, NaN where a row ends before."""
     import pandas as pd
 
     rows = _count_rows(path, head, encoding)

@@ -74,12 +74,12 @@ _GERMAN = rf"^({_GROUPED}|[-+]?[0-9]*,?[0-9]+([eE][-+]?[0-9]+)?)$"
 
 
 def is_grouped(cell: str) -> bool:
-    """Whether a cell, without blanks around it, has points for thousands: ``1.234`` or ``1.234,5``."""
+    """Return whether a cell, without blanks around it, has points for thousands: ``1.234`` or ``1.234,5``."""
     return re.fullmatch(_GROUPED, cell) is not None
 
 
 def has_decimal_commas(rows: list[list[str]], delimiter: str) -> bool:
-    """Whether the comma is the decimal sign; a point may then part thousands."""
+    """Return whether the comma is the decimal sign; a point may then part thousands."""
     cells = [cell.strip() for row in rows for cell in row]
     # 1.234,5 says it whatever stands elsewhere.
     if any("," in cell and is_grouped(cell) for cell in cells):
@@ -114,7 +114,10 @@ def _parse_switch(cells: pa.Array) -> pa.Array | None:
 
 
 def _parse_scaled(cells: pa.Array) -> pa.Array | None:
-    """Numbers with a prefix of SI behind them (``25.1m``), as panels of instruments write them; None for other text."""
+    """Return the numbers with a prefix of SI behind them (``25.1m``), as panels of instruments write them.
+
+    None for other text.
+    """
     cells = pc.utf8_trim_whitespace(cells)
     cells = pc.if_else(pc.is_in(cells, pa.array(NULLS)), pa.scalar(None, pa.string()), cells)
     if cells.null_count == len(cells) or not pc.all(pc.match_substring_regex(cells, _WITH_PREFIX)).as_py():
@@ -289,7 +292,7 @@ class CsvTable:
                 return
 
     def _parse_grouped(self, cells: pa.Array, column_index: int) -> pa.Array:
-        """Numbers of a column of text: those that have points for thousands, or the states of a switch."""
+        """Return the numbers of a column of text: those that have points for thousands, or the states of a switch."""
         numbers = _parse_without_groups(cells) if self.layout.decimal == "," else None
         numbers = _parse_switch(cells) if numbers is None else numbers
         numbers = _parse_scaled(cells) if numbers is None and self.layout.decimal == "." else numbers
@@ -315,12 +318,12 @@ class CsvTable:
         return [cell for batch in self.stream([key]) for cell in batch.column(key).to_pylist()]
 
     def _is_remark(self, row: Any) -> bool:
-        """Whether a row has words behind its last column, as loggers note events; such rows are left out."""
+        """Return whether a row has words behind its last column, as loggers note events; such rows are left out."""
         behind = row.text.split(self.layout.delimiter)[row.expected_columns :]
         return bool(behind) and all(re.search(r"[^\W\d_]{2}", cell) and '"' not in cell for cell in behind)
 
     def _is_torn(self, row: Any) -> bool:
-        """Whether a row has too few cells, and the file ends within it."""
+        """Return whether a row has too few cells, and the file ends within it."""
         if row.actual_columns >= row.expected_columns:
             return False
         end = row.text.encode(self.layout.encoding.removesuffix("-sig"), errors="replace")

@@ -111,7 +111,7 @@ def _columns(recording: Recording) -> list[tuple[str, str, Any]]:
 
 
 def _vectors(recording: Recording) -> list[tuple[str, str, Any]]:
-    """Like `_columns`, with ``name_1``, ``name_2``, ... as the columns of ``name``.
+    """Return the columns like `_columns`, with ``name_1``, ``name_2``, ... for the columns of ``name``.
 
     A column without a channel (``CylPressures_4``, the swing) is NaN.
     """

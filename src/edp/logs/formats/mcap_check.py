@@ -128,7 +128,7 @@ class _Walk:
         self.spans += [(start, 1, unpacked), (max(start, stop), 2, -unpacked)]
 
     def end(self) -> None:
-        """Chunks whose times overlap are unpacked at once; counts of messages are those that bytes can hold."""
+        """Check that overlapping chunks fit into memory, and that message counts are possible for the file size."""
         together = most = 0
         for _, _, size in sorted(self.spans):
             together += size

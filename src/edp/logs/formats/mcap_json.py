@@ -91,7 +91,7 @@ def holds_json(path: Path) -> bool:
 
 
 def read_json_mcap(path: Path) -> RawLog:
-    """All columns of a file.
+    """Return all columns of a file.
 
     Raises:
         DataError: it is damaged, beyond its bounds, or holds no numbers in JSON.
@@ -136,7 +136,7 @@ def _signals(topic: _Topic, facts: EdpMetadata, origin: int) -> Iterator[tuple[s
 
 
 def _topics(path: Path) -> Sequence[_Topic]:
-    """Every channel with its messages, in one go through the file."""
+    """Return every channel with its messages, in one go through the file."""
     by_number: dict[int, _Topic] = {}
     values = 0
     check_memory(path, path.stat().st_size, "its messages", "record shorter files")
@@ -195,7 +195,7 @@ def _flatten(name: str, value: Any, values: dict[str, float], where: str) -> Non
 
 
 def _records(path: Path, view: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """Channels and messages up to the end of the data, those within chunks included."""
+    """Return the channels and messages up to the end of the data, those within chunks included."""
     for kind, body in _walk(view[MAGIC_BYTES:]):
         if kind == _DATA_END:
             return

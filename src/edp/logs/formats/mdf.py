@@ -53,7 +53,7 @@ class MdfFormat:
     libraries = ("asammdf",)
 
     def claims(self, head: bytes) -> bool:
-        """Begins with MDF's file identification."""
+        """Return whether the file starts with MDF's identification."""
         return head.startswith(_MAGIC)
 
     def read(self, path: Path, signal_map: SignalMap) -> RawLog:
@@ -136,7 +136,7 @@ class _File:
                     channel.conversion = None
 
     def convert(self, number: int, channel_index: int, raw: NDArray[Any]) -> NDArray[Any]:
-        """Physical values of a channel."""
+        """Return the physical values of a channel."""
         block = self.conversions.get((number, channel_index))
         if block is None:
             return raw

@@ -171,7 +171,7 @@ class _Walk:
             )
 
     def conversions(self) -> None:
-        """Tables of conversions: no cycle, not deep, and not more of them (or of text) than the file can mean."""
+        """Check conversion tables: without cycles, of limited depth, number and text."""
         seen: dict[int, tuple[int, int]] = {}
         entries = 0
         text = sum(self.text_of(block) for block in self.blocks.values() if block.id not in _DATA)
@@ -186,7 +186,7 @@ class _Walk:
             )
 
     def conversion(self, at: int, seen: dict[int, tuple[int, int]], depth: int) -> tuple[int, int]:
-        """Entries and bytes of text of one conversion, with those within it."""
+        """Return the entries and bytes of text of one conversion, with those within it."""
         if depth > _DEEPEST_CONVERSION:
             raise self.broken(at, "a conversion within itself, or too many within one another")
         if at not in seen:
@@ -245,7 +245,7 @@ class _Walk:
             at = channel.links[0]
 
     def held(self, data: _Block) -> int:
-        """Bytes of records behind a link to data."""
+        """Return the bytes of records behind a link to data."""
         total, at, seen = 0, data.at, set[int]()
         while at:
             if at in seen:

@@ -70,7 +70,7 @@ class Conversion:
         return None if block is None or isinstance(block, bytes) else Conversion(block, self.where, depth + 1)
 
     def __call__(self, raw: NDArray[Any]) -> NDArray[Any]:
-        """Physical values, shape ``(rows,)``.
+        """Return the physical values, shape ``(rows,)``.
 
         Raises:
             DataError: a formula that is not of the grammar, or a table that does not fit itself.
@@ -99,7 +99,7 @@ class Conversion:
             ) from error
 
     def _from_texts(self, raw: NDArray[Any]) -> NDArray[Any]:
-        """Each entry's rows are converted together, so that the time is the rows', not entries times rows."""
+        """Return each entry's rows are converted together, so that the time is the rows', not entries times rows."""
         if self.default is None and not any(self.inner):
             return raw
         entry = self._entries(raw)

@@ -80,6 +80,6 @@ def event_blocks(events: Sequence[LogEvent]) -> list[Any]:
 
 
 def _plain(text: str) -> str:
-    """Text that XML and UTF-8 can hold."""
+    """Return text that XML and UTF-8 can hold."""
     cut = text[:LONGEST_TEXT].encode("utf-8", "replace").decode()
     return "".join(c if c.isprintable() else " " for c in cut)

@@ -81,7 +81,10 @@ class Formula:
         return Formula(tuple(_Parser(_tokens(text)).parse()))
 
     def __call__(self, raw: NDArray[Any]) -> Values:
-        """Physical values of raw ones, float64 of the same shape; NaN and infinite where the formula has no value."""
+        """Return the physical values of raw ones, float64 of the same shape.
+
+        NaN and infinite where the formula has no value.
+        """
         x = np.asarray(raw, dtype=np.float64)
         stack: list[Any] = []
         with np.errstate(all="ignore"):
@@ -115,7 +118,7 @@ _ONE_SIDED: Mapping[str, Callable[[Any], Any]] = {
 
 
 def _tokens(text: str) -> list[tuple[str, str]]:
-    """Kind (number, name, sign) and text of each token."""
+    """Return the kind (number, name, sign) and text of each token."""
     tokens: list[tuple[str, str]] = []
     at = 0
     text = text.rstrip()

@@ -13,7 +13,7 @@ Named = tuple[dict[str, RawSignal], dict[str, str], dict[str, list[str]]]
 
 
 def told_apart(named_signals: Sequence[tuple[str, RawSignal]]) -> Named:
-    """Columns by name.
+    """Return the columns by name.
 
     Args:
         named_signals: the full name of each column (with group or topic), and the column under its short name.

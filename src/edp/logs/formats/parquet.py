@@ -62,7 +62,7 @@ class ParquetFormat:
     libraries = ("pandas",)  # which pyarrow imports when columns become arrays
 
     def claims(self, head: bytes) -> bool:
-        """Begins with Parquet's magic number."""
+        """Return whether the file starts with Parquet's magic number."""
         return head.startswith(_MAGIC)
 
     def read(self, path: Path, signal_map: SignalMap) -> RawLog:
@@ -221,7 +221,7 @@ class _Table:
             ) from error
 
     def whole(self, field_index: int) -> pa.Array:
-        """One column."""
+        """Return one column."""
         parts = [columns[0] for _, columns in self.batches([field_index], 0, self.rows)]
         return pa.concat_arrays(parts) if parts else pa.array([], self.schema.field(field_index).type)
 
@@ -235,7 +235,7 @@ def _group_by_name(names: Sequence[str]) -> dict[str, list[int]]:
 
 
 def _numbers(column: pa.Array, element: int | None = None) -> NDArray[Any]:
-    """Values; NaN for missing ones."""
+    """Return the values; NaN for missing ones."""
     if element is not None:
         column = pc.list_element(column, element)
     if pa.types.is_boolean(column.type):
@@ -334,7 +334,7 @@ def _signals(table: _Table, field_index: int, field: pa.Field, clock: _Clock | N
 
 
 def _width(table: _Table, field_index: int) -> int:
-    """Elements of the lists of a column; 0 where they differ, such as signals of variable size, or are many."""
+    """Return elements of the lists of a column; 0 where they differ, such as signals of variable size, or are many."""
     kind = table.schema.field(field_index).type
     if pa.types.is_fixed_size_list(kind):
         return int(kind.list_size) if kind.list_size <= _LARGEST_LIST else 0

@@ -133,7 +133,7 @@ class _Walk:
                 names = texts
 
     def value(self, kind: Any, path: str, names: list[str], depth: int) -> list[str]:
-        """One field; returns the texts of a list of texts."""
+        """Return one field; returns the texts of a list of texts."""
         self.steps += 1
         if self.steps > _MAX_STEPS:
             raise LongMessageError(f"a message of more than {_MAX_STEPS:,} fields")
@@ -203,7 +203,7 @@ class _Walk:
 def columns_of(
     raws: Sequence[bytes], names: Sequence[str], message_type: str, types: Types, cdr: bool
 ) -> list[NDArray[Any]]:
-    """Numbers of the named fields in many messages of one type, each an array of shape ``(message,)``.
+    """Return the numbers of the named fields in many messages of one type, each an array of shape ``(message,)``.
 
     float32 where the field is, else float64; whole seconds and nanoseconds keep every digit. A message without the
     field, whose list is shorter, has NaN.

@@ -49,7 +49,7 @@ class BagFormat:
         self.magic = magic
 
     def claims(self, head: bytes) -> bool:
-        """Begins with the container's magic number."""
+        """Return whether the file starts with the container's magic number."""
         return head.startswith(self.magic)
 
     def read(self, path: Path, signal_map: SignalMap) -> RawLog:
@@ -134,7 +134,7 @@ class _Bag:
         self.scan(chosen, keep)
 
     def scan(self, topics: Sequence[_Topic], keep: bool) -> None:
-        """Stamps of some topics, and with `keep` their wanted columns."""
+        """Read the stamps of some topics, and with `keep` their selected columns."""
         by_name = {topic.name: topic for topic in topics}
         paths = {topic.name: [*topic.stamp_paths, *(topic.list_wanted_paths() if keep else [])] for topic in topics}
         collected = {name: _Collected(by_name[name], paths[name]) for name in by_name}
@@ -236,7 +236,10 @@ class _Topic:
         return columns_of(raws, paths, self.kind, self.types, self.bag.cdr)
 
     def stamps(self) -> Column:
-        """Seconds since the first message of the bag, by the message headers if they state time, or by the log."""
+        """Return the seconds since the first message of the bag, by the message headers if they state time.
+
+        Or by the log.
+        """
         if self._stamps is None and self.list_wanted_paths():
             _ = self.bag.together
         if self._stamps is None:

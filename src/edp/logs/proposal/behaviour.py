@@ -148,7 +148,7 @@ def behaviour_of(column: LogColumn) -> Behaviour:
 
 
 def _loses_rows(moving: Column) -> bool:
-    """Whether most steps have one size and nearly all others are a few times it."""
+    """Return whether most steps have one size and nearly all others are a few times it."""
     if len(moving) < _MIN_STEPS:
         return False
     step = float(np.median(moving))
@@ -191,7 +191,10 @@ def relations_of(columns: list[LogColumn]) -> dict[str, Relation]:
 
 
 def _is_turned_round(name: str, relations: Mapping[str, Relation]) -> bool:
-    """Whether a column passes for the change of its own change: in a steady swing each is the change of the other."""
+    """Return whether a column passes for the change of its own change.
+
+    In a steady swing each is the change of the other.
+    """
     relation = relations[name]
     back = relations.get(relation.other)
     mutual = back is not None and relation.how == back.how == "change" and back.other == name
@@ -281,7 +284,7 @@ def _change(own: Column, theirs: Column) -> tuple[float, float] | None:
 
 
 def _leads(own: Column, theirs: Column, level: float) -> bool:
-    """Whether a column is what another one is to follow: the same level, in steps or earlier.
+    """Return whether a column is what another one is to follow: the same level, in steps or earlier.
 
     Sensors side by side have one level, too; neither leads.
     """

@@ -133,7 +133,7 @@ def look_at_log(path: Path, experiment: str | None = None) -> LogLook:
 
 
 def names_in_log(path: Path) -> frozenset[str]:
-    """Names of the columns of a log, by the beginning of a text.
+    """Return the names of the columns of a log, by the beginning of a text.
 
     Raises:
         DataError: the file cannot be read.
@@ -324,7 +324,7 @@ def _is_numeric(signal: RawSignal) -> bool:
 
 
 def _ranges(length: int, first: int, later: int) -> list[tuple[int, int]]:
-    """Rows of the beginning, the middle and the end; all of a short log."""
+    """Return the rows of the beginning, the middle and the end; all of a short log."""
     if length <= first:
         return [(0, length)]
     middle, last = max(first, (length - later) // 2), max(first, length - later)

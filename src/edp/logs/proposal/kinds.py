@@ -63,7 +63,7 @@ def _numbers(why: str, check: str, confidence: float = 0.5) -> KindGuess:
 
 
 def kind_of(column: LogColumn, behaviour: Behaviour, family: int) -> KindGuess:
-    """Kind and unit of one column.
+    """Return the kind and unit of one column.
 
     Args:
         column: the column.
@@ -189,7 +189,9 @@ def unit_by_range(kind: Kind, behaviour: Behaviour) -> str | None:
 
 
 def kind_of_change(relation: Relation, other: KindGuess, rate_hz: float | None) -> KindGuess | None:
-    """Kind and unit of a column that is the change in time of one whose kind and unit are known; None for others.
+    """Return the kind and unit of a column that is the change in time of one whose kind and unit are known.
+
+    None for others.
 
     Args:
         relation: relation of the column to the other column.

@@ -175,7 +175,7 @@ _STAMP = re.compile(r"(?:^|[./])header[./]stamp(?:[./](?:n?secs?|nanosec))?$")
 
 
 def is_counter_name(name: str) -> bool:
-    """Whether a word of a name counts something."""
+    """Return whether a word of a name counts something."""
     return any(word in _COUNTERS for word in words_of(name))
 
 
@@ -190,7 +190,10 @@ def is_sample_time_name(name: str) -> bool:
 
 
 def is_stamp_name(name: str) -> bool:
-    """Whether a field of a message is the time at which it was sent: a stamp of ROS, whole or in its two parts."""
+    """Return whether a field of a message is the time at which it was sent.
+
+    A stamp of ROS, whole or in its two parts.
+    """
     return _STAMP.search(name) is not None
 
 

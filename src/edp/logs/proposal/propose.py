@@ -187,7 +187,7 @@ def _unify_kinds(columns: Sequence[LogColumn], kinds: dict[str, KindGuess]) -> d
 
 
 def _is_free(column: LogColumn, behaviour: Behaviour, clock: ClockGuess) -> bool:
-    """Whether a column may be related to others: no time, no constant, no counter, no label."""
+    """Return whether a column may be related to others: no time, no constant, no counter, no label."""
     idle = behaviour.constant or behaviour.counts or behaviour.switches or (behaviour.restarts and behaviour.whole)
     return column.name != clock.column and column.name not in clock.beside and not idle
 
@@ -259,14 +259,17 @@ def _aside(name: str, behaviour: Behaviour, kind: KindGuess, rate_hz: float | No
 
 
 def is_known(name: str) -> bool:
-    """Whether a name is of the vocabulary, whose constants may be wanted (conflux lines that a machine lacks)."""
+    """Return whether a name is of the vocabulary.
+
+    Whose constants may be wanted (conflux lines that a machine lacks).
+    """
     return name in VOCABULARY
 
 
 def _role(
     column: LogColumn, behaviour: Behaviour, kind: KindGuess, relation: Relation | None, steered: dict[str, str]
 ) -> tuple[str, float, str]:
-    """Role of a column that moves, how sure, and why."""
+    """Return the role of a column that moves, how sure, and why."""
     name, word = column.name, role_by_word(column.name)
     if name in TABLE_A1:
         return ("command" if kind.kind in _COMMANDS else "measured"), 0.95, "a name of Table A.1"
@@ -319,7 +322,7 @@ def _is_repeated(columns: dict[str, LogColumn], name: str, other: str) -> bool:
 
 
 def _name_channels(guesses: Sequence[ColumnGuess]) -> list[ColumnGuess]:
-    """Channels under names that every export takes and a person can type; too many ones are left out."""
+    """Return the channels under names that every export takes and a person can type; too many ones are left out."""
     named, used, count = [], set[str](), 0
     for i, guess in enumerate(guesses):
         channel = guess.channel

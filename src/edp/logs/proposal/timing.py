@@ -67,7 +67,7 @@ class Timing:
 
 
 def timing_of(looks: Sequence[LogLook], clock: ClockGuess, mapped: Sequence[str]) -> Timing:
-    """Rates and repairs of logs with one map.
+    """Return the rates and repairs of logs with one map.
 
     Args:
         looks: the logs.
@@ -90,7 +90,7 @@ def timing_of(looks: Sequence[LogLook], clock: ClockGuess, mapped: Sequence[str]
 
 
 def repair_table(repairs: Sequence[str]) -> dict[str, str]:
-    """Repairs as a data-set file has them."""
+    """Return the repairs as a data-set file has them."""
     return {defect: how for defect, _, how in (repair.partition("=") for repair in repairs)}
 
 
@@ -126,7 +126,7 @@ def _choose_falling_repair(clock: Clock) -> str:
 
 
 def _choose_gap_repair(clock: Clock) -> str:
-    """``cut`` where a long break leaves nearly all rows on one side, else ``hold``."""
+    """Return ``cut`` where a long break leaves nearly all rows on one side, else ``hold``."""
     breaks = clock.gaps[np.diff(clock.stamps)[clock.gaps] > max(_LONG_S, _LONG_STEPS * clock.step_s)]
     if not len(breaks):
         return "hold"

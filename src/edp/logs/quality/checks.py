@@ -121,7 +121,7 @@ def look_at(channel: Channel, values: Values, rate_hz: float, in_gaps: int = 0) 
 
 
 def place_of(row: int, rate_hz: float) -> str:
-    """Row and time for messages."""
+    """Return the row and time for messages."""
     return f"row {row} (t = {typed(row / rate_hz)} s)"
 
 
@@ -210,7 +210,7 @@ def likely_unit(kind: Kind, largest: float) -> str | None:
 
 
 def _check_stuck(at: Looked) -> list[Finding]:
-    """Long runs of one value between the ends of the range.
+    """Return the long runs of one value between the ends of the range.
 
     In a channel whose last digit moves all the time half a second means a frozen sensor or a stopped sender, also at
     zero. Other channels may rest at zero, and a command may be held: that is a note after a second. Between coarse
@@ -239,7 +239,7 @@ def _check_stuck(at: Looked) -> list[Finding]:
 
 
 def _check_clipped(at: Looked) -> list[Finding]:
-    """Noise that stops exactly at an end of the range: the sensor or the logger reaches no farther.
+    """Return the noise that stops exactly at an end of the range: the sensor or the logger reaches no farther.
 
     Zero is passed over: a pilot pressure or a flow rests there.
     """

@@ -14,7 +14,7 @@ PIECE_BYTES = 32 * 2**20
 
 
 def columns(recording: Recording) -> Iterator[Values]:
-    """Each column of the values, float32, shape ``(time,)``; some are copied at once, and at least one."""
+    """Return each column of the values, float32, shape ``(time,)``; some are copied at once, and at least one."""
     values = recording.values
     each = max(1, PIECE_BYTES // max(1, 4 * len(values)))
     for first in range(0, values.shape[1], each):

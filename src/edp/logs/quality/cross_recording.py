@@ -54,7 +54,7 @@ class DataQuality:
         return verdict_of([*every, *self.findings])
 
     def to_json(self) -> dict[str, object]:
-        """Plain values."""
+        """Return the plain values."""
         return {
             "verdict": self.verdict,
             "errors": self.errors,

@@ -149,7 +149,7 @@ def _is_misspelt(name: str) -> bool:
 def _check_digest(
     raw: RawLog, recording: Recording, signal_map: SignalMap, rows: tuple[int, int | None] | None
 ) -> list[Finding]:
-    """Whether reading would refuse the values, as not those that EDP wrote."""
+    """Return whether reading would refuse the values, as not those that EDP wrote."""
     mapped = signal_map.channels or signal_map.rate_hz is not None or signal_map.sample_time_s is not None
     if raw.digest is None or mapped or rows is not None or recording.digest == raw.digest:
         return []
@@ -191,7 +191,7 @@ def _readable(sources: list[ChannelSource]) -> tuple[list[ChannelSource], list[F
 
 
 def _find_near_misses(raw: RawLog) -> list[Finding]:
-    """Columns that are not taken although their names nearly are in the vocabulary."""
+    """Return the columns that are not taken although their names nearly are in the vocabulary."""
     findings = []
     for name in islice(raw.signals, _MAX_NAMES):
         if len(name) <= _LONGEST_MISS and name not in VOCABULARY and raw.signals[name].kind is None:
@@ -203,7 +203,7 @@ def _find_near_misses(raw: RawLog) -> list[Finding]:
 
 
 def _unit_clashes(raw: RawLog, signal_map: SignalMap) -> list[Finding]:
-    """Units of the map that differ from the file's."""
+    """Return the units of the map that differ from the file's."""
     findings = []
     for entry in signal_map.channels:
         stated = raw.signal(entry.column).unit if entry.column in raw else None

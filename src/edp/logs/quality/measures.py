@@ -90,7 +90,7 @@ def measure(values: Values) -> Measures:
 
 
 def _is_busy(same: NDArray[np.bool_], at_end: NDArray[np.bool_]) -> bool:
-    """Few equal neighbours away from the ends of the range, runs of ten and more left out, and few of those."""
+    """Return few equal neighbours away from the ends of the range, runs of ten and more left out, and few of those."""
     starts, stops = runs(same & ~at_end)
     lengths = stops - starts
     constant_samples = int(lengths[lengths >= _HELD].sum())
@@ -141,7 +141,9 @@ def update_every(steps: Values) -> float:
 
 
 def noise_floor(values: Values) -> tuple[float, bool]:
-    """Deviation of white noise where the channel is quietest, in its own unit, and whether it is there all the time.
+    """Return the deviation of white noise where the channel is quietest, in its own unit.
+
+    And whether it is there all the time.
 
     Third differences take out motion and keep 20 times the variance of white noise. Of their mean squares over blocks
     of 128 samples, blocks without any change left out, the lower quartile is taken, and set right for being one.
@@ -162,7 +164,7 @@ def noise_floor(values: Values) -> tuple[float, bool]:
 
 @np.errstate(over="ignore", invalid="ignore")
 def spikes(values: Values, floor: float) -> NDArray[np.intp]:
-    """Rows of single samples that leave both neighbours by over half the usual range, while these agree.
+    """Return the rows of single samples that leave both neighbours by over half the usual range, while these agree.
 
     The usual range is that between the 0.5 and 99.5 % quantiles, and no less than forty times the noise.
     """

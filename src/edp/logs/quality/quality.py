@@ -111,7 +111,7 @@ class QualityReport:
         return verdict_of(self.findings)
 
     def to_json(self) -> dict[str, object]:
-        """Plain JSON values; a number that is not finite becomes None."""
+        """Return the plain JSON values; a number that is not finite becomes None."""
         return {**json_value(self), "verdict": self.verdict}
 
 

@@ -94,7 +94,7 @@ class Repeat:
         )
 
     def to_json(self) -> dict[str, object]:
-        """Plain values."""
+        """Return the plain values."""
         return {**asdict(self), "renamed": [list(pair) for pair in self.renamed], "what": self.what}
 
 
@@ -117,7 +117,7 @@ def find_repeats(sketches: Sequence[Sketch]) -> tuple[Repeat, ...]:
 
 
 def _equal_pairs(sketches: Sequence[Sketch]) -> list[tuple[int, int]]:
-    """Each recording with the first that has the same samples."""
+    """Return each recording with the first that has the same samples."""
     seen: dict[str, int] = {}
     pairs = [(seen.setdefault(entry.digest, i), i) for i, entry in enumerate(sketches)]
     return [(first, second) for first, second in pairs if first != second]
@@ -231,7 +231,7 @@ def _select_windows(windows: int) -> NDArray[np.int64]:
 
 
 def _fingerprints(values: Floats, places: NDArray[np.int64]) -> tuple[Floats, NDArray[np.int64]]:
-    """Fingerprints ``(window, 12)`` of those windows in which the channel moves, and where they begin.
+    """Return the fingerprints ``(window, 12)`` of those windows in which the channel moves, and where they begin.
 
     Args:
         values: blocks of a channel.
@@ -325,7 +325,7 @@ def _compare_pair(
 
 
 def _pairs(a: Sketch, b: Sketch, rows: slice, lag: int) -> list[tuple[int, int]]:
-    """Columns of the same name, or where no name is shared, those that agree best at the lag, each once."""
+    """Return the columns of the same name, or where no name is shared, those that agree best at the lag, each once."""
     shared = [(i, b.channels.index(name)) for i, name in enumerate(a.channels) if name in b.channels]
     if shared:
         return shared
@@ -344,14 +344,14 @@ def _pairs(a: Sketch, b: Sketch, rows: slice, lag: int) -> list[tuple[int, int]]
 
 
 def _windows(values: Floats) -> NDArray[np.float64]:
-    """Shape ``(window, sample, channel)``, each window about its mean."""
+    """Return the shape ``(window, sample, channel)``, each window about its mean."""
     windows = values.reshape(-1, WINDOW, values.shape[1]).astype(np.float64)
     centred: NDArray[np.float64] = windows - windows.mean(axis=1, keepdims=True)
     return centred
 
 
 def _alike(mine: NDArray[np.float64], theirs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Correlation by window and channel, shape ``(window, channel)``; NaN where neither moves."""
+    """Return the correlation by window and channel, shape ``(window, channel)``; NaN where neither moves."""
     sizes = np.sqrt((mine**2).mean(axis=1)), np.sqrt((theirs**2).mean(axis=1))
     moves = np.maximum(*sizes) > _MOVES
     products = (mine * theirs).mean(axis=1)

@@ -240,7 +240,7 @@ def _drop_lost(index: StoreIndex, top: Path) -> StoreIndex:
 
 
 def _size(path: Path) -> int:
-    """Bytes of a regular file; -1 for anything else."""
+    """Return the bytes of a regular file; -1 for anything else."""
     return status_of(path).st_size if is_file_at(path) and not is_link_at(path) else -1
 
 

@@ -118,12 +118,12 @@ class StoreIndex:
     refused: tuple[RefusedLog, ...] = field(default=())
 
     def hours(self) -> float:
-        """Duration of all recordings."""
+        """Return the duration of all recordings."""
         return sum(entry.samples / entry.rate_hz for entry in self.recordings) / 3600.0
 
 
 def is_store(path: str | Path) -> bool:
-    """Whether a folder is a store, finished or not."""
+    """Return whether a folder is a store, finished or not."""
     folder = Path(path)
     return is_file_at(folder / INDEX) or (is_folder_at(folder / ROWS) and is_file_at(folder / LOCK))
 

@@ -54,7 +54,7 @@ def read_store(folder: str | Path) -> list[Recording]:
 
 
 def recording_of(entry: StoreEntry, index: StoreIndex, values: FloatArray) -> Recording:
-    """One recording of a file of samples."""
+    """Return one recording of a file of samples."""
     channels = index.lists[entry.channels]
     where = f"meta of recording {entry.name[:80]!r}"
     meta = object_with(parse_json(entry.meta, where, DataError), (), where, DataError)
@@ -81,7 +81,7 @@ def check_store(folder: str | Path) -> StoreIndex:
 
 
 def _map_file(folder: Path, file: RowsFile) -> FloatArray:
-    """Memory-map a data file, shape ``(values,)``. Changes remain in this process."""
+    """Return the memory-map a data file, shape ``(values,)``. Changes remain in this process."""
     size = _status(folder, file).st_size
     path = rows_path(folder, file.key)
     if size != file.bytes or size % NUMBER_BYTES or size == 0:

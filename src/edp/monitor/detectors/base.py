@@ -44,7 +44,7 @@ class Detector(ABC):
 
     @abstractmethod
     def _take(self, rows: Array) -> Array:
-        """`step` on rows that are finite."""
+        """Return `step` on rows that are finite."""
 
     @abstractmethod
     def reset(self, lanes: Bools | None = None) -> None:

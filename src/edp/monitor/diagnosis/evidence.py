@@ -33,7 +33,7 @@ def features(rows: Array) -> Array:
 
 
 def mean_features(rows: Array) -> Array:
-    """Mean features over blocks, NaN for summaries that were never there, shape (2 * summaries,)."""
+    """Return the mean features over blocks, NaN for summaries that were never there, shape (2 * summaries,)."""
     values = features(rows)
     there = np.isfinite(values)
     counts = there.sum(axis=0)
@@ -85,7 +85,7 @@ class Scatter:
 
     @staticmethod
     def fit(sessions: Sequence[Array]) -> Scatter:
-        """From conditioned rows of healthy sessions, shape (blocks, summaries) each.
+        """Fit to conditioned rows of healthy sessions, shape (blocks, summaries) each.
 
         Raises:
             DataError: too few sessions of `LONG` blocks.

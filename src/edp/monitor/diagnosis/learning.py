@@ -153,7 +153,7 @@ def _select_left_out(
 
 
 def _would_be_found(change: Array, noise: Sequence[Array]) -> bool:
-    """Whether a direction is far enough off at the onset or after it."""
+    """Return whether a direction is far enough off at the onset or after it."""
     return any(float(np.max(change[part] ** 2 / noise[part])) > MIN_CHANGE**2 for part in (0, 1))
 
 
@@ -174,7 +174,7 @@ def _choose_dictionary(judged_sessions: Sequence[_Judged], whole: Dictionary) ->
 
 
 def _confusions(judged_sessions: Sequence[_Judged], whole: Dictionary) -> tuple[Any, ...]:
-    """Pairs of faults that left-out sessions confuse; both signs of a fault count as one."""
+    """Return the pairs of faults that left-out sessions confuse; both signs of a fault count as one."""
     names = sorted({_name(fault) for fault in whole.classes})
     if not judged_sessions:
         return ()

@@ -104,7 +104,7 @@ class Candidates:
 
 @lru_cache(maxsize=2)
 def _all_candidates(dictionary: Dictionary, further: bool) -> Candidates:
-    """Those of a monitor that is at work: every alarm compares with the same ones."""
+    """Return the candidates of the monitor, with which every alarm is compared."""
     return candidates(dictionary, further)
 
 
@@ -121,7 +121,7 @@ def candidates(dictionary: Dictionary, further: bool = True) -> Candidates:
 
 
 def likelihoods(tried: Candidates, seen: Sequence[Seen | None], changing: float) -> tuple[Array, Array]:
-    """Logarithms of the densities of the evidence, and mean squared misfits, shape (candidates,) each."""
+    """Return the logarithms of the densities of the evidence, and mean squared misfits, shape (candidates,) each."""
     logs, misfits, count = np.zeros(len(tried.owner)), np.zeros(len(tried.owner)), 0
     for part, entry in enumerate(seen):
         if entry is None:
@@ -136,7 +136,7 @@ def likelihoods(tried: Candidates, seen: Sequence[Seen | None], changing: float)
 
 
 def judged(tried: Candidates, logs: Array, misfits: Array, dictionary: Dictionary) -> Match:
-    """Probabilities of the faults from the densities of the candidates."""
+    """Return the probabilities of the faults from the densities of the candidates."""
     scaled = logs / dictionary.temperature
     best = np.maximum.reduceat(scaled, tried.firsts)
     sums = np.add.reduceat(np.exp(scaled - best[tried.owner]), tried.firsts)
@@ -152,7 +152,7 @@ def judged(tried: Candidates, logs: Array, misfits: Array, dictionary: Dictionar
 
 
 def _list_sizes(dictionary: Dictionary, number: int, fault: FaultClass, beyond: bool) -> tuple[Array, Array]:
-    """Sizes of a fault that are tried and their signatures, shapes (sizes,) and (2, sizes, features)."""
+    """Return the sizes of a fault that are tried and their signatures, shapes (sizes,) and (2, sizes, features)."""
     rows = dictionary.rows_of(number)
     signatures = dictionary.signatures[:, rows]
     if not fault.sizes:

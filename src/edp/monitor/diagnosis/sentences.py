@@ -47,7 +47,9 @@ def clock(seconds: float, start: datetime | None = None) -> str:
 
 
 def alarm_sentence(causes: Sequence[Cause], since_s: float, start: datetime | None = None) -> str:
-    """One sentence for an alarm, such as "head pressure of the boom reads 9.8 bar too high since 14:02:11; 0.93".
+    """Return one sentence for an alarm, such as "head pressure of the boom reads 9.8 bar too high since 14:02:11.
+
+    0.93".
 
     Args:
         causes: the most likely one first; may be empty where there is no dictionary.
@@ -70,5 +72,5 @@ def alarm_sentence(causes: Sequence[Cause], since_s: float, start: datetime | No
 
 
 def component_probability(causes: Sequence[Cause], component: str) -> float:
-    """Probability of all causes of one part."""
+    """Return the probability of all causes of one part."""
     return sum(cause.probability for cause in causes if cause.component == component)

@@ -66,7 +66,7 @@ class Dictionary:
     provenance: Mapping[str, object] = field(default_factory=dict)
 
     def rows_of(self, number: int) -> NDArray[np.int64]:
-        """Signatures of a fault, the smallest size first."""
+        """Return the signatures of a fault, the smallest size first."""
         rows = np.flatnonzero(self.owner == number)
         return rows[np.argsort(np.abs(self.sizes[rows] - self.classes[number].neutral), kind="stable")]
 
@@ -74,7 +74,7 @@ class Dictionary:
 def signatures_of(
     classes: Sequence[FaultClass], owner: Sequence[int], sizes: Sequence[float], changes: Array
 ) -> tuple[Array, NDArray[np.int64], Array]:
-    """Mean signatures of each fault and size.
+    """Return the mean signatures of each fault and size.
 
     Args:
         classes: the faults.

@@ -199,7 +199,7 @@ def slow_channels(channels: Sequence[Channel], sessions: Sequence[Recording]) ->
 def match_pairs(
     channels: Sequence[Channel], sessions: Sequence[Recording], rate_hz: float, least: float
 ) -> list[tuple[Channel, Channel, float]]:
-    """Levels with the rates that belong to them: the best match of each level, with the gain of the rate."""
+    """Return the levels with the rates that belong to them: the best match of each level, with the gain of the rate."""
     ticks = max(1, round(MATCH_S * rate_hz))
     pairs = []
     for kind, rate_kind in RATE_OF.items():
@@ -217,7 +217,7 @@ def match_pairs(
 
 
 def _match(level: str, rate: str, sessions: Sequence[Recording], ticks: int, rate_hz: float) -> tuple[float, float]:
-    """Correlation of the changes of a level with the integral of a rate, and the gain of the latter."""
+    """Return the correlation of the changes of a level with the integral of a rate, and the gain of the latter."""
     xy = xx = yy = 0.0
     rows = 0
     for session in sessions:

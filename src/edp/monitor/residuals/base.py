@@ -183,7 +183,7 @@ class ResidualSource(ABC):
         return self
 
     def unlearned(self, recording: Recording) -> str:
-        """Why it is silent in a part of a recording that healthy logs do not cover; empty where it is not."""
+        """Return why it is silent in a part of a recording that healthy logs do not cover; empty where it is not."""
         return ""
 
     @abstractmethod
@@ -266,7 +266,7 @@ def texts_of(values: Any, what: str) -> tuple[str, ...]:
 
 
 def residuals_of(source: ResidualSource, recordings: Sequence[Recording], streams: int = 16) -> list[Rows]:
-    """Residuals of whole recordings, each from its start, shape (ticks, residuals) each.
+    """Return the residuals of whole recordings, each from its start, shape (ticks, residuals) each.
 
     A channel that a recording lacks is missing throughout.
     """
@@ -299,7 +299,7 @@ def sisters_of(sources: Sequence[ResidualSource], tolerance: float, number: int)
 
 
 def rows_of(recording: Recording, names: Sequence[str]) -> Rows:
-    """Values of the named channels, shape (ticks, names); NaN for a channel that the recording lacks."""
+    """Return the values of the named channels, shape (ticks, names); NaN for a channel that the recording lacks."""
     values = np.full((recording.samples, len(names)), np.nan, np.float32)
     for column, name in enumerate(names):
         if name in recording.channel_names:
@@ -320,7 +320,7 @@ def residual_labels(plain: Mapping[str, object]) -> tuple[tuple[str, ...], tuple
 
 
 def mean_inputs(material: FitMaterial, inputs: Sequence[str]) -> Rows:
-    """Mean of each input over the sessions that train, shape (inputs,)."""
+    """Return the mean of each input over the sessions that train, shape (inputs,)."""
     means = [session.select(inputs).mean(axis=0, dtype=np.float64) for session in material.train]
     return np.asarray(np.mean(means, axis=0), dtype=np.float32)
 

@@ -138,7 +138,7 @@ class CyclesSpec(ResidualSpec):
         return Cycles(inputs, template, width, mean_inputs(material, inputs), bool(self.period_s))
 
     def _cycles(self, material: FitMaterial, inputs: Sequence[str]) -> Array:
-        """All whole cycles of the healthy logs, shape (cycles, ticks, inputs)."""
+        """Return all whole cycles of the healthy logs, shape (cycles, ticks, inputs)."""
         logs = (*material.train, *material.validation)
         exact = self.period_s * material.rate_hz if self.period_s else float(min(log.samples for log in logs))
         ticks = round(exact)

@@ -58,7 +58,7 @@ class SpoolModel:
     play: Singles
 
     def of_sister(self, rng: np.random.Generator, tolerance: float, rate_hz: float) -> SpoolModel:
-        """Spools of another machine of the series; see `ResidualSource.of_sister`."""
+        """Return the spools of another machine of the series; see `ResidualSource.of_sister`."""
         gain, dead, play = (
             values * (1.0 + rng.uniform(-tolerance, tolerance, values.shape))
             for values in (self.gain, self.dead, self.play)
@@ -130,7 +130,7 @@ def _stage(values: Singles, stage: Singles, state: Singles) -> tuple[Singles, Si
 
 
 def played(values: Singles, width: np.float32, before: Singles) -> tuple[Singles, Singles]:
-    """Output of play: it stays where it is until its input is more than `width` away.
+    """Return the output of play: it stays where it is until its input is more than `width` away.
 
     A tick limits what was before to a range, and two such limits are one: all ticks take a few rounds instead of a
     loop, with the same bits, since limits round nothing.
@@ -283,14 +283,14 @@ def lines_of(spots: ChamberPlaces, rows: Singles, rates: Singles) -> list[Single
 
 
 def hats(travel: Singles) -> Array:
-    """Weights of the knots behind the first at a travel, shape (..., knots - 1): a curve is their sum."""
+    """Return the weights of the knots behind the first at a travel, shape (..., knots - 1): a curve is their sum."""
     knots = KNOTS.astype(np.float64)
     inside = np.clip(np.asarray(travel, np.float64), knots[0], knots[-1])
     return np.stack([np.interp(inside, knots, column) for column in np.eye(len(knots))[1:]], axis=-1)
 
 
 def slopes_of(values: Array) -> Array:
-    """Slopes of curves from each knot on, the last one zero, shape (paths, knots)."""
+    """Return the slopes of curves from each knot on, the last one zero, shape (paths, knots)."""
     slopes = np.zeros_like(values)
     slopes[:, :-1] = np.diff(values, axis=1) / np.diff(KNOTS.astype(np.float64))
     return slopes

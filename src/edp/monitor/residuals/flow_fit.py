@@ -83,7 +83,7 @@ def fit_chambers(
 
 
 def _axes_of(material: FitMaterial) -> list[Axis]:
-    """Axes with a command, a velocity and both pressures that are watched."""
+    """Return axes with a command, a velocity and both pressures that are watched."""
     kinds = {channel.name: channel.kind for channel in material.channels}
     return [
         axis
@@ -124,7 +124,7 @@ def _places(
 
 
 def _model(axis: Axis, names: Sequence[str], gains: Sequence[float], numbers: Array, rate_hz: float) -> SpoolModel:
-    """Spools of an axis by dead time, frequency and play, and dead time and frequency of the second."""
+    """Return the spools of an axis by dead time, frequency and play, and dead time and frequency of the second."""
     commands = [axis.command, *([axis.conflux] if axis.conflux else [])]
     timings = [(numbers[0], numbers[1]), (numbers[-2], numbers[-1])][: len(commands)]
     at = {name: i for i, name in enumerate(names)}
@@ -208,14 +208,14 @@ def _terms(
 
 
 def _columns(part: Part) -> Array:
-    """Columns of the regression, shape (ticks, paths (knots - 1) + LINES)."""
+    """Return the columns of the regression, shape (ticks, paths (knots - 1) + LINES)."""
     paths, lines = part[:2]
     curves = [hats(travel) * np.asarray(drive, np.float64)[:, None] for travel, drive in paths]
     return np.concatenate([*curves, np.stack(lines, axis=1).astype(np.float64)], axis=1)
 
 
 def _solve_robustly(columns: Array, target: Array) -> Array:
-    """Least squares, with a trace of ridge for what never opens, and once more without gross ticks."""
+    """Fit by least squares with a small ridge penalty, and again without gross outliers."""
     size = np.sqrt(np.square(columns).mean(axis=0))
     size = np.where(size > 1e-12, size, 1e-12)
     keep: NDArray[np.bool_] = np.ones(len(target), dtype=bool)
@@ -241,7 +241,7 @@ def _compute_remaining(
 
 
 def _curves(spots: ChamberPlaces, model: SpoolModel, sessions: Sequence[Singles], rate_hz: float, rows: int) -> Curves:
-    """Numbers of a chamber by all sessions that train."""
+    """Return the numbers of a chamber by all sessions that train."""
     stride = max(1, sum(map(len, sessions)) // rows)
     parts = [_terms(spots, model, session, rate_hz, lambda v: v[50::stride]) for session in sessions]
     target = np.concatenate([part[2] for part in parts]).astype(np.float64) * spots.sign
@@ -323,7 +323,7 @@ def _assemble_chambers(
     places: Sequence[ChamberPlaces],
     curves: Sequence[Curves],
 ) -> tuple[tuple[str, ...], SpoolModel, list[Fitted]]:
-    """All chambers with the inputs that they read, and their spools as one model."""
+    """Return all chambers with the inputs that they read, and their spools as one model."""
     inputs, own, first = _Numbered([]), list(dict.fromkeys(map(id, models))), {}
     apart = {id(model): model for model in models}
     for key in own:

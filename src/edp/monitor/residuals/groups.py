@@ -31,7 +31,7 @@ class Group:
 
 
 def select_sensed(channels: Sequence[Channel]) -> tuple[Channel, ...]:
-    """Channels that sensors can give: without truth of a simulation."""
+    """Return the channels that sensors can give: without truth of a simulation."""
     truth = {*EXTRA_CHANNELS, *GROUND_CHANNELS, *MOTOR_CHANNELS, *FAULT_CHANNELS} - {*SENSED}
     return tuple(channel for channel in channels if channel.name not in truth)
 
@@ -48,7 +48,7 @@ def groups_of(channels: Sequence[Channel]) -> tuple[Group, ...]:
 
 
 def _excavator_groups(names: set[str]) -> tuple[Group, ...]:
-    """Velocities, head pressures, rod pressures, pump pressures, pilots."""
+    """Return the velocities, head pressures, rod pressures, pump pressures, pilots."""
     numbers = range(1, 4)
     velocities = tuple(f"CylVels_{n}" for n in numbers)
     shadows = (*(f"CylAcc_{n}" for n in numbers), *(f"CylStroke_{n}" for n in numbers))

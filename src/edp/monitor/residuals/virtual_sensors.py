@@ -196,7 +196,7 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
         return VirtualSensors(bundles, inputs, mean_inputs(material, inputs), self.every)
 
     def _select_inputs(self, group: Group, material: FitMaterial) -> tuple[Channel, ...]:
-        """Channels that the network of a group reads."""
+        """Return the channels that the network of a group reads."""
         apart = {*group.judged, *group.unread}
         return tuple(channel for channel in material.channels if channel.name not in apart)
 
@@ -218,7 +218,7 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
 
 
 def slower(material: FitMaterial, every: int) -> FitMaterial:
-    """Material in which only every n-th tick was recorded."""
+    """Return the material in which only every n-th tick was recorded."""
     rate = material.rate_hz / every
     train, validation = (
         tuple(replace(part, values=part.values[::every], rate_hz=rate) for part in parts)

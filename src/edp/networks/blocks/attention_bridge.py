@@ -100,7 +100,7 @@ class _Bridge(Streaming):
         return y, (keys[:, ticks:], values[:, ticks:], hidden[:, ticks:])
 
     def _attend(self, query: Tensor, keys: Tensor, values: Tensor, hidden: Tensor) -> Tensor:
-        """Each query row attends to its own `window` columns: row i to columns i to ``i + window - 1``."""
+        """Return each query row attends to its own `window` columns: row i to columns i to ``i + window - 1``."""
         (batch, ticks, _), columns = query.shape, keys.shape[1]
         q, k, v = (p.unflatten(-1, (self.heads, -1)).transpose(1, 2).flatten(0, 1) for p in (query, keys, values))
         lag = torch.arange(columns, device=q.device) - torch.arange(ticks, device=q.device)[:, None]
@@ -130,7 +130,10 @@ class _Bridge(Streaming):
             return build.combine("sum2", BinaryOperation.ADD, y, fed)
 
     def costs(self) -> list[Cost]:
-        """Scores and weighted values cost ``2 W C`` a tick; a window of W ticks costs the thesis's ``2 W^2 C``."""
+        """Return the costs of scores and weighted values.
+
+        ``2 W C`` per sample; a window of W samples costs the thesis's ``2 W^2 C``.
+        """
         wide, attention = self.width, nn.ModuleList([self.norm_attention, self.project, self.gather])
         feed = nn.ModuleList([self.norm_feed, self.widen, self.narrow])
         return [

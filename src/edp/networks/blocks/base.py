@@ -109,7 +109,7 @@ class HasConflicts(Protocol):
     """A part (block, backbone, head, activation) that does not go with everything."""
 
     def conflicts(self, model: ModelView, task: TaskView) -> str | None:
-        """Why this part contradicts the model or the task and what to change, None where it does not."""
+        """Return why this part contradicts the model or the task and what to change, None where it does not."""
 
 
 BLOCKS: Registry[type] = Registry("block")

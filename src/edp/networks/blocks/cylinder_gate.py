@@ -38,7 +38,7 @@ class CylinderGate:
             raise ConfigError(f"cylinder_gate: unknown form '{self.form}'{closest(self.form, ('diagonal', 'linear'))}")
 
     def build(self, width: int, outputs: int) -> Streaming:
-        """Gate from ``(batch, time, width)`` to ``(batch, time, outputs, width)``."""
+        """Return the gate from ``(batch, time, width)`` to ``(batch, time, outputs, width)``."""
         return _DiagonalGate(width, outputs) if self.form == "diagonal" else _LinearGate(width, outputs)
 
 

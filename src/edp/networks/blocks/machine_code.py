@@ -74,7 +74,7 @@ class CodedChannels(Streaming):
         return x * gain + shift, state
 
     def _compute_gains(self, code: Tensor) -> tuple[Tensor, Tensor]:
-        """Gain and shift of each channel ``(..., width)`` from codes ``(..., size)``."""
+        """Return the gain and shift of each channel ``(..., width)`` from codes ``(..., size)``."""
         each = code.unsqueeze(-2)
         return 1.0 + (self.scale_map * each).sum(dim=-1), (self.shift_map * each).sum(dim=-1)
 
@@ -83,7 +83,7 @@ class CodedChannels(Streaming):
         return build.add(ScaleShift, "machine_code", x, gain=gain, shift=shift)
 
     def costs(self) -> list[Cost]:
-        """No products but one a channel, element by element: the maps act on a constant."""
+        """Return the costs: one element-wise product per channel, since the maps act on a constant."""
         return [
             Cost(
                 "machine code",

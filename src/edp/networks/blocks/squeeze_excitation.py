@@ -72,7 +72,7 @@ class _SqueezeExcitation(Streaming):
             return build.combine("weighted", BinaryOperation.MULTIPLY, s, x)
 
     def costs(self) -> list[Cost]:
-        """Per column, because every tick has its own weights."""
+        """Return the costs per column, since every sample has its own weights."""
         weights = parameters_of(self)
         own = Cost("squeeze-excitation", weights, per_column=weights, width_in=self.width, width_out=self.width)
         return [*self.mean.costs(), own]

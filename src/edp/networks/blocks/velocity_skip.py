@@ -26,7 +26,7 @@ class VelocitySkip:
     space: ClassVar[dict[str, object]] = {}
 
     def conflicts(self, model: ModelView, task: TaskView) -> str | None:
-        """Delta mode and a physics base add the velocity already, and its present value must be known."""
+        """Return the delta mode and a physics base add the velocity already, and its present value must be known."""
         if task.mode == "delta":
             return (
                 "velocity_skip adds the present value to the prediction, which mode = 'delta' does already; "

@@ -26,7 +26,7 @@ class CellSpec(Protocol):
     zoneout: ClassVar[bool]
 
     def build(self, width_in: int, units: int, zoneout: float) -> Streaming:
-        """One layer, ``(batch, time, width_in)`` to ``(batch, time, units)``; its state is zero at reset."""
+        """Return one layer, ``(batch, time, width_in)`` to ``(batch, time, units)``; its state is zero at reset."""
         ...
 
 

@@ -45,7 +45,7 @@ class DiagonalSsmCell:
         check_bounds("diagonal_ssm", self, states=integer(1, MAX_UNITS))
 
     def build(self, width_in: int, units: int, zoneout: float) -> Streaming:
-        """One layer."""
+        """Return one layer."""
         return DiagonalSsm(width_in, units, self.states)
 
 
@@ -70,7 +70,7 @@ class DiagonalSsm(Streaming):
         return like.new_zeros(batch, self.states, 2)
 
     def factor(self) -> tuple[Tensor, Tensor]:
-        """Lambda as ``(state, 2)`` and the scale of the input, ``(state, 1)``; both are constants once trained."""
+        """Return lambda as ``(state, 2)`` and the input scale ``(state, 1)``; both are constants once trained."""
         # training.
         decay = torch.exp(self.rate)
         size = torch.exp(-decay)

@@ -31,7 +31,7 @@ class LayerNormLstmCell:
     zoneout: ClassVar[bool] = True
 
     def build(self, width_in: int, units: int, zoneout: float) -> Streaming:
-        """One layer."""
+        """Return one layer."""
         return StreamingLayerNormLstm(width_in, units, zoneout)
 
 

@@ -25,7 +25,7 @@ Norm = tuple[Tensor, Tensor, Tensor]
 
 
 def output_first(weight: Tensor) -> Tensor:
-    """Rows of PyTorch's gate order i, f, g, o in the order o, i, f, g.
+    """Return the rows of PyTorch's gate order i, f, g, o in the order o, i, f, g.
 
     So one call squashes the three sigmoid gates, and one product gives the gradients of the three that make c.
     """
@@ -126,7 +126,7 @@ class _Steps(torch.autograd.Function):
 
 
 def _each(share: Shares, ticks: int) -> tuple[Sequence[Tensor | float], Sequence[Tensor | float]] | None:
-    """Shares of h and of c tick by tick; None where all of the new state is taken."""
+    """Return the shares of h and of c tick by tick; None where all of the new state is taken."""
     if isinstance(share, tuple):
         return share[0].unbind(0), share[1].unbind(0)
     return None if share == 1.0 else ([share] * ticks, [share] * ticks)
@@ -186,7 +186,7 @@ class _NormsBackward:
         return _norm_backward(grad, self.of_cell, t, self.c_gain)
 
     def rows(self) -> Tensor:
-        """Gradients by ``U h`` at every tick."""
+        """Return the gradients by ``U h`` at every tick."""
         # The loop runs from the last tick to the first, so the list is turned round.
         return torch.stack(self.made[::-1])
 
@@ -198,7 +198,7 @@ class _NormsBackward:
 
 
 def _norm_backward(grad: Tensor, seen: Sequence[Sequence[Tensor]], t: int, gain: Tensor) -> Tensor:
-    """Gradient by the input of a layer norm at tick t; `seen` are inputs, means and scales of all ticks."""
+    """Return the gradient by the input of a layer norm at tick t; `seen` are inputs, means and scales of all ticks."""
     x, mean, scale = (values[t] for values in seen)
     gradients: tuple[Tensor, ...] = torch.ops.aten.native_layer_norm_backward(
         grad, x, [x.shape[1]], mean, scale, gain, None, [True, False, False]

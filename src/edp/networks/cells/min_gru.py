@@ -29,7 +29,7 @@ class MinGruCell:
     zoneout: ClassVar[bool] = False
 
     def build(self, width_in: int, units: int, zoneout: float) -> Streaming:
-        """One layer."""
+        """Return one layer."""
         return StreamingMinGru(width_in, units)
 
 

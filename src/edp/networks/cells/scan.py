@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 
 def linear_scan(a: Tensor, b: Tensor, start: Tensor) -> Tensor:
-    """``h[t] = a[t] h[t - 1] + b[t]`` with ``h[-1] = start``.
+    """Return ``h[t] = a[t] h[t - 1] + b[t]`` with ``h[-1] = start``.
 
     Args:
         a: ``(time, batch, unit)``, or ``(unit,)`` where it is the same at every tick.
@@ -51,7 +51,7 @@ class _Scan(torch.autograd.Function):
 
 
 def _run(a: Tensor, b: Tensor, start: Tensor, backwards: bool = False) -> Tensor:
-    """About ``2 sqrt(time)`` operations instead of one a tick.
+    """Return about ``2 sqrt(time)`` operations instead of one a tick.
 
     Blocks of ``sqrt(time)`` ticks run side by side from zero, with the product of the factors kept; then the end of
     each block enters the next. Products only shrink where ``|a| < 1``, so nothing overflows.

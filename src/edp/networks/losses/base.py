@@ -53,7 +53,7 @@ class Penalty(ABC):
 
     @abstractmethod
     def penalty(self, error: Tensor) -> Tensor:
-        """Penalty of each error, same shape."""
+        """Return the penalty of each error, same shape."""
 
     def evaluate(self, answer: Prediction, target: Tensor) -> Tensor:
         """Return the penalty of the prediction's error."""
@@ -64,7 +64,7 @@ LOSSES: Registry[type] = Registry("loss")
 
 
 def compute_masked_loss(spec: LossSpec, answer: Prediction, target: Tensor, valid: Tensor, weights: Tensor) -> Tensor:
-    """Mean weighted loss over the valid ticks.
+    """Return the mean weighted loss over the valid ticks.
 
     Args:
         spec: the loss.

@@ -30,7 +30,7 @@ class Derivative:
         check_weight("derivative", self.weight)
 
     def evaluate(self, course: Course) -> Tensor:
-        """Mean over pairs of consecutive ticks."""
+        """Return the mean over pairs of consecutive ticks."""
         # The level cancels in the difference of prediction and target, so absolute and delta mode agree.
         error = course.predicted - course.target
         return compute_masked_mean((error[:, 1:] - error[:, :-1]).square(), course.together(2))

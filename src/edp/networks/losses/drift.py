@@ -34,7 +34,7 @@ class Drift:
         check_weight("drift", self.weight)
 
     def evaluate(self, course: Course) -> Tensor:
-        """Mean over the ticks that count."""
+        """Return the mean over the ticks that count."""
         error = torch.where(course.valid[..., None, None], course.predicted - course.target, 0.0)
         # The sum of independent errors grows with the root of the ticks; the quotient keeps late ticks from dominating.
         ticks = course.valid.to(error.dtype).cumsum(dim=1).clamp(min=1.0)[..., None, None]

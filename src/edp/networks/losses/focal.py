@@ -33,5 +33,5 @@ class Focal(Penalty):
         check_bounds("focal", self, gamma=span(0.0, 4.0), delta=WEIGHT)
 
     def penalty(self, error: Tensor) -> Tensor:
-        """``|e|^gamma`` times the Huber penalty."""
+        """Return ``|e|^gamma`` times the Huber penalty."""
         return error.abs().clamp(min=TINY).pow(self.gamma) * huber(error, self.delta)

@@ -29,12 +29,12 @@ class Huber(Penalty):
         check_bounds("huber", self, delta=WEIGHT)
 
     def penalty(self, error: Tensor) -> Tensor:
-        """``e^2 / 2`` inside, ``delta (|e| - delta / 2)`` outside."""
+        """Return ``e^2 / 2`` inside, ``delta (|e| - delta / 2)`` outside."""
         return huber(error, self.delta)
 
 
 def huber(error: Tensor, delta: float) -> Tensor:
-    """Huber penalty of each error."""
+    """Return the Huber penalty of each error."""
     size = error.abs()
     # One expression for both branches: no selection, and a continuous gradient at `delta`.
     inside = torch.clamp(size, max=delta)

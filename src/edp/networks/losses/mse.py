@@ -15,5 +15,5 @@ class MeanSquared(Penalty):
     """Squared error (eq. 3.29)."""
 
     def penalty(self, error: Tensor) -> Tensor:
-        """``e^2``."""
+        """Return ``e^2``."""
         return error.square()

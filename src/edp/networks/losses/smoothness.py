@@ -32,7 +32,7 @@ class Smoothness:
         check_weight("smoothness", self.weight)
 
     def evaluate(self, course: Course) -> Tensor:
-        """Mean over triplets of consecutive ticks."""
+        """Return the mean over triplets of consecutive ticks."""
         # The level is added back: in delta mode the increments alone would be smoothed, not the predicted velocity.
         value = course.predicted + course.level
         bend = value[:, 2:] - 2.0 * value[:, 1:-1] + value[:, :-2]

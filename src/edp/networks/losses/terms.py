@@ -30,7 +30,7 @@ class Course:
     valid: Tensor
 
     def together(self, ticks: int) -> Tensor:
-        """``(stream, time - ticks + 1)``: where `ticks` consecutive ones all count."""
+        """Return ``(stream, time - ticks + 1)``: where `ticks` consecutive ones all count."""
         last = self.valid.shape[1] - ticks + 1
         whole = self.valid[:, :last]
         for tick in range(1, ticks):
@@ -66,6 +66,6 @@ def check_weight(name: str, weight: float) -> None:
 
 
 def compute_masked_mean(each: Tensor, valid: Tensor) -> Tensor:
-    """Mean over horizons and outputs, then over the ticks that count; ``(stream, time, horizon, output)``."""
+    """Return mean over horizons and outputs, then over the ticks that count; ``(stream, time, horizon, output)``."""
     mask = valid.to(each.dtype)
     return (each.mean(dim=(-1, -2)) * mask).sum() / mask.sum().clamp(min=1.0)

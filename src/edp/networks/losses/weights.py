@@ -11,7 +11,9 @@ from edp.settings.bounds import MAX_WEIGHT, SHARE, above, below, check_bounds
 
 
 def output_weights(sigma: Tensor, power: float) -> Tensor:
-    """Weights ``w_i`` proportional to ``1 / sigma_i^power`` with mean one (eq. 3.31; the sum is the output count).
+    """Return weights ``w_i`` proportional to ``1 / sigma_i^power`` with mean one (eq. 3.31).
+
+    The sum is the number of outputs.
 
     Args:
         sigma: standard deviation of each target in SI units, ``(..., output)``.
@@ -23,7 +25,7 @@ def output_weights(sigma: Tensor, power: float) -> Tensor:
 
 
 def horizon_weights(horizons: int, decay: float) -> Tensor:
-    """Weights ``(horizon, 1)`` proportional to ``decay^i`` for the i-th horizon, i from 0, with mean one."""
+    """Return the weights ``(horizon, 1)`` proportional to ``decay^i`` for the i-th horizon, i from 0, with mean one."""
     weights = torch.tensor([decay**horizon_index for horizon_index in range(horizons)], dtype=torch.float64)
     return (weights / weights.mean()).float().unsqueeze(-1)
 
@@ -53,7 +55,7 @@ class AdaptiveWeights:
         check_bounds("adaptive", self, blend=SHARE, max_ratio=above(1.0, MAX_WEIGHT), memory=below(0.0, 1.0))
 
     def weights(self, running: Tensor) -> Tensor:
-        """Weights ``(horizon, output)`` from the running errors, same shape."""
+        """Return the weights ``(horizon, output)`` from the running errors, same shape."""
         # A running error of zero, before the first batch or on perfect outputs, must not divide.
         inverse = running.clamp(min=1e-9).reciprocal()
         cut = torch.minimum(inverse, self.max_ratio * inverse.amin(dim=-1, keepdim=True))

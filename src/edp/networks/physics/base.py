@@ -65,7 +65,7 @@ class PhysicsSpec(ABC):
         return POSES[self.pose]
 
     def conflicts(self, model: ModelView, task: TaskView) -> str | None:
-        """Why it cannot be added to this network, None where it can."""
+        """Return why it cannot be added to this network, None where it can."""
         name = f"physics base '{PHYSICS.name_of(self)}'"
         missing = [channel for channel in self.channels() if channel not in task.inputs]
         if missing:
@@ -149,7 +149,7 @@ class PhysicsBase(Streaming):
         return {name: ranges[name] for name in self.columns}
 
     def take(self, x: Tensor, names: Sequence[str]) -> Tensor:
-        """Input columns by name."""
+        """Return the input columns by name."""
         return x[..., [self.columns[name] for name in names]]
 
     def initial_state(self, batch: int, like: Tensor) -> State:
@@ -180,7 +180,7 @@ class PhysicsBase(Streaming):
 
     @abstractmethod
     def ahead(self, x: Tensor, pose: Pose, rate: Tensor, speed: Tensor) -> Tensor:
-        """Velocities ``(batch, time, horizon, 3)`` of the cylinders.
+        """Return the velocities ``(batch, time, horizon, 3)`` of the cylinders.
 
         Args:
             x: inputs ``(batch, time, input)``.

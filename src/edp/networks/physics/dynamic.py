@@ -80,14 +80,14 @@ class Dynamic(PhysicsBase):
         """Present velocities in m/s and accelerations in m/s^2 of the cylinders, ``(batch, time, 3)``."""
 
     def lasting(self) -> list[float]:
-        """For each horizon the time in s by which an acceleration counts: k steps, less where it fades."""
+        """Return the time (s) during which an acceleration acts for each horizon: k steps, minus the fading time."""
         ahead_s = [k / self.rate_hz for k in self.task.horizons]
         fade_s = self.spec.fade_s
         # The integral of exp(-t / fade); expm1 keeps the digits where the horizon is far below the fading.
         return [fade_s * -math.expm1(-time_s / fade_s) if fade_s else time_s for time_s in ahead_s]
 
     def torque(self, x: Tensor, pose: Pose, rate: Tensor) -> Tensor:
-        """Torque of the cylinders at the joints less `load` without friction, N m, ``(batch, time, 3)``."""
+        """Return the torque of the cylinders at the joints less `load` without friction, N m, ``(batch, time, 3)``."""
         own = self.geometry
         force = own.axis("HEAD_AREA") * self.take(x, HEADS) - own.axis("ROD_AREA") * self.take(x, RODS)
         torque = force * pose.lever
@@ -103,14 +103,14 @@ class Dynamic(PhysicsBase):
         return torch.exp(-(speed / self.geometry.axis("STRIBECK")).square())
 
     def sliding(self, pose: Pose, speed: Tensor) -> Tensor:
-        """Torque of Coulomb and viscous friction where an axis slides, N m, ``(batch, time, 3)``."""
+        """Return the torque of Coulomb and viscous friction where an axis slides, N m, ``(batch, time, 3)``."""
         own = self.geometry
         # The part that stands is left to static friction; both together would brake an axis twice.
         coulomb = (1.0 - self.standing(speed)) * torch.sign(speed) * own.axis("COULOMB")
         return (coulomb + own.axis("VISCOUS") * speed) * pose.lever
 
     def stopped(self, pose: Pose, torque: Tensor) -> Tensor:
-        """1 where an axis is pressed against the end of its stroke, which takes any force, else 0."""
+        """Return 1 where an axis is pressed against the end of its stroke, which takes any force, else 0."""
         own = self.geometry
         stroke, push = pose.length - own.axis("CLOSED"), torque * pose.lever
         ends = (stroke < NEAR) & (push < 0) | (stroke > own.axis("STROKE") - NEAR) & (push > 0)
@@ -127,5 +127,5 @@ class Dynamic(PhysicsBase):
         return (torque - friction - self.sliding(pose, speed)) * (1.0 - self.stopped(pose, torque))
 
     def torque_arithmetic(self) -> int:
-        """Arithmetic of `net_torque`."""
+        """Return arithmetic of `net_torque`."""
         return {"none": 9, "gravity": 31, "all": 104}[self.spec.load]

@@ -45,7 +45,7 @@ class Force(Dynamic):
             self.mass.copy_(self.geometry.mean_mass())
 
     def settle(self, parts: Iterable[Tensor]) -> None:
-        """Average the equivalent masses over training inputs; before, they are averages over all strokes."""
+        """Average the equivalent masses over training inputs; the initial values are averages over all strokes."""
         with torch.no_grad():
             # Double precision: sums over hours of ticks lose digits in float32.
             total, ticks = torch.zeros(AXES, dtype=torch.float64), 0

@@ -46,7 +46,7 @@ class Pose:
 
 
 def inverse(lever: Tensor) -> Tensor:
-    """1 / J, finite everywhere."""
+    """Return 1 / J, finite everywhere."""
     # A clamp of the square keeps the sign of the lever and a finite gradient at a dead centre.
     return lever / torch.clamp(lever.square(), min=LEAST)
 
@@ -119,14 +119,14 @@ class Geometry(nn.Module):
         return Pose(cosine, sine, *self.cylinders(cosine, sine))
 
     def _corner(self, base: str, rod: str, length: Tensor) -> tuple[Tensor, Tensor]:
-        """Cosine and sine of the angle between two pin radii that a cylinder's length spans."""
+        """Return the cosine and sine of the angle between two pin radii that a cylinder's length spans."""
         b, r = self.number(base), self.number(rod)
         cosine = (b * b + r * r - length * length) / (2.0 * b * r)
         # Rounding and noise may push a cosine beyond 1 near the end of a stroke.
         return cosine, torch.sqrt(torch.clamp(1.0 - cosine * cosine, min=SMALL))
 
     def _bucket_turn(self, length: Tensor) -> tuple[Tensor, Tensor]:
-        """Cosine and sine of the bucket angle from its cylinder's length: the rocker's pin, then the lug's."""
+        """Return cosine and sine of the bucket angle from its cylinder's length: the rocker's pin, then the lug's."""
         rocker, link = self.number("ROCKER"), self.number("LINK")
         lug_x, lug_y = self.number("LUG_X"), self.number("LUG_Y")
         away_x = self.number("CYLINDER_X") - self.number("PIVOT_X")
@@ -139,7 +139,7 @@ class Geometry(nn.Module):
         return (lug_x * x + lug_y * y) / lug2, (lug_x * y - lug_y * x) / lug2
 
     def cylinders(self, cosine: Tensor, sine: Tensor) -> tuple[Tensor, Tensor]:
-        """Lengths in m and lever arms J = dx/dpsi in m/rad, ``(..., 3)``, thesis eq. 3.7 (J is diagonal)."""
+        """Return the lengths in m and lever arms J = dx/dpsi in m/rad, ``(..., 3)``, thesis eq. 3.7 (J is diagonal)."""
         bc, bs, ac, as_ = (self.number(name) for name in ("BOOM_COS", "BOOM_SIN", "ARM_COS", "ARM_SIN"))
         (c1, c2, c3), (s1, s2, s3) = cosine.unbind(-1), sine.unbind(-1)
         boom, boom_lever = self._triangle("BOOM_BASE", "BOOM_ROD", c1 * bc - s1 * bs, s1 * bc + c1 * bs)
@@ -150,14 +150,14 @@ class Geometry(nn.Module):
         return torch.stack((boom, arm, bucket), dim=-1), levers
 
     def _triangle(self, base: str, rod: str, cosine: Tensor, sine: Tensor) -> tuple[Tensor, Tensor]:
-        """Length opposite to the angle between two pin radii, and its change by that angle."""
+        """Return the length opposite to the angle between two pin radii, and its change by that angle."""
         b, r = self.number(base), self.number(rod)
         # The clamp only matters where the pin radii fold onto each other, outside any stroke.
         length = torch.sqrt(torch.clamp(b * b + r * r - 2.0 * b * r * cosine, min=SMALL))
         return length, b * r * sine / length
 
     def _four_bar(self, cosine: Tensor, sine: Tensor) -> tuple[Tensor, Tensor]:
-        """Rocker, link and lug: a constant link gives the rocker's rate, the rocker's pin the cylinder's."""
+        """Return the rocker, link and lug: a constant link gives the rocker's rate, the rocker's pin the cylinder's."""
         rocker, link = self.number("ROCKER"), self.number("LINK")
         lug_x, lug_y = self.number("LUG_X"), self.number("LUG_Y")
         dx, dy = lug_x * cosine - lug_y * sine, lug_x * sine + lug_y * cosine
@@ -171,7 +171,7 @@ class Geometry(nn.Module):
         return length, turned / ((link_y * arm_x - link_x * arm_y) * length)
 
     def lever_change(self, pose: Pose) -> Tensor:
-        """dJ/dpsi in m/rad^2, ``(..., 3)``, by a central difference over `TURN` to either side."""
+        """Return the dJ/dpsi in m/rad^2, ``(..., 3)``, by a central difference over `TURN` to either side."""
         # A central difference: the derivative of the four-bar in closed form is long and would be needed in every
         # export.
         c, s = float(np.cos(TURN)), float(np.sin(TURN))
@@ -180,7 +180,7 @@ class Geometry(nn.Module):
         return (ahead - behind) * (0.5 / TURN)
 
     def couplings(self, pose: Pose) -> tuple[list[Tensor], list[Tensor]]:
-        """Mass coupling of the bodies 12, 13, 23 in absolute angles, kg m^2: parts by cosine and by sine."""
+        """Return the mass coupling of the bodies 12, 13, 23 in absolute angles, kg m^2: parts by cosine and by sine."""
         (_, m2, m3), (l1, l2, _) = self.axis("MASS"), self.axis("LENGTH")
         (_, cx2, cx3), (_, cy2, cy3) = self.axis("COM_X"), self.axis("COM_Y")
         (_, c2, c3), (_, s2, s3) = pose.cosine.unbind(-1), pose.sine.unbind(-1)
@@ -191,7 +191,10 @@ class Geometry(nn.Module):
         return list(first), list(second)
 
     def masses(self, by_cosine: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Mass matrix in relative angles, kg m^2: diagonal 11, 22, 33 and coupling 12, 13, 23, each ``(..., 3)``."""
+        """Return the mass matrix in relative angles, kg m^2.
+
+        Diagonal 11, 22, 33 and coupling 12, 13, 23, each ``(..., 3)``.
+        """
         k12, k13, k23 = by_cosine
         m, length = self.axis("MASS"), self.axis("LENGTH")
         # Steiner's theorem: inertia about the joint from inertia about the centre of mass.
@@ -218,7 +221,7 @@ class Geometry(nn.Module):
         return self.number("GRAVITY") * torch.stack((g1, g2, g3), dim=-1)
 
     def coriolis_torque(self, by_sine: list[Tensor], rate: Tensor) -> Tensor:
-        """Coriolis and centrifugal torques, N m, ``(..., 3)``; `rate` holds relative joint rates in rad/s."""
+        """Return Coriolis and centrifugal torques, N m, ``(..., 3)``; `rate` holds relative joint rates in rad/s."""
         k12, k13, k23 = by_sine
         w1, w2, w3 = rate.unbind(-1)
         first, second, third = w1.square(), (w1 + w2).square(), (w1 + w2 + w3).square()
@@ -228,7 +231,7 @@ class Geometry(nn.Module):
         return torch.stack((c1, c2, c3), dim=-1)
 
     def mean_mass(self) -> Tensor:
-        """Equivalent masses M_ii / J_i^2 in kg averaged over a uniform grid of strokes, ``(3,)``."""
+        """Return the equivalent masses M_ii / J_i^2 in kg averaged over a uniform grid of strokes, ``(3,)``."""
         # A grid over all poses stands for training data that do not exist yet.
         share = torch.linspace(0.0, 1.0, GRID, dtype=self.axes.dtype, device=self.axes.device)
         pose = self.at_strokes(torch.cartesian_prod(share, share, share) * self.axis("STROKE"))

@@ -69,7 +69,7 @@ class HybridPhysics(Dynamic):
 
 
 def solve(own: Tensor, coupling: Tensor, torque: Tensor) -> Tensor:
-    """Solution of the symmetric 3 x 3 system with diagonal `own` and off-diagonal 12, 13, 23, ``(..., 3)``."""
+    """Return solution of the symmetric 3 x 3 system with diagonal `own` and off-diagonal 12, 13, 23, ``(..., 3)``."""
     (a, b, c), (d, e, f), (x, y, z) = own.unbind(-1), coupling.unbind(-1), torque.unbind(-1)
     # L D L' by hand: the matrix is positive definite.
     l21, l31 = d / a, e / a

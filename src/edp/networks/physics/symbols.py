@@ -57,7 +57,7 @@ class Symbol:
         return self.layer(Activate, str(function), self.value, shape=self.shape, function=function, size=size)
 
     def affine(self, gain: Any, shift: Any) -> Symbol:
-        """``gain x + shift``, each a number or an array of the same shape."""
+        """Return ``gain x + shift``, each a number or an array of the same shape."""
         gain, shift = (np.broadcast_to(np.asarray(part, np.float32), self.shape).ravel() for part in (gain, shift))
         value = self.value
         if self._factors is not None and (np.abs(gain) == 1).all():
@@ -87,7 +87,7 @@ class Symbol:
         return Symbol(self.build, self.value, (*self.shape[:at], 1, *self.shape[at:]))
 
     def expand(self, *shape: int) -> Symbol:
-        """Repeated along dimensions of length 1."""
+        """Repeat the symbol along dimensions of length 1."""
         return self.spread(shape)
 
     def to(self, dtype: object) -> Symbol:
@@ -95,11 +95,11 @@ class Symbol:
         return self
 
     def square(self) -> Symbol:
-        """Each number times itself."""
+        """Return each number times itself."""
         return multiply(self, self)
 
     def abs(self) -> Symbol:
-        """Without sign."""
+        """Return the absolute value."""
         return maximum(self, -self)
 
     def __neg__(self) -> Symbol:
@@ -144,7 +144,7 @@ class Symbol:
 
 
 def _array(value: Any) -> np.ndarray:
-    """Numbers that are known when the graph is made."""
+    """Return the numbers that are known when the graph is made."""
     return np.asarray(value.detach().cpu().numpy() if isinstance(value, Tensor) else value, dtype=np.float32)
 
 
@@ -216,12 +216,12 @@ def _extreme(operation: BinaryOperation, a: Any, b: Any) -> Symbol:
 
 
 def positive(a: Symbol) -> Symbol:
-    """1 where a number is above 0, else 0."""
+    """Return 1 where a number is above 0, else 0."""
     return a.activate(Function.POSITIVE)
 
 
 def sign(a: Symbol) -> Symbol:
-    """1, 0 or -1."""
+    """Return 1, 0 or -1."""
     return positive(a) - positive(-a)
 
 

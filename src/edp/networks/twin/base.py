@@ -54,7 +54,7 @@ class Twin(ABC):
 
     @abstractmethod
     def _run(self, commands: Array, measured: Array, state: TwinState) -> tuple[Array, TwinState]:
-        """`rollout` of checked arrays, `measured` with NaN at free ports."""
+        """Return `rollout` of checked arrays, `measured` with NaN at free ports."""
 
     @abstractmethod
     def arrays(self) -> dict[str, Array]:
@@ -113,7 +113,7 @@ class Twin(ABC):
         return self.rollout(commands, self.initial_state(commands[:, 0], measured[:, 0]), measured)[1]
 
     def step(self, command: Array, state: TwinState, measured: Array | None = None) -> tuple[Array, TwinState]:
-        """One tick: the machine after `command`.
+        """Return one tick: the machine after `command`.
 
         Args:
             command: ``(batch, command)``.
@@ -184,7 +184,7 @@ class Twin(ABC):
         return np.asarray((answers - self.scales.answer_offset) / self.scales.answer_width, dtype=np.float32)
 
     def scale_commands(self, commands: Array) -> Array:
-        """Commands in SI units as a network reads them."""
+        """Return the commands in SI units as a network reads them."""
         return np.asarray((commands - self.scales.command_offset) / self.scales.command_width, dtype=np.float32)
 
     def drive(self, commands: Array) -> Array:

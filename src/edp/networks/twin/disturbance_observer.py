@@ -24,7 +24,7 @@ def force_slopes(
     tick: tuple[NDArray[np.float32], NDArray[np.float32], TwinState],
     expected: Array,
 ) -> Array:
-    """Slopes of velocities after a tick by forces against them, m/s by N ``(velocity, velocity)``.
+    """Return the slopes of velocities after a tick by forces against them, m/s by N ``(velocity, velocity)``.
 
     Args:
         runner: runner of a model with a load; its `resistance` is restored.

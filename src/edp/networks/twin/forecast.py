@@ -126,7 +126,10 @@ def forecast(twin: Twin, commands: Array, measured: Array, horizons: Sequence[in
 
 
 def _begin(twin: Twin, measured: Array) -> int:
-    """First tick at which the twin can start: all measured, no stroke far beyond an end stop; the first without one."""
+    """Return the first tick at which the twin can start: all measured, no stroke far beyond an end stop.
+
+    The first without one.
+    """
     there = np.asarray(np.isfinite(measured).all(axis=1))
     possible = np.flatnonzero(there & twin.is_within_stops(np.where(there[:, None], measured, np.float32(0.0))))
     # Where there is none, the reset at the first tick says what is wrong there.

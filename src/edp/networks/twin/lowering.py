@@ -93,7 +93,7 @@ def add_stroke_stops(build: Builder, twin: Twin, fed: str, velocity: str, column
 
 
 def _stop_at_ends(build: Builder, name: str, stroke: str, velocity: str, stop: Array, most: Array, side: float) -> str:
-    """Velocities that do not go into an end stop: their bound is zero where a stroke is beyond it."""
+    """Return the velocities that do not go into an end stop: their bound is zero where a stroke is beyond it."""
     one = np.ones(len(stop))
     past = build.add(ScaleShift, f"past_{name}", stroke, gain=side * one, shift=-side * stop)
     there = build.add(Activate, f"at_{name}", past, function=Function.POSITIVE, size=len(stop))

@@ -185,7 +185,7 @@ Pair = tuple[Doubles, Doubles]
 
 
 def _append_ones(commands: Array) -> Doubles:
-    """Scaled commands ``(..., command)`` and a column of ones: the mean of a velocity is not zero."""
+    """Return the scaled commands ``(..., command)`` and a column of ones: the mean of a velocity is not zero."""
     wide = np.ones((*commands.shape[:-1], commands.shape[-1] + 1))
     wide[..., :-1] = commands
     return wide
@@ -264,7 +264,7 @@ def _project_out(columns: Doubles, directions: Doubles) -> Doubles:
 
 
 def _windows(pairs: Sequence[Pair], horizon: int) -> Iterator[Pair]:
-    """Windows of past and future ``(window, 2 horizon, channel)``, in chunks."""
+    """Return the windows of past and future ``(window, 2 horizon, channel)``, in chunks."""
     length = 2 * horizon
     usable = [pair for pair in pairs if len(pair[0]) >= length]
     total = sum(len(u) - length + 1 for u, _ in usable)
@@ -288,7 +288,7 @@ def _states(pairs: Sequence[Pair], horizon: int, to_states: Doubles) -> tuple[Do
 
 
 def _stable(a: Doubles) -> Doubles:
-    """Poles outside the unit circle reflected, slow ones shrunk to `SLOWEST`."""
+    """Return the poles outside the unit circle reflected, slow ones shrunk to `SLOWEST`."""
     poles, vectors = np.linalg.eig(a)
     modulus = np.abs(poles)
     inside = np.minimum(np.where(modulus > 1.0, 1.0 / np.maximum(modulus, SMALL), modulus), SLOWEST)

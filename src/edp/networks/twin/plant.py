@@ -94,7 +94,7 @@ class TwinPlant(Predictor):
         return answers, None, new
 
     def forward_features(self, x: Tensor, state: State) -> NoReturn:
-        """Not of a twin.
+        """Raise an error: a twin has no hidden features.
 
         Raises:
             ExportError: always.

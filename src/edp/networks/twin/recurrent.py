@@ -79,18 +79,18 @@ class Recurrent:
         return self._map_spec.start(channels, scales, train, 0) if self.valve_map else None
 
     def member(self, channels: TwinChannels, scales: TwinScales, static: StaticTwin | None, seed: int) -> RecurrentTwin:
-        """One of its members, untrained, on a fitted map."""
+        """Return one of its members, untrained, on a fitted map."""
         network = self.alone()._network(channels)
         # Answers that start at no change at all make the first free runs stand still.
         network.draw(seed, 0.1)
         return RecurrentTwin(channels, scales, self.prefix_ticks, network, static)
 
     def alone(self) -> Recurrent:
-        """Options of a single member."""
+        """Return the options of a single member."""
         return replace(self, units=self.units // self.members, members=1)
 
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
-        """Those of the network, and of the map."""
+        """Return the array shapes of the network and of the map."""
         with torch.device("meta"):  # a header says how wide it is: no memory before that is checked
             network = self._network(channels)
         shapes = {name: tuple(weight.shape) for name, weight in network.named_parameters()}

@@ -55,7 +55,7 @@ def scales_for(twin: RecurrentTwin, own: TwinScales, train: list[Series]) -> Twi
 
 
 def _is_stop(there: Sequence[np.ndarray], pushes: Sequence[np.ndarray], rate_hz: float) -> bool:
-    """Whether an outermost place is an end stop.
+    """Return whether an outermost place is an end stop.
 
     Args:
         there: of each segment, tick by tick, whether it is there.
@@ -70,7 +70,7 @@ def _is_stop(there: Sequence[np.ndarray], pushes: Sequence[np.ndarray], rate_hz:
 
 
 def _longest(there: np.ndarray) -> int:
-    """Ticks of the longest stay."""
+    """Return the ticks of the longest stay."""
     turns = np.flatnonzero(np.diff(np.concatenate([[0], there.astype(np.int8), [0]])))
     return int((turns[1::2] - turns[::2]).max(initial=0))
 

@@ -68,7 +68,7 @@ class Residual(GreyBox):
             )
 
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
-        """Those of the grey box and of the network."""
+        """Return the array shapes of the grey box and of the network."""
         with torch.device("meta"):  # a header says how wide it is: no memory before that is checked
             network = _network(channels, self.units)
         return super().shapes(channels) | {name: tuple(weight.shape) for name, weight in network.named_parameters()}

@@ -48,7 +48,7 @@ class TwinScales:
 
     @staticmethod
     def shapes(channels: TwinChannels) -> dict[str, tuple[int, ...]]:
-        """Shape of each array."""
+        """Return the shape of each array."""
         commands, answers = len(channels.commands), len(channels.answers)
         return {e.name: (commands if e.name.startswith("command") else answers,) for e in fields(TwinScales)}
 
@@ -68,7 +68,7 @@ class TwinScales:
         return scales
 
     def trapezoid(self, channels: TwinChannels) -> Array:
-        """Scaled stroke per tick for the sum of two scaled velocities ``(stroke,)``: the trapezoidal rule."""
+        """Return scaled stroke per tick for the sum of two scaled velocities ``(stroke,)``: the trapezoidal rule."""
         count, first = len(channels.strokes), len(channels.velocities)
         widths = self.answer_width[first : first + count]
         return np.asarray(self.answer_width[:count] / (2.0 * channels.rate_hz * widths), dtype=np.float32)

@@ -180,7 +180,7 @@ class StaticTwin(Twin):
 
 
 def polygon(commands: Array, corners: Array) -> Array:
-    """How much of the way from each corner ``(knot, command)`` to the next a command has gone, 0 to 1.
+    """Return how much of the way from each corner ``(knot, command)`` to the next a command has gone, 0 to 1.
 
     Shares and not distances: sums of what each of them adds have no large parts that cancel, also with weights of
     eight bits, and a command beyond all that was seen outputs what the farthest one did.
@@ -197,13 +197,13 @@ def polygon(commands: Array, corners: Array) -> Array:
 
 
 def _solve_delay(solution: RidgeSolution, which: int) -> dict[str, Array]:
-    """Rises and intercepts of one delay."""
+    """Return the rises and intercepts of one delay."""
     rise = np.ascontiguousarray(solution.weights[0, :, which], dtype=np.float32)
     return {"rise": rise, "intercept": solution.intercept[which].astype(np.float32)}
 
 
 def _lengths(corners: Array) -> Array:
-    """From corner to corner, for each command ``(command,)``."""
+    """Return the distance between neighbouring corners for each command, ``(command,)``."""
     return np.asarray(corners[1] - corners[0])
 
 

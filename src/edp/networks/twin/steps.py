@@ -53,7 +53,7 @@ def _tanh(x: np.float32) -> np.float32:
 
 @compiler.compiled
 def gates_of(into: Array, up: Array, bias: Array, h: Array, gates: Array, inner: Array, new_h: Array) -> None:
-    """Gates r, k, n ``(batch, 3 units)``, ``inner = U h + b`` of n, and the next h."""
+    """Compute gates r, k, n ``(batch, 3 units)``, ``inner = U h + b`` of n, and the next h."""
     batch, units = h.shape
     half = np.float32(0.5)
     for row in range(batch):

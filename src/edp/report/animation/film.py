@@ -63,7 +63,7 @@ def write_film(scene: Scene, output: str | Path) -> Path:
 
 
 def frames(scene: Scene) -> Iterator[NDArray[np.uint8]]:
-    """Pictures of a scene, each uint8 of shape (HEIGHT, WIDTH, 3)."""
+    """Return the pictures of a scene, each uint8 of shape (HEIGHT, WIDTH, 3)."""
     drawn = _Front(scene)
     for k in range(len(scene.angles)):
         image = Image(WIDTH, HEIGHT)
@@ -115,7 +115,7 @@ class _Front:
         self._front(image, scene.angles[k])
 
     def _front(self, image: Image, angles: Array) -> None:
-        """Boom, arm, bucket and their cylinders; pin angles of frame and boom as on the page."""
+        """Draw boom, arm, bucket and their cylinders; pin angles of frame and boom as on the page."""
         machine, u = self.scene.machine, self.unit
         boom_l, arm_l, bucket_l = self.lengths
         a, b, c = np.exp(1j * np.cumsum(angles))
@@ -147,7 +147,7 @@ class _Front:
         image.line(self.at(bucket_at + c * np.array([bucket_l, heel])), INK, 2.5)
 
     def _bucket_pins(self, psi: float) -> tuple[complex, complex, complex, complex]:
-        """Elbow, lug, rocker pivot and cylinder pin in the arm's frame."""
+        """Return the elbow, lug, rocker pivot and cylinder pin in the arm's frame."""
         link, arm_l = self.scene.machine.bucket_linkage, self.lengths[1]
         pivot = complex(arm_l - link.pivot_to_pin, link.pivot_offset)
         lug = complex(arm_l + link.lug * np.exp(1j * (psi + link.lug_angle)))

@@ -199,7 +199,7 @@ def _machine_of(recording: Recording) -> str:
 
 
 def _angles(shown: _Columns, machine: Machine) -> Array:
-    """Joint angles, shape (frame, 3), from the angles themselves or from strokes."""
+    """Return the joint angles, shape (frame, 3), from the angles themselves or from strokes."""
     angles, strokes = ([f"{kind}_{i}" for i in (1, 2, 3)] for kind in ("JointAngle", "CylStroke"))
     if shown.has(*angles):
         return shown.take(*angles)

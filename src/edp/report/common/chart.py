@@ -321,7 +321,7 @@ class Chart:
 
 
 def fits(mark: Mark, chosen: Mapping[str, str]) -> bool:
-    """Whether a mark is shown for the options chosen."""
+    """Return whether a mark is shown for the options chosen."""
     return all(mark.when.get(key, option) == option for key, option in chosen.items())
 
 

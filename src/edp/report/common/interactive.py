@@ -65,7 +65,7 @@ class Plot:
 
 
 def plots(charts: Iterable[Chart]) -> dict[str, Plot]:
-    """Every chart as a figure of a page, by name."""
+    """Return every chart as a figure of a page, by name."""
     return {chart.name: plot(chart) for chart in charts}
 
 
@@ -321,7 +321,7 @@ def _interval(values: Any, low: Any, high: Any, colour: str) -> dict[str, object
 
 
 def finite_or_none(value: float) -> float | None:
-    """JSON has no NaN; four decimals keep a page small."""
+    """Return the JSON has no NaN; four decimals keep a page small."""
     return round(value, 4) if math.isfinite(value) else None
 
 

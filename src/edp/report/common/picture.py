@@ -78,7 +78,9 @@ _STYLE: Any = {
 
 
 def write_pictures(folder: str | Path, charts: Iterable[Chart]) -> list[Path]:
-    """Every picture of every chart in every format, in order, in a folder that is made; equal charts give equal bytes.
+    """Return every picture of every chart in every format, in order, in a folder that is made.
+
+    Equal charts give equal bytes.
 
     Raises:
         StorageError: the folder or a file cannot be written.

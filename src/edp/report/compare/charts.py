@@ -75,7 +75,7 @@ def change_chart(comparison: Comparison) -> Chart | None:
 
 
 def horizon_chart(comparison: Comparison) -> Chart | None:
-    """Error against the time ahead, an output at a time; of twins on the recordings of each run."""
+    """Return the error against the time ahead, an output at a time; of twins on the recordings of each run."""
     outputs = list(dict.fromkeys(measure.output for measure in comparison.measures))
     marks: list[Mark] = []
     shown: list[str] = []
@@ -161,7 +161,7 @@ def learning_chart(comparison: Comparison) -> Chart | None:
 
 
 def cost_chart(comparison: Comparison) -> Chart | None:
-    """Error against size and work, an error and a cost at a time."""
+    """Return the error against size and work, an error and a cost at a time."""
     costs = [cost for cost in comparison.runs[0].costs if all(cost in run.costs for run in comparison.runs)]
     if not costs:
         return None

@@ -89,7 +89,7 @@ def build_compare_page(comparison: Comparison, title: str = "") -> Page:
 
 
 def error_table(comparison: Comparison, measure: Measure) -> Table:
-    """Each run's error and its paired difference from the first run."""
+    """Return each run's error and its paired difference from the first run."""
     differences = comparison.differences(measure)
     rows: list[tuple[Value, ...]] = []
     for run in comparison.runs:
@@ -114,7 +114,7 @@ def error_table(comparison: Comparison, measure: Measure) -> Table:
 
 
 def recording_table(comparison: Comparison, measure: Measure) -> Table:
-    """Each run's error on each common recording."""
+    """Return each run's error on each common recording."""
     errors = {run.name: comparison.errors(run, measure).tolist() for run in comparison.runs}
     rows = tuple(
         (name, *(errors[run.name][i] for run in comparison.runs)) for i, name in enumerate(comparison.recordings)

@@ -54,7 +54,7 @@ class RunDifference:
         return self.p is not None and self.p < 0.05 and abs(self.change) > LEAST
 
     def text(self) -> str:
-        """In words, without the names of the runs."""
+        """Return the difference in words, without the names of the runs."""
         amount = f"{percent(abs(self.change))} {'less' if self.change < 0 else 'more'} error"
         if self.low is None or self.high is None:
             return f"{amount} (no interval: too little in common)"
@@ -82,7 +82,7 @@ class Comparison:
         return np.array([run.errors[measure][name] for name in self.recordings])
 
     def error(self, run: ComparedRun, measure: Measure) -> float:
-        """Mean over the common recordings, each of the same weight."""
+        """Return the mean over the common recordings, each of the same weight."""
         return float(self.errors(run, measure).mean())
 
     def differences(self, measure: Measure) -> dict[str, RunDifference]:
@@ -227,7 +227,7 @@ def _blocks(first: ComparedRun, second: ComparedRun, measure: Measure, names: Se
 
 
 def _absolute(run: ComparedRun, name: str, measure: Measure) -> Array | None:
-    """(time,) absolute error of a measure at each tick, mean over outputs where it is theirs; report units."""
+    """Return (time,) absolute error of a measure at each tick, mean over outputs where it is theirs; report units."""
     parts, horizon = run.predictions.get(name, {}), round(measure.ahead_s * (run.rate_hz or 1.0))
     if NETWORK not in parts or horizon not in run.horizons:
         return None

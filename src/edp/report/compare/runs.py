@@ -47,7 +47,7 @@ class Measure:
     what: str = "mean absolute error"
 
     def text(self) -> str:
-        """For a heading."""
+        """Return the text for a heading."""
         return f"{self.output}, {self.when}"
 
     @property

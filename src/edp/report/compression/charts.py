@@ -32,7 +32,7 @@ STAGES: tuple[tuple[str, str, Symbol, float, str], ...] = (
 
 
 def profile_chart(facts: CompressionResult) -> Chart:
-    """Parameters as bars and MAE before and after (left), composite scores with the front marked (right)."""
+    """Return the parameters as bars and MAE before and after (left), composite scores with the front marked (right)."""
     indices = smallest(facts)
     rows = [facts.rows[index] for index in indices]
     names = [row.name for row in rows]
@@ -99,7 +99,7 @@ def front_chart(facts: CompressionResult) -> Chart:
 
 
 def _ticks(facts: CompressionResult) -> tuple[tuple[float, str], ...]:
-    """Five round errors for each horizon, evenly spread on a logarithmic axis."""
+    """Return the five round errors for each horizon, evenly spread on a logarithmic axis."""
     ticks = set()
     for horizon in facts.horizons:
         values = [row.scores[horizon]["mae"] for row in facts.rows]
@@ -118,7 +118,7 @@ def _percent(row: CompressedRow) -> float:
 
 
 def _front(facts: CompressionResult, cost: str) -> list[tuple[float, float]]:
-    """Points that no other one betters in error at no greater cost."""
+    """Return the points that no other one betters in error at no greater cost."""
     line: list[tuple[float, float]] = []
     for x, y in sorted((cost_of(row, cost), _percent(row)) for row in facts.rows):
         if not line or y < line[-1][1]:

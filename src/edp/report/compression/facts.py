@@ -67,7 +67,7 @@ def front_table(facts: CompressionResult, horizon: str) -> Table:
 
 
 def tabulate_held_out(facts: CompressionResult) -> Table | None:
-    """Teacher and chosen on the sealed test set."""
+    """Return the teacher and chosen on the sealed test set."""
     scores = facts.held_out_test.scores
     if not scores:
         return None
@@ -98,7 +98,7 @@ def headline(facts: CompressionResult) -> str:
 
 
 def verdict(facts: CompressionResult) -> list[str]:
-    """Sentences under the headline."""
+    """Return the sentences under the headline."""
     if facts.best is None:
         near = min(facts.rows, key=lambda row: max(value / limit for value, limit in row.over.values()))
         over = listed(f"{LIMITS[k]} {v:,} of {limit:,}" for k, (v, limit) in near.over.items())
@@ -141,7 +141,7 @@ def caveats(facts: CompressionResult) -> list[str]:
 
 
 def tiles(facts: CompressionResult) -> list[tuple[str, str, str]]:
-    """Key figures: value, unit, meaning."""
+    """Return the key figures: value, unit, meaning."""
     best, unit = facts.best, facts.unit
     if best is None:
         return []

@@ -30,7 +30,7 @@ AXES = ("Boom", "Arm", "Bucket")
 
 
 def control_charts(facts: ControlFacts) -> list[Chart]:
-    """Every figure of the page: ``path``, ``errors``, ``strokes``, ``levers`` and ``solver``."""
+    """Return every figure of the page: ``path``, ``errors``, ``strokes``, ``levers`` and ``solver``."""
     choice = Control(LOOP, "Loop", tuple((str(n), loop.name) for n, loop in enumerate(facts.content.loops)))
     return [
         path_chart(facts, choice),
@@ -56,7 +56,7 @@ def path_chart(facts: ControlFacts, choice: Control) -> Chart:
 
 
 def errors_chart(facts: ControlFacts, choice: Control) -> Chart:
-    """Position error and attitude error over time."""
+    """Return the position error and attitude error over time."""
     position: list[Mark] = []
     attitude: list[Mark] = []
     for n, recording in enumerate(facts.recordings):
@@ -78,7 +78,7 @@ def errors_chart(facts: ControlFacts, choice: Control) -> Chart:
 
 
 def strokes_chart(facts: ControlFacts, choice: Control) -> Chart:
-    """Stroke minus its reference, for each cylinder."""
+    """Return the stroke minus its reference, for each cylinder."""
     panels = []
     for i, name in enumerate(AXES, start=1):
         marks: list[Mark] = []
@@ -94,7 +94,7 @@ def strokes_chart(facts: ControlFacts, choice: Control) -> Chart:
 
 
 def levers_chart(facts: ControlFacts, choice: Control) -> Chart:
-    """Lever positions over time."""
+    """Return the lever positions over time."""
     marks: list[Mark] = []
     colours = (BLUE, MUTED[0], MUTED[1])
     for n, recording in enumerate(facts.recordings):

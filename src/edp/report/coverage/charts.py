@@ -49,7 +49,7 @@ def coverage_charts(coverage: Coverage) -> list[Chart]:
 
 
 def spectrum_chart(coverage: Coverage) -> Chart | None:
-    """Power spectral density of each command in dB below its maximum, with the band that should be flat."""
+    """Return the power spectral density of each command in dB below its maximum, with the band that should be flat."""
     inputs = coverage.spectrum
     if inputs is None or not len(inputs.frequency_hz):
         return None
@@ -72,7 +72,7 @@ def spectrum_chart(coverage: Coverage) -> Chart | None:
 
 
 def excitation_chart(coverage: Coverage) -> Chart | None:
-    """Smallest singular value of the input Hankel matrix against the number of lags."""
+    """Return the smallest singular value of the input Hankel matrix against the number of lags."""
     if len(coverage.singular) < 2:
         return None
     lags = list(coverage.singular)

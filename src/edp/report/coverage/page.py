@@ -166,7 +166,7 @@ def verdict(coverage: Coverage) -> list[str]:
 
 
 def tiles(coverage: Coverage) -> list[tuple[str, str, str]]:
-    """Key figures: value, unit, what."""
+    """Return the key figures: value, unit, what."""
     tiles: list[tuple[str, str, str]] = []
     if coverage.occupancy is not None:
         cells = coverage.occupancy.samples.size
@@ -208,7 +208,7 @@ def tabulate_targets(coverage: Coverage) -> Table:
 
 
 def activity_table(coverage: Coverage) -> Table:
-    """Commands by axis."""
+    """Return the commands by axis."""
     rows = tuple(
         (axis.axis, count_text(axis.reversals), count_text(axis.crossings), percent(axis.active))
         for axis in coverage.activity
@@ -224,7 +224,7 @@ def activity_table(coverage: Coverage) -> Table:
 
 
 def together_table(coverage: Coverage) -> Table:
-    """Axes in use at once."""
+    """Return axes in use at once."""
     rows = tuple((_first_up(name), percent(share)) for name, share in coverage.together.items())
     return Table("In use at once", (Column("Commanded"), Column("Share", "of the time")), rows)
 
@@ -241,7 +241,7 @@ def events_table(coverage: Coverage) -> Table:
 
 
 def joints_table(coverage: Coverage) -> Table:
-    """Joint histograms in figures."""
+    """Return the joint histograms in figures."""
     rows = tuple(
         (f"{j.x} and {j.y}", percent(j.filled), number(j.correlation, 2), number(j.information, 2))
         for j in coverage.joints

@@ -99,7 +99,7 @@ def channels_table(quality: DataQuality) -> Table:
 
 
 def findings_table(quality: DataQuality) -> Table:
-    """Errors and warnings, equal ones of several recordings together, worst first; notes are in the JSON."""
+    """Return the errors and warnings, equal ones of several recordings together, worst first; notes are in the JSON."""
     grouped: dict[tuple[str, str, str, str], list[str]] = {_key(finding): [] for finding in quality.findings}
     for report in quality.reports:
         for finding in report.findings:

@@ -139,7 +139,7 @@ class _Usual:
         return [f"the error of {self.targets[worst]} is {ratios[worst]:.1f} times the fleet's median"]
 
     def _speed(self, row: MachineErrors) -> list[str]:
-        """Whether its outputs simply change faster."""
+        """Return whether its outputs simply change faster."""
         ratio = row.persistence / self.still if self.still else 1.0
         return [f"its outputs change {ratio:.1f} times as fast as the fleet's"] if ratio > LARGER else []
 
@@ -213,7 +213,7 @@ def worst_table(facts: FleetFacts) -> Table:
 
 
 def machine_table(facts: FleetFacts) -> Table:
-    """Every machine."""
+    """Return every machine."""
     rows: list[tuple[Value, ...]] = [
         (row.name, row.minutes, row.mae, percent(row.skill), row.drift, "yes" if row.drifts else "", row.changes)
         for row in facts.rows

@@ -72,7 +72,7 @@ def build_fleet_page(facts: FleetFacts) -> Page:
 
 
 def errors_chart(facts: FleetFacts) -> Chart:
-    """How many machines have which error."""
+    """Return how many machines have which error."""
     counts, edges = np.histogram([row.mae for row in facts.rows], bins=BINS)
     middles = [float(value) for value in (edges[:-1] + edges[1:]) / 2]
     bars: Mark = Bars(

@@ -94,7 +94,7 @@ class Drawing:
 
 
 def timeline(trace: RecordingTrace, facts: MonitorFacts) -> Drawing:
-    """Statistics of a recording over their limits, its alarms, and the levels of its residual groups below."""
+    """Return statistics of a recording over their limits, its alarms, and the levels of its residual groups below."""
     alarms = [alarm for alarm in facts.alarms if alarm.recording == trace.name]
     seconds = max(len(trace.ratios) * facts.traces.block_s, 1e-9)
     across = _across(seconds)

@@ -133,7 +133,7 @@ def _subject(alarm: AlarmFacts) -> str:
 
 
 def again_text(facts: MonitorFacts, again: Sequence[AlarmFacts]) -> str:
-    """How often a change was raised again, and when for the last time; empty where it was not."""
+    """Return how often a change was raised again, and when for the last time; empty where it was not."""
     if not again:
         return ""
     last = clock(again[-1].raised_s, facts.start_of(again[-1].recording))
@@ -146,7 +146,7 @@ def hours_text(hours: float) -> str:
 
 
 def verdict(facts: MonitorFacts) -> list[str]:
-    """Sentences behind the headline."""
+    """Return the sentences behind the headline."""
     lines = [f"Limits: {facts.promise}." if facts.promise else ""]
     if facts.unseen and not facts.alarms:
         lines.append(f"What silence does not exclude: {facts.unseen}.")

@@ -47,7 +47,7 @@ class BandLine:
 
 
 def recordings_figure(recording: Recording, channels: Sequence[str]) -> go.Figure:
-    """Channels of a recording over time, a row each, in the units of reports."""
+    """Return the channels of a recording over time, a row each, in the units of reports."""
     columns = [recording.channels[recording.index(name)] for name in channels]
     panels, labels = [], label_by_name(channels)
     for channel in columns:

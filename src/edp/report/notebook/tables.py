@@ -20,7 +20,7 @@ _CELL = "padding:2px 10px;text-align:"
 
 
 def html_of(tables: Iterable[Table], title: str = "") -> str:
-    """Tables one below the other, escaped; the rows of the network are bold."""
+    """Return the tables one below the other, escaped; the rows of the network are bold."""
     parts = [f"<p><b>{_safe(title)}</b></p>"] if title else []
     for table in tables:
         heads = table.heads()

@@ -107,7 +107,7 @@ def _network_last(models: Mapping[str, object]) -> list[str]:
 
 
 def prediction_chart(facts: Facts) -> Chart | None:
-    """Prediction against truth: one row per output, one shared time axis."""
+    """Return the prediction against truth: one row per output, one shared time axis."""
     lines = figures.prediction_lines(facts)
     if not lines:
         return None
@@ -146,7 +146,7 @@ def prediction_chart(facts: Facts) -> Chart | None:
 
 
 def residual_chart(facts: Facts) -> Chart | None:
-    """Residual histograms: one panel per output."""
+    """Return the residual histograms: one panel per output."""
     histograms = figures.residual_histograms(facts)
     if not histograms:
         return None
@@ -174,7 +174,7 @@ def residual_chart(facts: Facts) -> Chart | None:
 
 
 def horizon_chart(facts: Facts) -> Chart | None:
-    """Error against horizon; with one horizon, a bar per model."""
+    """Return the error against horizon; with one horizon, a bar per model."""
     curves = figures.horizon_curves(facts)
     if not curves:
         return None
@@ -228,7 +228,7 @@ def speed_chart(facts: Facts) -> Chart | None:
 
 
 def recording_chart(facts: Facts) -> Chart | None:
-    """Error by recording: dots in rows, or with many recordings a curve over their rank."""
+    """Return the error by recording: dots in rows, or with many recordings a curve over their rank."""
     horizons = [k for k in figures.headline_first(facts) if figures.recording_errors(facts, k)[0]]
     if not horizons:
         return None

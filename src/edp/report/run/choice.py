@@ -161,7 +161,7 @@ def _ratios(errors: Errors, below: Errors) -> Errors:
 
 
 def _errors(overall: ByHorizon) -> Errors:
-    """Root-mean-square errors by horizon and target."""
+    """Return the root-mean-square errors by horizon and target."""
     return {
         k: {name: metric(metrics, "rmse") for name, metrics in targets.items() if name != MEAN}
         for k, targets in overall.items()
@@ -296,7 +296,7 @@ def promise_line(choice: AutoChoice) -> str:
 
 
 def _count_within(tested: Errors, interval: ErrorBounds) -> tuple[int, int]:
-    """How many test errors lie within their bounds, and how many have some."""
+    """Return how many test errors lie within their bounds, and how many have some."""
     within = [
         low <= tested[k][name] <= interval.high[k][name]
         for k, row in interval.low.items()

@@ -159,7 +159,10 @@ def _series(facts: Facts, recording: str, horizons: Sequence[int]) -> list[tuple
 
 
 def _ends(facts: Facts, recording: str, model: str, horizon: int | None, output: int) -> tuple[Array | None, ...]:
-    """(time,) both ends of the network's interval at the moments it speaks of, report units; None without one."""
+    """Return (time,) both ends of the network's interval at the moments it speaks of, report units.
+
+    None without one.
+    """
     parts = facts.predictions[recording]
     if model != NETWORK or horizon is None or LOW not in parts or HIGH not in parts:
         return None, None
@@ -222,7 +225,7 @@ def _residuals(facts: Facts, model: str, horizon: int, output: int) -> Array:
 
 
 def horizon_curves(facts: Facts) -> dict[str, list[tuple[float, float]]]:
-    """Error (`MEASURE`) of each model against the horizon: name -> (milliseconds or samples, report units)."""
+    """Return error (`MEASURE`) of each model against the horizon: name -> (milliseconds or samples, report units)."""
     scale = 1000.0 / facts.rate_hz if facts.rate_hz else 1.0
     curves: dict[str, list[tuple[float, float]]] = {}
     for name, model in facts.models.items():
@@ -263,6 +266,6 @@ def log_ticks(values: Sequence[float | None]) -> list[float]:
 
 
 def headline_first(facts: Facts) -> list[int]:
-    """Horizons to choose from in the figures, the headline's first."""
+    """Return the horizons to choose from in the figures, the headline's first."""
     main = main_horizon(facts)
     return sorted(horizons_shown(facts), key=lambda k: (k != main, k))

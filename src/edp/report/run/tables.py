@@ -42,7 +42,7 @@ _TILES = 3
 
 
 def comparison_tables(facts: Facts) -> list[Table]:
-    """Metrics of every model, one table per horizon, the headline's horizon first.
+    """Return the metrics of every model, one table per horizon, the headline's horizon first.
 
     Means over outputs where they have one unit, else the error of each output.
     """
@@ -79,7 +79,7 @@ def _any(rows: Sequence[ComparisonRow], key: str) -> bool:
 
 
 def output_table(facts: Facts) -> Table | None:
-    """Error by output at the longest horizon; None where `comparison_tables` shows it already."""
+    """Return the error by output at the longest horizon; None where `comparison_tables` shows it already."""
     return _tabulate_outputs(facts, main_horizon(facts)) if facts.averaged else None
 
 
@@ -177,7 +177,7 @@ def _colour_verdict(verdict: Value) -> Markup:
 
 
 def part_table(facts: Facts) -> Table | None:
-    """Parameters and multiply-accumulates of each part of the network."""
+    """Return the parameters and multiply-accumulates of each part of the network."""
     rows = facts.footprint.rows if facts.footprint else ()
     if not rows:
         return None
@@ -274,13 +274,13 @@ def _best_baseline(models: Mapping[str, ModelScores], horizon: int, targets: lis
 
 
 def _ratio(ours: list[float | None], theirs: list[float | None]) -> float | None:
-    """Geometric mean of the ratios of both, over the targets of which both have an error."""
+    """Return the geometric mean of the ratios of both, over the targets of which both have an error."""
     logs = [math.log(a / b) for a, b in zip(ours, theirs) if a and b]
     return math.exp(sum(logs) / len(logs)) if logs else None
 
 
 def machine_parts_table(foundation: FoundationFile) -> Table:
-    """Machines, recordings and minutes of each part."""
+    """Return the machines, recordings and minutes of each part."""
     heads = ("machines", "recordings", "minutes")
     rows = tuple((part, size.machines, size.recordings, size.minutes) for part, size in foundation.data.items())
     columns = (Column("Part"), *(Column(head.capitalize(), show=_short) for head in heads))
@@ -288,7 +288,7 @@ def machine_parts_table(foundation: FoundationFile) -> Table:
 
 
 def contexts_table(foundation: FoundationFile, unit: str = "report units") -> Table:
-    """Error by the time since the state was reset, always on the same ticks."""
+    """Return the error by the time since the state was reset, always on the same ticks."""
     unseen = foundation.unseen
     rows: list[tuple[Value, ...]] = []
     for row in unseen.contexts:
@@ -312,7 +312,7 @@ def _short(value: Value) -> str:
 
 
 def machines_table(foundation: FoundationFile, unit: str = "report units") -> Table:
-    """Each machine that tests, the hardest first."""
+    """Return each machine that tests, the hardest first."""
     each = sorted(foundation.unseen.machines.items(), key=lambda entry: -entry[1])
     columns = (Column("Machine"), Column("MAE", unit, figures([mae for _, mae in each])))
     return Table("Machines that were never seen, the hardest first", columns, tuple(each), name="machines")

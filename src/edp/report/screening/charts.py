@@ -94,7 +94,7 @@ def matrix_chart(views: Sequence[MatrixView]) -> Chart | None:
 
 
 def lag_chart(views: Sequence[LagView], rate_hz: float) -> Chart | None:
-    """Cross-correlation against the lag, a curve for each of the channels that go best with a target."""
+    """Return the cross-correlation against the lag, a curve for each of the channels that go best with a target."""
     if not views:
         return None
     marks: list[Mark] = [GuideLine(x=0.0, dash="dot", colour=FRAME)]

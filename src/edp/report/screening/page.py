@@ -228,7 +228,7 @@ def sentence(text: str) -> str:
 
 
 def tiles(screening: ScreeningResult) -> list[tuple[str, str, str]]:
-    """Key figures: value, unit, what."""
+    """Return the key figures: value, unit, what."""
     from edp.data.screening import FlagKind  # late: see `verdict`
 
     tiles = [

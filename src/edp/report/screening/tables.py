@@ -87,7 +87,7 @@ def flags_table(screening: ScreeningResult) -> Table:
 
 
 def ranges_table(screening: ScreeningResult) -> Table:
-    """Best lags by kind of signal, in the form of the thesis's Table 4.2."""
+    """Return the best lags by kind of signal, in the form of the thesis's Table 4.2."""
     rows = tuple(
         (
             row.group,
@@ -108,7 +108,10 @@ def ranges_table(screening: ScreeningResult) -> Table:
 
 
 def lags_table(screening: ScreeningResult) -> Table:
-    """Best lag of each channel against each target, with the correlation there; brackets where it is not certain."""
+    """Return the best lag of each channel against each target, with the correlation there.
+
+    Brackets where it is not certain.
+    """
     rows = []
     by_pair = {(curve.channel, curve.target): curve for curve in screening.lags}
     for channel in screening.channels:
@@ -127,7 +130,7 @@ def _cell(channel: str, curve: LagCurve | None) -> str:
 
 
 def clusters_table(screening: ScreeningResult) -> Table:
-    """Collinear channels."""
+    """Return the collinear channels."""
     rows = tuple(
         (cluster.representative, number(cluster.least, 2), ", ".join(cluster.members)) for cluster in screening.clusters
     )

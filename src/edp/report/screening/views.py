@@ -122,7 +122,7 @@ def matrix_views(screening: ScreeningResult) -> tuple[MatrixView, ...]:
 
 
 def lag_views(screening: ScreeningResult) -> tuple[LagView, ...]:
-    """For each target the curves of the channels that go best with it, itself left out."""
+    """Return the curves of the channels that correlate best with each target, without the target itself."""
     views = []
     for target in screening.targets:
         curves = [c for c in screening.lags if c.target == target and c.channel != target and math.isfinite(c.value)]
@@ -206,13 +206,13 @@ def _stability(
 
 
 def _make_labels_unique(bars: Sequence[Bar]) -> tuple[Bar, ...]:
-    """Bars under short labels, each its own."""
+    """Return the bars under short labels, each its own."""
     labels = short_labels(bar.label for bar in bars)
     return tuple(replace(bar, label=label) for bar, label in zip(bars, labels, strict=True))
 
 
 def importance_views(screening: ScreeningResult) -> tuple[BarView, ...]:
-    """Permutation importance by target, the mean of all first."""
+    """Return the permutation importance by target, the mean of all first."""
     proposed = set(screening.proposal.kept)
     views = []
     for target in ("all", *screening.targets):

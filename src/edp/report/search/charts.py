@@ -60,7 +60,7 @@ def study_charts(study: StudyFile) -> list[Chart]:
 
 
 def variance_chart(arms: Sequence[ArmView], unit: str) -> Chart | None:
-    """Fig 4.3: every run of every arm; a line joins the seeds of a run, a bar is the arm's mean."""
+    """Return figure 4.3: every run of every arm; a line joins the seeds of a run, a bar is the arm's mean."""
     if not arms:
         return None
     marks: list[Mark] = []
@@ -100,7 +100,7 @@ def _score_axis(unit: str, limits: tuple[float, float] | None = None) -> ChartAx
 
 
 def pareto_chart(points: Sequence[PointView], unit: str) -> Chart | None:
-    """Fig 4.4: score against a cost, the front marked."""
+    """Return figure 4.4: score against cost, with the Pareto front."""
     costs = [cost for cost in COSTS if any(cost in point.costs for point in points)]
     if not costs:
         return None

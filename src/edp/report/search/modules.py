@@ -25,7 +25,7 @@ OTHER = "Other"
 
 
 def modules_tables(study: StudyFile) -> tuple[Table, ...]:
-    """Table 4.5: phases 2 and 3 side by side, and every test of phase 3."""
+    """Return the table 4.5: phases 2 and 3 side by side, and every test of phase 3."""
     tables = (_modules_thesis if study.mode == "thesis" else _modules_sound)(study)
     return tuple(table for table in tables if table is not None)
 

@@ -37,7 +37,7 @@ def study_tables(study: StudyFile) -> dict[str, Table]:
 
 @require_phase(IsolationFacts, None)
 def variance_table(study: StudyFile, facts: IsolationFacts) -> Table | None:
-    """Table 4.3: mean error and its standard deviations, of MAE and of the composite score."""
+    """Return the table 4.3: mean error and its standard deviations, of MAE and of the composite score."""
     rows = []
     for arm in arm_views(study):
         spreads = [value for s in (arm.mae, arm.composite) for value in (s.mean, s.split, s.seed)]
@@ -137,7 +137,7 @@ def _count(value: Value) -> str:
 
 
 def selection_table(study: StudyFile) -> Table | None:
-    """Table 4.6: how often each module was on among the questions of phases 4 and 5."""
+    """Return the table 4.6: how often each module was on among the questions of phases 4 and 5."""
     decisions = {"Phase 4": study.facts(SynthesisFacts), "Phase 5": study.facts(ExplorationFacts)}
     on = {name: facts.on for name, facts in decisions.items() if facts is not None}
     names = list(dict.fromkeys(name for counts in on.values() for name in counts))
@@ -156,12 +156,12 @@ def selection_table(study: StudyFile) -> Table | None:
 
 
 def identifiers(study: StudyFile) -> dict[str, str]:
-    """Table 4.7: short names of the modules, in their order."""
+    """Return the table 4.7: short names of the modules, in their order."""
     return {name: f"M{number}" for number, (_, name) in enumerate(ordered(list(study.modules)), 1)}
 
 
 def identifiers_table(study: StudyFile) -> Table | None:
-    """Table 4.7."""
+    """Return the table 4.7."""
     rows = tuple((short, study.module(name), name) for name, short in identifiers(study).items())
     columns = (Column("ID"), Column("Module", is_text=True), Column("Name in settings", is_text=True))
     return Table("Module identifiers", columns, rows, name="identifiers") if "synthesis" in study.decided else None
@@ -169,7 +169,7 @@ def identifiers_table(study: StudyFile) -> Table | None:
 
 @require_phase(SynthesisFacts, None)
 def holdout_table(study: StudyFile, facts: SynthesisFacts) -> Table | None:
-    """Table 4.8: baseline and winners; in brackets the change against the baseline."""
+    """Return the table 4.8: baseline and winners; in brackets the change against the baseline."""
     calibrated, free = study.facts(CalibrationFacts), study.facts(ExplorationFacts)
     if calibrated is None:
         return None
@@ -208,7 +208,7 @@ def _compare_with(value: float, reference: float | None, show: Callable[[float],
 
 
 def openings_table(study: StudyFile) -> Table | None:
-    """Every opening of the sealed test sets."""
+    """Return every opening of the sealed test sets."""
     rows = tuple(
         (moment(opening.time), opening.why, len(opening.judged), opening.test_set) for opening in study.openings
     )
@@ -217,7 +217,7 @@ def openings_table(study: StudyFile) -> Table | None:
 
 
 def phases_table(study: StudyFile) -> Table | None:
-    """Trainings and time of each phase, and their sums."""
+    """Return the trainings and time of each phase, and their sums."""
     rows: list[tuple[Value, ...]] = [
         (p.heading, p.trainings, p.trained, p.pruned, p.failed, p.seconds, p.wall_s, _status(study, p))
         for p in study.all_phases

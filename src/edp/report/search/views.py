@@ -146,7 +146,7 @@ def valued(values: Mapping[str, Scalar]) -> str:
 
 
 def front(points: Sequence[PointView], cost: str) -> tuple[PointView, ...]:
-    """Points that no other one betters in score without costing more, in ascending order of cost."""
+    """Return the points that no other one betters in score without costing more, in ascending order of cost."""
     front_points: list[PointView] = []
     for point in sorted((p for p in points if cost in p.costs), key=lambda p: (p.costs[cost], p.score)):
         if not front_points or point.score < front_points[-1].score:

@@ -125,7 +125,7 @@ def _teacher(study: StudyFile, facts: ExplorationFacts) -> str:
 
 
 def tiles(study: StudyFile) -> list[tuple[str, str, str]]:
-    """Key figures: value, unit, what."""
+    """Return the key figures: value, unit, what."""
     pruned = sum(training.status == "pruned" for training in study.ended)
     failed = sum(training.status not in ("done", "pruned") for training in study.ended)
     trained = sum(phase.seconds for phase in study.phases)

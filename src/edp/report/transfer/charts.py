@@ -61,7 +61,7 @@ def _label(facts: Transfer, target: ScoredTarget) -> str:
 
 
 def prediction_chart(facts: Transfer, methods: Sequence[str]) -> Chart:
-    """Measured and predicted, a row for each target (figures 4.8 and 4.10)."""
+    """Return the measured and predicted, a row for each target (figures 4.8 and 4.10)."""
     names = [key.removesuffix("/truth") for key in facts.shown if key.endswith("/truth")]
     curves = [("truth", ("Measured", GREY, 3.0)), *((method, _look(facts, method)) for method in methods)]
     panels = []
@@ -85,7 +85,7 @@ def prediction_chart(facts: Transfer, methods: Sequence[str]) -> Chart:
 
 
 def error_chart(facts: Transfer, methods: Sequence[str]) -> Chart:
-    """Distribution of the errors, a panel for each target (figures 4.9 and 4.11); a dotted line is the bias."""
+    """Return distribution of the errors, a panel for each target (figures 4.9 and 4.11); a dotted line is the bias."""
     panels: list[Panel] = []
     for target in facts.targets:
         marks: list[Mark] = []

@@ -225,7 +225,7 @@ def _figures(facts: Transfer) -> str:
 
 
 def verdict(facts: Transfer) -> list[str]:
-    """Sentences under the headline: R2 and bias of each target, the best baseline, the domain of the source."""
+    """Return sentences under the headline: R2 and bias of each target, the best baseline, the domain of the source."""
     horizon, method = facts.horizons[-1], facts.content.method
     each = {facts.name(target): facts.score(method, horizon, target.name) for target in facts.targets}
     r2_texts = listed(f"{number(row['r2'], 4)} ({name})" for name, row in each.items())
@@ -260,7 +260,7 @@ def caveats(facts: Transfer) -> list[str]:
 
 
 def tiles(facts: Transfer) -> list[tuple[str, str, str]]:
-    """Key figures: value, unit, meaning."""
+    """Return the key figures: value, unit, meaning."""
     horizon, (before, after) = facts.horizons[-1], facts.pair
     was, now = facts.score(before, horizon), facts.score(after, horizon)
     return [

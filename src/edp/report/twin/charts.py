@@ -45,7 +45,7 @@ KINDS_DRAWN = {
 
 
 def twin_charts(facts: FreeRunFacts) -> list[Chart]:
-    """Every figure of the page: ``runs_velocities`` and so on, ``horizon``, and ``steps``."""
+    """Return every figure of the page: ``runs_velocities`` and so on, ``horizon``, and ``steps``."""
     runs = [runs_chart(facts, part) for part in PARTS if facts.channels(part) and facts.names]
     steps = None if facts.steps is None else steps_chart(facts.steps)
     return [*runs, horizon_chart(facts), *([] if steps is None else [steps])]
@@ -78,7 +78,10 @@ def runs_chart(facts: FreeRunFacts, part: str) -> Chart:
 
 
 def horizon_chart(facts: FreeRunFacts) -> Chart:
-    """Mean absolute error over the horizon, a panel for each kind of channel, and half widths of the intervals."""
+    """Return the mean absolute error over the horizon, a panel for each kind of channel.
+
+    And half widths of the intervals.
+    """
     half, seconds = facts.shown.get("half_width"), facts.shown["seconds"]
     panels: list[Panel] = []
     for part in PARTS:

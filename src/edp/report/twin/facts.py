@@ -344,7 +344,7 @@ def _tabulate_comparison(beside: PredictorComparison) -> Table:
 
 
 def has_mixed_units(scores: FreeRunScores) -> bool:
-    """Whether velocities of a twin have more than one unit."""
+    """Return whether velocities of a twin have more than one unit."""
     return bool(scores.velocity_mae.units)
 
 
@@ -371,7 +371,7 @@ def tabulate_ahead_by_actuator(models: Mapping[str, FreeRunScores], caption: str
 
 
 def _tabulate_actuators(name: str, caption: str, columns: Mapping[str, Sequence[tuple[str, ChannelErrors]]]) -> Table:
-    """Rows by actuator, then model; of each model titles and rows of errors, each by channel."""
+    """Return the rows by actuator, then model; of each model titles and rows of errors, each by channel."""
     first = next(iter(columns.values()))
     rows: list[tuple[Value, ...]] = []
     for which, velocity in enumerate(first[0][1].by_channel):

@@ -28,7 +28,7 @@ class NominalMachine:
         self.kinematics = pose.Kinematics(*pack(machine))
 
     def commands(self, levers: Any) -> Array:
-        """Nominal pilot pressures (Pa) of lever positions: the last 12 channels of Table A.1, shape (..., 12).
+        """Return nominal pilot pressures (Pa) of lever positions: the last 12 channels of Table A.1, shape (..., 12).
 
         Args:
             levers: shape (..., 3).
@@ -44,7 +44,7 @@ class NominalMachine:
         return out.reshape(*positions.shape[:-1], 2 * at.SPOOLS)
 
     def tip(self, strokes: Any) -> Array:
-        """Tip x, y (m from the boom foot) and attitude (rad) at strokes (m from closed), both of shape (..., 3).
+        """Return tip x, y (m from the boom foot) and attitude (rad) at strokes (m from closed), both of shape (..., 3).
 
         Raises:
             ConfigError: another shape.
@@ -52,7 +52,7 @@ class NominalMachine:
         return self.kinematics.poses(_triples(strokes, "strokes"))
 
     def strokes(self, poses: Any) -> Array:
-        """Strokes (m from closed) that put the tip at poses, both of shape (..., 3); NaN where it cannot be.
+        """Return the strokes (m from closed) that put the tip at poses, both of shape (..., 3); NaN where it cannot be.
 
         Raises:
             ConfigError: another shape.

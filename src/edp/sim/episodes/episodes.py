@@ -98,7 +98,10 @@ class Episodes:
         tick.begin(self.memory[index], self.drawn[index], self.columns, self._scratch, index, out)
 
     def new_out(self) -> tick.Out:
-        """Arrays for what `begin` and `step` show: observations, rows of the log, and which episodes have ended."""
+        """Return arrays for what `begin` and `step` show.
+
+        Observations, rows of the log, and which episodes have ended.
+        """
         observations = np.empty((self.count, len(self.columns)), np.float32)
         return observations, np.empty((self.count, tick.LOG_WIDTH)), np.zeros(self.count, dtype=np.bool_)
 
@@ -124,7 +127,7 @@ class Episodes:
         )
 
     def ticks(self, index: int) -> int:
-        """Ticks done since an episode began."""
+        """Return the ticks done since an episode began."""
         return int(self.memory[index, blocks.BLOCKS * blocks.ENTRY + blocks.TICK])
 
     def shares(self) -> Callable[[], Array] | None:
@@ -142,7 +145,7 @@ class Episodes:
         return partial(_shares_of, plans, ticks, self.most_faults)
 
     def ended(self, index: int) -> bool:
-        """Whether an episode has all its ticks behind it."""
+        """Return whether an episode has all its ticks behind it."""
         first = blocks.BLOCKS * blocks.ENTRY
         return bool(self.memory[index, first + blocks.TICK] >= self.memory[index, first + blocks.SAMPLES] - 1.0)
 
@@ -240,7 +243,7 @@ def _bridge(present: Array, fresh: Array, done: int, depth: int) -> None:
 
 
 def _shares_of(plans: Sequence[tuple[tuple[FaultSpec, ...], float]], ticks: NDArray[np.int64], most: int) -> Array:
-    """How much of each fault of several episodes is there at their ticks, shape (episode, fault)."""
+    """Return how much of each fault of several episodes is there at their ticks, shape (episode, fault)."""
     shares = np.full((len(plans), most), np.nan)
     for index, (faults, rate_hz) in enumerate(plans):
         shares[index, : len(faults)] = shares_at(faults, ticks[index : index + 1], rate_hz)[0]
@@ -256,7 +259,7 @@ def _sensor_draws(start: EpisodeStart, noise: np.random.SeedSequence, chance: np
 
 
 def _losses(start: EpisodeStart, samples: int, seed: np.random.SeedSequence) -> Array:
-    """1 at each tick whose observation is lost, shape (samples,)."""
+    """Return 1 at each tick whose observation is lost, shape (samples,)."""
     if start.lost_frames <= 0.0:
         return np.zeros(samples)
     return (np.random.default_rng(seed).random(samples) < start.lost_frames).astype(float)
@@ -270,7 +273,7 @@ def _changes(start: EpisodeStart, plant: Plant) -> Array:
 
 
 def _sensor_parts(start: EpisodeStart) -> dict[int, Array]:
-    """Blocks of the sensors, their draws and their faults."""
+    """Return the blocks of the sensors, their draws and their faults."""
     scenario, seeds = start.scenario, seeds_of(start.scenario)
     drawn = _sensor_draws(start, seeds[2], seeds[4])
     faults = SensorCourse(scenario.faults).table

@@ -30,7 +30,7 @@ Setup = tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]]
 
 @inlined
 def finite(value: float) -> bool:
-    """Whether a number is finite; where sums may be reordered, a compiler takes the test of Python as passed."""
+    """Return whether a number is finite; where sums may be reordered, a compiler takes the test of Python as passed."""
     return math.isfinite(value)
 
 

@@ -46,7 +46,7 @@ class Aprbs(Excitation):
         self._until_chirp = self._draw_pause()
 
     def _draw_pause(self) -> float:
-        """Seconds of steps before the next chirp."""
+        """Return the seconds of steps before the next chirp."""
         mean = 0.5 * sum(self.CHIRP_S) * (1.0 - self.CHIRP_SHARE) / self.CHIRP_SHARE
         return float(self._rng.uniform(0.3, 1.7) * mean)
 

@@ -37,7 +37,7 @@ class Excitation:
 
     @classmethod
     def levers(cls) -> int:
-        """How many levers it moves: boom, arm, bucket, and where it swings also swing, left and right track."""
+        """Return how many levers it moves: boom, arm, bucket, and where it swings also swing, left and right track."""
         return AXES + MOTORS if cls.swings else AXES
 
     def block(self, view: View) -> Array:
@@ -57,7 +57,7 @@ EXCITATIONS: Registry[type[Excitation]] = Registry("excitation")
 
 
 def extend_probability(stroke: float, pull: float = 1.1) -> float:
-    """Chance to extend next: more when retracted, so that the mean stroke stays near the middle."""
+    """Return the chance to extend next: more when retracted, so that the mean stroke stays near the middle."""
     # Never certain: moves into the ends of the stroke stay part of the data.
     return min(max(0.5 + pull * (0.5 - stroke), 0.03), 0.97)
 
@@ -135,7 +135,7 @@ class AxisStream:
         self.hold = Hold(rng, rate_hz)
 
     def move(self, stroke: float) -> float:
-        """Lever position of a move."""
+        """Return the lever position of a move."""
         if self._rng.random() < self.CHANGE:
             self._vigour = self._rng.uniform(*self.VIGOUR)
         sign = 1.0 if self._rng.random() < extend_probability(stroke) else -1.0

@@ -109,7 +109,7 @@ class Dig(Tracked):
         return self.stroke_leg(strokes, rng.uniform(*self.MOVE))
 
     def _dump(self, view: View) -> Array:
-        """Strokes of an open bucket high above the ground, with a way there that stays above it."""
+        """Return the strokes of an open bucket high above the ground, with a way there that stays above it."""
         rng = self._rng
         for _ in range(self.TRIES):
             x, y = rng.uniform(0.45, 0.85) * self.reach_m, self._surface + rng.uniform(*self.DUMP_M)
@@ -119,7 +119,7 @@ class Dig(Tracked):
         return np.array([min(view.strokes[0] + 0.2, 0.95), view.strokes[1], 0.1])
 
     def steer(self, view: View) -> None:
-        """In the drag: end with a full bucket, and rise where it stalls."""
+        """Return the levers of the drag: end with a full bucket, and raise the bucket at a stall."""
         if self._phase != DRAG:
             return
         if view.payload_kg > self._full_kg:

@@ -19,7 +19,7 @@ class Isolated(Excitation):
         self._axis = 0
 
     def block(self, view: View) -> Array:
-        """One move or pause of one axis."""
+        """Return one move or pause of one axis."""
         if self._stream.hold.left == 0:
             if self._rng.random() < 0.5:
                 self._axis = int(self._rng.integers(AXES))

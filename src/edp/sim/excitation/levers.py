@@ -20,7 +20,7 @@ RUN_S, SETTLE_S = 0.9, 0.5
 
 
 def dead_lever(machine: Machine) -> Array:
-    """Lever positions at which the main spools begin to open, shape (3, 2): extend, retract."""
+    """Return the lever positions at which the main spools begin to open, shape (3, 2): extend, retract."""
     valves = machine.valves
     bands = np.array([valves.dead_band_extend, valves.dead_band_retract]).T
     shaped: Array = valves.lever_dead_zone + (1.0 - valves.lever_dead_zone) * bands
@@ -30,7 +30,9 @@ def dead_lever(machine: Machine) -> Array:
 # Thirty short simulations each; few are kept, since a family may have a thousand machines.
 @lru_cache(maxsize=8)
 def speed_table(machine: Machine) -> tuple[Array, Array]:
-    """Lever to cylinder speed, measured on the machine from mid stroke in free air, as an automatic control is set up.
+    """Return the lever to cylinder speed, measured on the machine from mid stroke in free air.
+
+    As an automatic control is set up.
 
     Returns:
         Levers, shape (3, 2, levers), and the speeds (m/s, positive in either direction), the same shape; the first

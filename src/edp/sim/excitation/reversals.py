@@ -27,7 +27,7 @@ class Reversals(Excitation):
         self._levels = np.zeros(AXES)
 
     def block(self, view: View) -> Array:
-        """One flip, or the pause after a burst."""
+        """Return one flip, or the pause after a burst."""
         if self._hold.left == 0:
             self._next(view)
         samples = self._hold.spend(self._hold.left)

@@ -56,7 +56,7 @@ class SwingDig(Dig):
         return leg
 
     def block(self, view: View) -> Array:
-        """Levers over one control step."""
+        """Return the levers over one control step."""
         front = super().block(view)
         targets = np.zeros((len(front), self.levers()))
         targets[:, :AXES] = front
@@ -72,7 +72,7 @@ class SwingDig(Dig):
         return self._side if self._phase in (CURL, DUMP) else 0.0
 
     def _swing_lever(self, view: View) -> float:
-        """Towards the goal; centred where braking suffices."""
+        """Return the lever towards the goal, centred as soon as braking suffices."""
         left = self._swing_goal - view.swing
         braking = view.swing_rate * abs(view.swing_rate) / (2.0 * self.BRAKES_AT)
         # What is left once the motion has died out by itself.

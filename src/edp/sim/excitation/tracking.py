@@ -72,7 +72,7 @@ class Tracked(Excitation):
         """Adjust the present motion to the view; the default has no effect."""
 
     def block(self, view: View) -> Array:
-        """Levers over one control step, from the last ones in a straight line to the new ones."""
+        """Return the levers over one control step, from the last ones in a straight line to the new ones."""
         memory = self._memory
         if not self._begun:
             self._begun = True
@@ -113,7 +113,7 @@ class Tracked(Excitation):
         self._memory[tip_control.TIME] = self._leg[tip_control.LENGTH]
 
     def reference_pose(self) -> tuple[float, float, float]:
-        """Tip pose at the newest reference."""
+        """Return the tip pose at the newest reference."""
         return self.kinematics.pose_at(self._queue[-1])
 
     def line_fits(self, start: tuple[float, ...], goal: tuple[float, ...], margin: float = 0.04) -> bool:
@@ -127,7 +127,7 @@ class Tracked(Excitation):
         return True
 
     def stays_above(self, goal: Array, floor: float) -> bool:
-        """Whether the tip stays above a height (m) on a stroke leg to `goal`."""
+        """Return whether the tip stays above a height (m) on a stroke leg to `goal`."""
         start = self._queue[-1]
         return all(self.kinematics.pose_at(start + q * (goal - start))[1] > floor for q in (0.25, 0.5, 0.75, 1.0))
 
@@ -137,5 +137,5 @@ class Tracked(Excitation):
         return np.array([*start, *goal, float(np.abs(goal - start).max()) / speed + self.RAMP_S, 0.0])
 
     def cartesian_leg(self, start: tuple[float, ...], goal: tuple[float, ...], length_s: float) -> Array:
-        """From a tip pose to another."""
+        """Create a straight motion from one tip pose to another."""
         return np.array([*start, *goal, length_s, 1.0])

@@ -64,17 +64,17 @@ class Draws:
     scatter: float = 1.0
 
     def uniform(self, low: float, high: float, size: int | None = None) -> Any:
-        """Evenly from a range about a law, widened."""
+        """Draw uniformly from a widened range around a scaling law."""
         more = 0.5 * (self.scatter - 1.0) * (high - low)
         return self.rng.uniform(low - more, high + more, size)
 
     def wear(self, low: float, high: float) -> float:
-        """Evenly from new to worn."""
+        """Draw uniformly between new and worn."""
         return float(self.rng.uniform(low, high))
 
 
 def member_name(seed: int, index: int, masses_t: tuple[float, float] = MASSES_T, scatter: float = 1.0) -> str:
-    """``family-<seed>-<index>``; with ``-<low>-<high>`` in t and ``-x<scatter>`` where these are not the usual ones.
+    """Return ``family-<seed>-<index>``, with ``-<low>-<high>`` (t) and ``-x<scatter>`` unless they are the defaults.
 
     Such as ``family-0-3-10-12p5`` and ``family-0-3-x1p5``.
     """
@@ -89,7 +89,7 @@ def _format_value(value: float) -> str:
 
 
 def member_mass(seed: int, index: int, low_t: float = MASSES_T[0], high_t: float = MASSES_T[1]) -> float:
-    """Mass (t) of one machine of a family: evenly spread on a logarithmic scale, however many there are.
+    """Return the mass (t) of one machine of a family: evenly spread on a logarithmic scale, however many there are.
 
     Raises:
         ConfigError: the range is empty or beyond 1 to 200 t.
@@ -183,7 +183,7 @@ def _motor(motor: Any, s: float, sweep: float, weight: float) -> Any:
 
 
 def _swing(swing: SwingMotor, s: float) -> SwingMotor:
-    """Speeds of the swing fall with the root of the length."""
+    """Return the speeds of the swing fall with the root of the length."""
     scaled: SwingMotor = replace(_motor(swing, s, 2.5, 5.0), boom_foot_ahead=swing.boom_foot_ahead * s)
     return scaled
 
@@ -215,7 +215,7 @@ def _triangle(pins: PinTriangle, size: float) -> PinTriangle:
 
 
 def _bucket_linkage(pins: BucketLinkage, size: float, old_arm: float, new_arm: float) -> BucketLinkage:
-    """Scaled about the bucket pin, which ends the arm."""
+    """Return the scaled about the bucket pin, which ends the arm."""
     x, y = pins.cylinder_pin
     return replace(
         pins,

@@ -269,7 +269,7 @@ def _check_ratings(value: Rating | Ratings, key: str, where_key: str) -> None:
 
 
 def _check_pairs(machine: Machine, where: str) -> None:
-    """Bounds that one value sets another."""
+    """Check bounds that depend on another value."""
     cylinders, friction = machine.cylinders, machine.friction
     for i, name in enumerate(CYLINDERS):
         if cylinders.rod[i] >= cylinders.bore[i]:

@@ -24,7 +24,7 @@ FAMILY = re.compile(
 
 
 def machine_names() -> tuple[str, ...]:
-    """Names of the machines that come with the package."""
+    """Return the names of the machines that come with the package."""
     files = resources.files("edp.sim").joinpath("machines").iterdir()
     return tuple(sorted(f.name.removesuffix(".toml").upper() for f in files if f.name.endswith(".toml")))
 
@@ -94,7 +94,7 @@ def look_up_mass(name: str) -> float | None:
 def family_member(
     seed: int, index: int, low_t: float = MASSES_T[0], high_t: float = MASSES_T[1], scatter: float = 1.0
 ) -> Machine:
-    """Machine `index` of the family of `seed`: M22 scaled to a mass from `low_t` to `high_t`, with scatter.
+    """Return the machine `index` of the family of `seed`: M22 scaled to a mass from `low_t` to `high_t`, with scatter.
 
     It is also `load_machine` of its `member_name`, such as "family-0-3" and "family-0-3-10-20-x2".
 
@@ -114,7 +114,10 @@ def family_member(
 def machine_family(
     count: int, seed: int, low_t: float = MASSES_T[0], high_t: float = MASSES_T[1], scatter: float = 1.0
 ) -> tuple[Machine, ...]:
-    """`count` machines from `low_t` to `high_t`, each with its own scatter; the same seed gives the same machines."""
+    """Return `count` machines from `low_t` to `high_t`, each with its own scatter.
+
+    The same seed gives the same machines.
+    """
     return tuple(family_member(seed, index, low_t, high_t, scatter) for index in range(count))
 
 

@@ -104,7 +104,7 @@ def check_lines(machine: Machine, where: str) -> None:
 
 
 def check_motors(machine: Machine, where: str) -> None:
-    """Swing and travel or neither, and motors that can turn against their own friction."""
+    """Check that swing and travel are both present or both absent, and that motors overcome their own friction."""
     if (machine.swing is None) != (machine.travel is None):
         absent = "swing" if machine.swing is None else "travel"
         raise ConfigError(

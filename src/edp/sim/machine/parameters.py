@@ -24,14 +24,14 @@ UNBOUNDED = 1e12
 
 
 def conductance(rating: Rating) -> float:
-    """K of Q = k sqrt(dp), m^3/s/sqrt(Pa), from L/min at bar."""
+    """Return the k of Q = k sqrt(dp), m^3/s/sqrt(Pa), from L/min at bar."""
     flow, pressure = rating
     # 6e4 L/min are 1 m^3/s.
     return flow / 6e4 / math.sqrt(pressure * 1e5)
 
 
 def pack(machine: Machine) -> tuple[Array, Array]:
-    """`axes`, shape (3, AXIS_VALUES), and `plant`, shape (PLANT_VALUES,); see `edp.sim.machine.layout`."""
+    """Return `axes`, shape (3, AXIS_VALUES), and `plant`, shape (PLANT_VALUES,); see `edp.sim.machine.layout`."""
     axes = np.zeros((at.AXES, at.AXIS_VALUES))
     _pack_bodies(machine, axes)
     _pack_cylinders(machine, axes)

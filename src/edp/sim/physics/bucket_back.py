@@ -34,7 +34,7 @@ HEEL_CELLS = 2
 
 
 def passive_coefficient(friction: float, wall: float) -> float:
-    """Horizontal over vertical stress on an upright wall at passive failure.
+    """Return the horizontal over vertical stress on an upright wall at passive failure.
 
     `wall`: its friction (rad), at most `friction`, that of the soil.
     """
@@ -70,7 +70,7 @@ def pressure(depth: float, grown: float, back: Array) -> float:
 
 @compiled
 def measure_soil_ahead(points: Array, heights: Array, memory: Array, back: Array) -> tuple[float, float]:
-    """Depth (m) of the lower of tip and heel, `points`, in the soil ahead of both, and that soil's force (N)."""
+    """Return depth (m) of the lower of tip and heel, `points`, in the soil ahead of both, and that soil's force (N)."""
     low, front = min(points[1], points[3]), max(points[0], points[2])
     # 1.5 cells ahead: the cell of the front itself is cleared already.
     ahead = front + 1.5 * SPACING

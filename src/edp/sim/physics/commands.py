@@ -17,7 +17,10 @@ LEVER_BANDWIDTH_HZ, LEVER_RATE = 2.5, 5.0
 
 @compiled
 def smooth_lever(target: Array, hand: Array, step_s: float, out: Array) -> None:
-    """Lever positions of one sample, shape (3,), from targets: 2nd-order low-pass of limited rate; state in `hand`."""
+    """Filter the targets of one sample to lever positions, shape (3,): rate-limited 2nd-order low-pass.
+
+    State in `hand`.
+    """
     omega = 2.0 * np.pi * LEVER_BANDWIDTH_HZ
     for i in range(at.AXES):
         # Critically damped: an operator's hand does not ring.
@@ -29,7 +32,7 @@ def smooth_lever(target: Array, hand: Array, step_s: float, out: Array) -> None:
 
 @compiled
 def put_first(past: Array, demands: Array) -> None:
-    """Past demands into the first rows of `demands`."""
+    """Copy past demands to the first rows of `demands`."""
     for k in range(past.shape[0]):
         for j in range(past.shape[1]):
             demands[k, j] = past[k, j]
@@ -54,7 +57,7 @@ def shape_commands(
     demands: Array,
     held_commands: Array,
 ) -> None:
-    """Spool demands of `levers`, shape (samples, 3), behind the `past` ones into `demands`; `past` is then brought up.
+    """Write the spool demands of `levers`, shape (samples, 3), after the `past` demands; then update `past`.
 
     A `step_s` above 0 puts the operator's hand between the levers given and those of the machine. `held_commands` is
     scratch.
@@ -74,7 +77,7 @@ def shape_commands(
 def shape_motor_commands(
     levers: Array, hand: Array, step_s: float, past: Array, zone: float, demands: Array, shaped: Array
 ) -> None:
-    """Demands of the motors of `levers`, shape (samples, 3), behind the past ones; as `shape_commands` for cylinders.
+    """Write the motor demands of `levers`, shape (samples, 3), after the past demands, like `shape_commands`.
 
     `zone` is the dead zone of the levers, `shaped` scratch of shape (3,).
     """

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 def couplings(
     c2: float, s2: float, c3: float, s3: float, axes: Array
 ) -> tuple[float, float, float, float, float, float]:
-    """Off-diagonal terms of the mass matrix in absolute angles: k cos and k sin for (12), (13), (23).
+    """Return the off-diagonal terms of the mass matrix in absolute angles: k cos and k sin for (12), (13), (23).
 
     c2, s2, c3, s3: cosine and sine of the arm's and the bucket's relative angle.
     """
@@ -38,7 +38,10 @@ def couplings(
 
 @inlined
 def mass_terms(c12: float, c13: float, c23: float, axes: Array) -> tuple[float, float, float, float, float, float]:
-    """M in relative joint angles, kg m^2: entries 11, 12, 13, 22, 23, 33; L' H L with L the lower-triangular ones."""
+    """Return the mass matrix in relative joint angles, kg m^2, entries 11, 12, 13, 22, 23, 33.
+
+    M = L' H L with a lower-triangular L of ones.
+    """
     m2, m3 = axes[1, at.MASS], axes[2, at.MASS]
     l1, l2 = axes[0, at.LENGTH], axes[1, at.LENGTH]
     own_1 = axes[0, at.MASS] * (axes[0, at.COM_X] * axes[0, at.COM_X] + axes[0, at.COM_Y] * axes[0, at.COM_Y])
@@ -62,7 +65,7 @@ def mass_terms(c12: float, c13: float, c23: float, axes: Array) -> tuple[float, 
 def gravity_terms(
     boom: tuple[float, float], arm: tuple[float, float], bucket: tuple[float, float], axes: Array, gravity: float
 ) -> tuple[float, float, float]:
-    """Generalised gravity torques in relative angles, N m, from (cosine, sine) of the absolute angles."""
+    """Return the generalised gravity torques in relative angles, N m, from (cosine, sine) of the absolute angles."""
     m1, m2, m3 = axes[0, at.MASS], axes[1, at.MASS], axes[2, at.MASS]
     g3 = m3 * (axes[2, at.COM_X] * bucket[0] - axes[2, at.COM_Y] * bucket[1])
     g2 = m2 * (axes[1, at.COM_X] * arm[0] - axes[1, at.COM_Y] * arm[1]) + m3 * axes[1, at.LENGTH] * arm[0]
@@ -73,7 +76,10 @@ def gravity_terms(
 
 @inlined
 def coriolis_terms(s12: float, s13: float, s23: float, w1: float, w2: float, w3: float) -> tuple[float, float, float]:
-    """Coriolis and centrifugal torques in relative angles, N m, from joint rates and the sines of `couplings`."""
+    """Return the Coriolis and centrifugal torques in relative angles, N m.
+
+    From joint rates and the sines of `couplings`.
+    """
     w2 += w1
     w3 += w2
     first, second, third = w1 * w1, w2 * w2, w3 * w3
@@ -88,20 +94,20 @@ def _turn(angle: float) -> tuple[float, float]:
 
 
 def mass_matrix(psi: Array, axes: Array, out: Array) -> None:
-    """M(psi), shape (3, 3), kg m^2, in relative joint angles."""
+    """Return M(psi), shape (3, 3), kg m^2, in relative joint angles."""
     c12, _, c13, _, c23, _ = couplings(*_turn(psi[1]), *_turn(psi[2]), axes)
     m11, m12, m13, m22, m23, m33 = mass_terms(c12, c13, c23, axes)
     out[:] = [[m11, m12, m13], [m12, m22, m23], [m13, m23, m33]]
 
 
 def gravity_torque(psi: Array, axes: Array, gravity: float, out: Array) -> None:
-    """Generalised gravity torque in relative angles, shape (3,), N m."""
+    """Return the generalised gravity torque in relative angles, shape (3,), N m."""
     boom, arm, bucket = (_turn(angle) for angle in np.cumsum(psi))
     out[:] = gravity_terms(boom, arm, bucket, axes, gravity)
 
 
 def bias_torque(psi: Array, rate: Array, axes: Array, plant: Array) -> Array:
-    """Coriolis plus gravity torque h(psi, rate), shape (3,), N m."""
+    """Return the Coriolis plus gravity torque h(psi, rate), shape (3,), N m."""
     gravity = np.empty(3)
     gravity_torque(psi, axes, plant[at.GRAVITY], gravity)
     _, s12, _, s13, _, s23 = couplings(*_turn(psi[1]), *_turn(psi[2]), axes)
@@ -110,7 +116,7 @@ def bias_torque(psi: Array, rate: Array, axes: Array, plant: Array) -> Array:
 
 
 def mechanical_energy(psi: Array, rate: Array, axes: Array, plant: Array) -> float:
-    """Kinetic plus potential energy, J (zero height at the boom foot)."""
+    """Return the kinetic plus potential energy, J (zero height at the boom foot)."""
     mass = np.empty((3, 3))
     mass_matrix(psi, axes, mass)
     angles = np.cumsum(psi)

@@ -17,7 +17,7 @@ MIN_SPEED = 0.3
 
 @compiled
 def load_power(row: Array, plant: Array) -> float:
-    """Power (W) that both pumps take from the shaft at a logged sample and the present speed."""
+    """Return the power (W) that both pumps take from the shaft at a logged sample and the present speed."""
     power = 0.0
     for m in range(2):
         power += plant[at.MAX_FLOW] * row[at.DISPLACEMENT + m] * max(row[at.PUMP + m], 0.0)

@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 @inlined
 def eliminate(g: float, axes: Array, s: Array, e: Array) -> None:
-    """Chamber pressures and bristles as linear functions of joint rates and pump pressures, into the slopes `e`."""
+    """Express chamber pressures and bristles as linear functions of joint rates and pump pressures, in `e`."""
     for i in range(at.AXES):
         lever = s[LEVERS + i]
         ch, cr = g * e[i, C_HEAD], g * e[i, C_ROD]

@@ -17,7 +17,7 @@ NEGLIGIBLE = 6.5
 
 @inlined
 def lugre(v: float, z: float, axes: Array, i: int, viscous: float) -> tuple[float, float, float, float, float, float]:
-    """LuGre friction with bristle damping that fades with speed (which keeps it passive).
+    """Return the luGre friction with bristle damping that fades with speed (which keeps it passive).
 
     Args:
         v: cylinder velocity, m/s.
@@ -48,7 +48,7 @@ def lugre(v: float, z: float, axes: Array, i: int, viscous: float) -> tuple[floa
 
 @inlined
 def end_stop(stroke: float, v: float, axes: Array, i: int) -> tuple[float, float]:
-    """Hunt-Crossley stop force (N, extension positive) and its derivative by velocity; it pushes, never pulls."""
+    """Return the Hunt-Crossley stop force (N, extension positive) and its derivative by velocity; it never pulls."""
     if stroke < 0.0:
         depth, inward = -stroke, -v
     elif stroke > axes[i, at.STROKE]:

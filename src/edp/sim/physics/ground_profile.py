@@ -20,7 +20,7 @@ DEEPEST_RUT = 0.1
 
 @inlined
 def height_at(x: float, heights: Array) -> float:
-    """Height (m) of the ground at `x`, linear between its points."""
+    """Return the height (m) of the ground at `x`, linear between its points."""
     # Just below the last point, so that k + 1 exists.
     cell = min(max(x / SPACING, 0.0), heights.shape[0] - 1.000001)
     k = int(cell)

@@ -20,7 +20,7 @@ UNLOADING = 1.5
 
 @inlined
 def orifice(dp: float) -> tuple[float, float]:
-    """Dp / (dp^2 + delta^2)^(1/4), which is sqrt(dp) smoothed over 1 bar, and its derivative."""
+    """Return the dp / (dp^2 + delta^2)^(1/4), which is sqrt(dp) smoothed over 1 bar, and its derivative."""
     q2 = dp * dp + SMOOTH2
     # Two square roots replace the slower pow(q2, 0.25).
     root = math.sqrt(math.sqrt(q2))
@@ -38,7 +38,7 @@ def check_orifice(dp: float, leak: float) -> tuple[float, float]:
 
 @inlined
 def stiffness(pressure: float, plant: Array) -> float:
-    """Effective bulk modulus (Pa) of oil with free air at a gauge pressure (Pa), isothermal."""
+    """Return the effective bulk modulus (Pa) of oil with free air at a gauge pressure (Pa), isothermal."""
     # 0.1 bar absolute, as the clamped pressures: a stage of ROS2 may fall below it, where a / p has no meaning.
     absolute = max(pressure + at.ATMOSPHERE, 1e4)
     air = plant[at.AIR] * at.ATMOSPHERE
@@ -50,7 +50,7 @@ def stiffness(pressure: float, plant: Array) -> float:
 
 @inlined
 def port_flows(pressure: float, relief: float, leak: float, plant: Array) -> tuple[float, float]:
-    """Inflow (m^3/s) of one chamber through relief, make-up check and spool leakage, and its slope (<= 0)."""
+    """Return inflow (m^3/s) of one chamber through relief, make-up check and spool leakage, and its slope (<= 0)."""
     flow, slope = -leak * (pressure - plant[at.TANK]), -leak
     # A slope instead of a hard limit: real reliefs let pressure rise while they open, and the Jacobian needs it.
     if pressure > relief:
@@ -143,7 +143,9 @@ def highest_load(m: int, state: Array, opened: Array, plant: Array) -> float:
 
 @inlined
 def relief_of(highest: float, plant: Array) -> float:
-    """Pressure (Pa) above which a pump line opens to tank: the main relief's, or an unloading valve's above the load.
+    """Return the pressure (Pa) above which a pump line opens to tank.
+
+    The main relief's, or an unloading valve's above the load.
 
     A pump that senses loads swings back late; until then a valve set to `UNLOADING` margins above the `highest` load
     takes its oil, as in closed-centre blocks.

@@ -59,7 +59,7 @@ def anchor(i: int, angle: float, s: Array) -> None:
 
 @inlined
 def turned(i: int, angle: float, s: Array) -> tuple[float, float]:
-    """Cosine and sine of joint `i`, by series for the turn since its anchor: within a sample it is small."""
+    """Return the cosine and sine of joint `i`, by series for the turn since its anchor: within a sample it is small."""
     if not abs(angle - s[ANCHOR + i]) < ANCHORED:
         anchor(i, angle, s)
     x = angle - s[ANCHOR + i]
@@ -72,7 +72,7 @@ def turned(i: int, angle: float, s: Array) -> tuple[float, float]:
 
 @inlined
 def freeze_geometry(state: Array, axes: Array, plant: Array, strokes: Array, s: Array) -> None:
-    """Strokes, lever arms, volumes, mass matrix, gravity and Coriolis coefficients at the current angles."""
+    """Compute strokes, lever arms, volumes, mass matrix, gravity and Coriolis terms at the current angles."""
     c1, s1 = turned(0, state[at.PSI], s)
     c2, s2 = turned(1, state[at.PSI + 1], s)
     c3, s3 = turned(2, state[at.PSI + 2], s)
@@ -110,7 +110,7 @@ def section_loads(w: Array, opened: Array, plant: Array, jacobian: bool, motors:
 
 @inlined
 def rates(w: Array, axes: Array, plant: Array, work: tuple[Array, ...], jacobian: bool, motors: Motors | None) -> None:
-    """F(w) into `work[RATES]`: torque balance (not yet divided by M), pressure and bristle rates.
+    """Write F(w) to `work[RATES]`: torque balance (not yet divided by M), pressure and bristle rates.
 
     `w` is a state vector; its part from RATE to BRISTLE is used, and that of the lines where there are any. Derivatives
     go to `work[SLOPE]` if asked for. Motors are at their state then, and at that of the stage otherwise.
@@ -174,7 +174,10 @@ def rates(w: Array, axes: Array, plant: Array, work: tuple[Array, ...], jacobian
 def rosenbrock(
     state: Array, h: float, axes: Array, plant: Array, work: tuple[Array, ...], motors: Motors | None
 ) -> None:
-    """ROS2 on w: (I - gJ) k1 = F(w), (I - gJ) k2 = F(w + h k1) - 2 k1, w += 1.5 h k1 + 0.5 h k2, g = gamma h."""
+    """Advance w by one step of ROS2.
+
+    (I - gJ) k1 = F(w), (I - gJ) k2 = F(w + h k1) - 2 k1, w += 1.5 h k1 + 0.5 h k2, g = gamma h.
+    """
     s, rhs, f, k1, k2, stage = work[FROZEN_W], work[RHS], work[RATES], work[K1], work[K2], work[STAGE]
     g, long = GAMMA * h, plant[at.LINES] > 0.0
     rates(state, axes, plant, work, True, motors)
@@ -222,7 +225,7 @@ def rosenbrock(
 
 @inlined
 def begin_sample(state: Array, work: tuple[Array, ...]) -> None:
-    """Anchor the joints, so that no step depends on more than the state at the beginning of its sample."""
+    """Reset the joints' reference angles, so that a step depends only on the state at the start of its sample."""
     for i in range(at.AXES):
         anchor(i, state[at.PSI + i], work[FROZEN_W])
 
@@ -307,7 +310,7 @@ def step(
 
 
 def new_work() -> tuple[Array, ...]:
-    """Fresh scratch arrays for `step`."""
+    """Return the fresh scratch arrays for `step`."""
     shapes: list[tuple[int, ...]] = [(FROZEN,), (3,), (3, at.OPENINGS), (5, 5), (4, SLOPES), (terramechanics.CONTACTS,)]
     return tuple(np.zeros(shape) for shape in shapes + [(at.STATES,)] * 5)
 

@@ -38,7 +38,9 @@ def line_rates(
     plant: Array,
     work: tuple[Array, ...],
 ) -> tuple[float, float]:
-    """Rates of both chambers and lines of cylinder `i` at speed `v`; returns stiffness over volume of the chambers.
+    """Return the rates of both chambers and lines of cylinder `i` at speed `v`.
+
+    Returns stiffness over volume of the chambers.
 
     `flows` are those of `cylinder_flows`; slopes go to `work[SLOPE]`.
     """

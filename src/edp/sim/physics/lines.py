@@ -29,12 +29,12 @@ DENSITY = 860.0
 
 
 def modelled(cylinders: Cylinders) -> bool:
-    """Whether a machine has lines of their own."""
+    """Return whether a machine has lines of their own."""
     return any(cylinders.line_bore)
 
 
 def lengths(cylinders: Cylinders) -> Array:
-    """Length (m) of each cylinder's line of this volume and bore, shape (3,)."""
+    """Return the length (m) of each cylinder's line of this volume and bore, shape (3,)."""
     return np.array(cylinders.hose_volume) / (math.pi / 4.0 * np.array(cylinders.line_bore) ** 2)
 
 
@@ -55,7 +55,7 @@ def pack_lines(machine: Machine, axes: Array) -> None:
 
 @inlined
 def drop(flow: float, i: int, axes: Array, plant: Array) -> tuple[float, float]:
-    """Pressure (Pa) lost along a line of cylinder `i` at a flow (m^3/s), and its slope (> 0)."""
+    """Return the pressure (Pa) lost along a line of cylinder `i` at a flow (m^3/s), and its slope (> 0)."""
     # Viscosity is that of 40 degC over `THINNING`.
     viscous = axes[i, at.LINE_LAMINAR] / plant[at.THINNING]
     root = math.sqrt(abs(flow))
@@ -67,7 +67,7 @@ def drop(flow: float, i: int, axes: Array, plant: Array) -> tuple[float, float]:
 
 @inlined
 def first_valve_pressure(plant: Array) -> int:
-    """First state of the pressures (heads, then rods) that the valve's sections see."""
+    """Return the first state of the pressures (heads, then rods) that the valve's sections see."""
     return at.PORT_HEAD if plant[at.LINES] > 0.0 else at.HEAD
 
 

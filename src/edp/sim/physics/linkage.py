@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 @inlined
 def pin_triangle(base: float, rod: float, cosine: float, sine: float) -> tuple[float, float]:
-    """Length (m) between the pins and its derivative by the angle (m/rad), by the cosine law."""
+    """Return the length (m) between the pins and its derivative by the angle (m/rad), by the cosine law."""
     length = math.sqrt(base * base + rod * rod - 2.0 * base * rod * cosine)
     return length, base * rod * sine / length
 
@@ -48,7 +48,7 @@ def bucket_linkage(cosine: float, sine: float, plant: Array) -> tuple[float, flo
 
 @inlined
 def cylinder_at(axis: int, cosine: float, sine: float, plant: Array) -> tuple[float, float]:
-    """`cylinder` from cosine and sine of the joint angle."""
+    """Return `cylinder` from cosine and sine of the joint angle."""
     if axis == 0:
         c, s = plant[at.BOOM_COS], plant[at.BOOM_SIN]
         return pin_triangle(plant[at.BOOM_BASE], plant[at.BOOM_ROD], cosine * c - sine * s, sine * c + cosine * s)
@@ -63,12 +63,12 @@ def cylinder_at(axis: int, cosine: float, sine: float, plant: Array) -> tuple[fl
 
 @compiled
 def cylinder(axis: int, psi: float, plant: Array) -> tuple[float, float]:
-    """Pin-to-pin length (m) of one cylinder and J = dx/dpsi (m/rad), thesis eq. 3.7 (J is diagonal)."""
+    """Return the pin-to-pin length (m) of one cylinder and J = dx/dpsi (m/rad), thesis eq. 3.7 (J is diagonal)."""
     return cylinder_at(axis, math.cos(psi), math.sin(psi), plant)
 
 
 def bucket_closes(psi: Array, plant: Array) -> NDArray[np.bool_]:
-    """Whether rocker and link meet at these bucket angles (rad)."""
+    """Return whether rocker and link meet at these bucket angles (rad)."""
     angle = psi + plant[at.LUG_ANGLE]
     across = plant[at.PIN_X] + plant[at.LUG] * np.cos(angle) - plant[at.PIVOT_X]
     apart = np.hypot(across, plant[at.LUG] * np.sin(angle) - plant[at.PIVOT_Y])
@@ -110,7 +110,7 @@ def bucket_branch(closed: float, full: float, plant: Array) -> tuple[Array, Arra
 
 
 def angle_at_stroke(axis: int, stroke: float, axes: Array, plant: Array) -> float:
-    """Joint angle (rad) at a stroke (m from closed): the cosine law, or bisection for the bucket."""
+    """Return the joint angle (rad) at a stroke (m from closed): the cosine law, or bisection for the bucket."""
     target = stroke + axes[axis, at.CLOSED]
     if axis < 2:
         base, rod, offset = ((at.BOOM_BASE, at.BOOM_ROD, at.BOOM_OFFSET), (at.ARM_BASE, at.ARM_ROD, at.ARM_OFFSET))[

@@ -99,7 +99,7 @@ MATERIAL_FILE = SettingsTree(what="material file")
 
 
 def material_names() -> tuple[str, ...]:
-    """Names of the materials that come with the package."""
+    """Return the names of the materials that come with the package."""
     files = resources.files("edp.sim").joinpath("materials").iterdir()
     return tuple(sorted(f.name.removesuffix(".toml") for f in files if f.name.endswith(".toml")))
 

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 def motors_of(machine: Machine) -> tuple[SwingMotor, Motor, Motor]:
-    """Motors of swing, left and right track.
+    """Return the motors of swing, left and right track.
 
     Raises:
         ConfigError: the machine has none.
@@ -31,7 +31,7 @@ def motors_of(machine: Machine) -> tuple[SwingMotor, Motor, Motor]:
 
 
 def pack_motors(machine: Machine) -> Array:
-    """Numbers of the motors of a machine that has them, shape (3, MOTOR_VALUES)."""
+    """Return the numbers of the motors of a machine that has them, shape (3, MOTOR_VALUES)."""
     numbers, motors = np.zeros((at.MOTORS, at.MOTOR_VALUES)), motors_of(machine)
     for row, motor in zip(numbers, motors, strict=True):
         row[: at.FOOT_AHEAD] = (
@@ -45,7 +45,7 @@ def pack_motors(machine: Machine) -> Array:
 
 
 def filters_of(machine: Machine, half_s: float) -> Array:
-    """Transitions of pilots and spools of the motors over half a step, shape (3, 2, 4)."""
+    """Return the transitions of pilots and spools of the motors over half a step, shape (3, 2, 4)."""
     return np.array(
         [
             [
@@ -93,7 +93,7 @@ class MotorCircuit:
         return self.state, self.valves, self.hand, self.past
 
     def demands_of(self, levers: Array, hand_s: float) -> Array:
-        """Demands of levers of shape (samples, 3), behind the past ones, which are brought up.
+        """Return the demands of levers of shape (samples, 3), behind the past ones, which are brought up.
 
         A hand smooths the levers at steps of `hand_s`, none where it is 0.
         """

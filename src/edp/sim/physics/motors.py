@@ -89,7 +89,7 @@ def open_sections(motors: Motors) -> None:
 
 @inlined
 def freeze_inertia(motors: Motors, turns: Array, axes: Array) -> None:
-    """Inertia of the swing and its slopes, from cosines and sines of the front's absolute angles in `turns`."""
+    """Compute the inertia of the swing and its derivatives from the front's absolute angles in `turns`."""
     frozen, foot = motors[FROZEN], motors[NUMBERS][0, at.FOOT_AHEAD]
     total = motors[NUMBERS][0, at.MOTOR_INERTIA]
     x, first, second, third, height = foot, 0.0, 0.0, 0.0, 0.0
@@ -128,7 +128,7 @@ def highest_load(m: int, state: Array, motors: Motors) -> float:
 
 @inlined
 def drag(i: int, speed: float, motors: Motors) -> tuple[float, float]:
-    """Friction (N m, N) of motor `i` at a speed, and its slope."""
+    """Return the friction (N m, N) of motor `i` at a speed, and its slope."""
     numbers = motors[NUMBERS]
     dry = numbers[i, at.MOTOR_COULOMB]
     if motors[STATE][i, at.IDLE] >= numbers[i, at.BRAKE_DELAY]:
@@ -141,7 +141,7 @@ def drag(i: int, speed: float, motors: Motors) -> tuple[float, float]:
 
 @inlined
 def port_flows(pressure: float, i: int, motors: Motors, plant: Array) -> tuple[float, float]:
-    """Inflow (m^3/s) of a port of motor `i` through relief, make-up check and drain, and its slope (<= 0)."""
+    """Return inflow (m^3/s) of a port of motor `i` through relief, make-up check and drain, and its slope (<= 0)."""
     numbers = motors[NUMBERS]
     flow, slope = hydraulics.port_flows(pressure, NEVER, numbers[i, at.MOTOR_DRAIN] * plant[at.THINNING], plant)
     above, relief_slope = pressure - numbers[i, at.MOTOR_RELIEF], numbers[i, at.MOTOR_SLOPE]
@@ -293,7 +293,7 @@ def fill(first: float, second: float, motors: Motors) -> None:
 
 @inlined
 def first_stage(motors: Motors) -> None:
-    """Right-hand sides of the first stage of ROS2."""
+    """Compute the right-hand sides of the first stage of ROS2."""
     for i in range(at.MOTORS):
         for n in range(at.WAY):
             motors[RHS][i, n] = motors[RATES][i, n]
@@ -310,7 +310,7 @@ def to_stage(motors: Motors, h: float) -> None:
 
 @inlined
 def second_stage(motors: Motors) -> None:
-    """Right-hand sides of the second stage; rows of the speeds hold the inertia in place of 1."""
+    """Compute the right-hand sides of the second stage; rows of the speeds contain the inertia instead of 1."""
     f, k1, out = motors[RATES], motors[K1], motors[RHS]
     for i in range(at.MOTORS):
         out[i, at.SPEED] = f[i, at.SPEED] - 2.0 * motors[SLOPE][i, MOVED] * k1[i, at.SPEED]
@@ -349,7 +349,7 @@ def hold_commands(motors: Motors, sample: float) -> None:
 
 @inlined
 def write_log(motors: Motors, row: int, demand: int) -> None:
-    """One logged sample into `row` of the log; `demand` is the row of the demands that belongs to it."""
+    """Write one logged sample to `row` of the log; `demand` is the matching row of the demands."""
     log, state = motors[LOG], motors[STATE]
     for i in range(at.MOTORS):
         log[row, at.LOG_MOTOR_SPEED + i] = state[i, at.SPEED]
@@ -361,7 +361,7 @@ def write_log(motors: Motors, row: int, demand: int) -> None:
 
 @inlined
 def relieved(motors: Motors) -> bool:
-    """Whether the relief of a port is open."""
+    """Return whether the relief of a port is open."""
     state, opened = motors[STATE], False
     for i in range(at.MOTORS):
         relief = motors[NUMBERS][i, at.MOTOR_RELIEF]
@@ -371,7 +371,7 @@ def relieved(motors: Motors) -> bool:
 
 @inlined
 def power(motors: Motors) -> float:
-    """Power (W) that the motors take from the oil."""
+    """Return the power (W) that the motors take from the oil."""
     watts, state = 0.0, motors[STATE]
     for i in range(at.MOTORS):
         watts += motors[NUMBERS][i, at.SWEPT] * (state[i, at.PORT_A] - state[i, at.PORT_B]) * state[i, at.SPEED]
@@ -380,6 +380,6 @@ def power(motors: Motors) -> float:
 
 @compiled
 def shape_demand(lever: Array, zone: float, out: Array) -> None:
-    """Lever positions in [-1, 1] to signed demands of the spools, both shape (3,)."""
+    """Convert lever positions in [-1, 1] to signed demands of the spools, both of shape (3,)."""
     for i in range(at.MOTORS):
         out[i] = math.copysign(min(max((abs(lever[i]) - zone) / (1.0 - zone), 0.0), 1.0), lever[i])

@@ -21,7 +21,7 @@ PARTS = 10
 
 @compiled
 def fill_levers(angles: Array, plant: Array, out: Array) -> None:
-    """Lever arms J = dx/dpsi in m/rad at joint angles, both of shape (time, 3)."""
+    """Compute lever arms J = dx/dpsi in m/rad at joint angles, both of shape (time, 3)."""
     for k in range(angles.shape[0]):
         for i in range(at.AXES):
             out[k, i] = linkage.cylinder(i, angles[k, i], plant)[1]
@@ -55,7 +55,7 @@ def fill_loads(log: Array, axes: Array, plant: Array, force: Array, mass: Array)
 def cross_play(
     pull: tuple[float, float], mass: float, half: float, step_s: float, before: tuple[float, float]
 ) -> tuple[float, float]:
-    """Offset (m) and speed (m/s) of a pin in its bore after a sample, from those before it.
+    """Return the offset (m) and speed (m/s) of a pin in its bore after a sample, from those before it.
 
     `pull` is the force at the beginning and at the end of the sample, `half` the half of the play.
     """
@@ -82,7 +82,7 @@ def first_offset(force: float, half: float) -> float:
 
 @compiled
 def follow_play(force: Array, mass: Array, width: Array, step_s: float, out: Array) -> None:
-    """Velocity of each joint against its cylinder in the play of its pins, m/s, shape (time, 3), into `out`.
+    """Write the velocity of each joint relative to its cylinder within the pin play, m/s, shape (time, 3), to `out`.
 
     A pin that pushes lies half of `width` (m) ahead of its bore. Once the force turns, no force passes until the play
     is crossed: against a cylinder without play the joint is then accelerated by -force / mass, and held back by the
@@ -101,7 +101,7 @@ def follow_play(force: Array, mass: Array, width: Array, step_s: float, out: Arr
 
 
 def lever_arms(angles: Array, plant: Array) -> Array:
-    """Lever arms J = dx/dpsi in m/rad at joint angles, shape (time, 3)."""
+    """Return the lever arms J = dx/dpsi in m/rad at joint angles, shape (time, 3)."""
     out = np.empty_like(angles)
     fill_levers(np.ascontiguousarray(angles), plant, out)
     return out

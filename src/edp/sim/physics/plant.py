@@ -32,7 +32,7 @@ Clock = tuple[int, float, float, Array]
 
 @compiled
 def is_near_end(row: Array, axes: Array) -> bool:
-    """Whether any cylinder of a logged sample runs into a cushion, or moves at a stop."""
+    """Return whether any cylinder of a logged sample runs into a cushion, or moves at a stop."""
     for i in range(at.AXES):
         v, stroke = row[at.LOG_VELOCITY + i], row[at.LOG_STROKE + i]
         ahead = axes[i, at.STROKE] - stroke if v > 0.0 else stroke
@@ -55,7 +55,7 @@ def run_sample(
     row: Array,
     motors: Motors | None = None,
 ) -> int:
-    """From one logged instant, whose log is `row`, to the next; returns the number of clamped pressures.
+    """Simulate from the logged sample `row` to the next sample; return the number of clamped pressures.
 
     `newest` is the row of the demands that belongs to the sample; the rest as in `run_samples`.
     """
@@ -117,7 +117,7 @@ def run_samples(
 
 
 def steps_per_sample(rate_hz: float, step_s: float) -> int:
-    """Whole number of integration steps that fill a sample.
+    """Return the whole number of integration steps that fill a sample.
 
     Raises:
         ConfigError: there is none.
@@ -241,7 +241,7 @@ class Plant:
         return self._advance(levers, 0.0)
 
     def follow(self, targets: Array) -> Array:
-        """Like `run`, with the operator's hand between targets and levers."""
+        """Simulate like `run`, with the operator's hand between targets and levers."""
         return self._advance(targets, 1.0 / self.rate_hz)
 
     def drive(self, demands: Array) -> Array:

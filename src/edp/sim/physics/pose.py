@@ -73,7 +73,7 @@ def reach(x: float, y: float, attitude: float, axes: Array, plant: Array, limits
 
 @compiled
 def angle_at(axis: int, stroke: float, axes: Array, plant: Array, limits: Array) -> float:
-    """Joint angle (rad) at a stroke (m from closed), by bisection between `joint_limits`."""
+    """Return the joint angle (rad) at a stroke (m from closed), by bisection between `joint_limits`."""
     target = stroke + axes[axis, at.CLOSED]
     low, high = limits[axis, 0], limits[axis, 1]
     # The boom's length alone grows with its angle.
@@ -91,7 +91,7 @@ def angle_at(axis: int, stroke: float, axes: Array, plant: Array, limits: Array)
 
 @compiled
 def fill_poses(strokes: Array, axes: Array, plant: Array, limits: Array, out: Array) -> None:
-    """Tip poses at strokes in m from closed, both of shape (time, 3), into `out`."""
+    """Write tip poses at strokes in m from closed, both of shape (time, 3), to `out`."""
     for k in range(strokes.shape[0]):
         x = y = angle = 0.0
         for i in range(at.AXES):
@@ -103,7 +103,7 @@ def fill_poses(strokes: Array, axes: Array, plant: Array, limits: Array, out: Ar
 
 @compiled
 def fill_strokes(poses: Array, axes: Array, plant: Array, limits: Array, reached: Array, out: Array) -> None:
-    """Strokes in m from closed at tip poses, both of shape (time, 3), into `out`; NaN out of reach."""
+    """Write strokes in m from closed at tip poses, both of shape (time, 3), to `out`; NaN out of reach."""
     for k in range(poses.shape[0]):
         reach(poses[k, 0], poses[k, 1], poses[k, 2], axes, plant, limits, reached)
         for i in range(at.AXES):
@@ -112,13 +112,13 @@ def fill_strokes(poses: Array, axes: Array, plant: Array, limits: Array, reached
 
 
 def joint_limits(axes: Array, plant: Array) -> Array:
-    """Joint angles (rad) at the ends of each stroke, lower first, shape (3, 2)."""
+    """Return the joint angles (rad) at the ends of each stroke, lower first, shape (3, 2)."""
     ends = [[linkage.angle_at_stroke(i, share * axes[i, at.STROKE], axes, plant) for share in (0, 1)] for i in range(3)]
     return np.sort(np.array(ends), axis=1)
 
 
 def tip_pose(angles: Array, axes: Array) -> tuple[float, float, float]:
-    """Tip x and y (m) and attitude (rad) at joint angles, shape (3,)."""
+    """Return the tip x and y (m) and attitude (rad) at joint angles, shape (3,)."""
     absolute = np.cumsum(angles)
     lengths = axes[:, at.LENGTH]
     return float(lengths @ np.cos(absolute)), float(lengths @ np.sin(absolute)), float(absolute[2])
@@ -163,14 +163,16 @@ class Kinematics:
         return reached[:3] if reached[REACHABLE] > 0.5 else None
 
     def poses(self, strokes: Array) -> Array:
-        """Tip x, y (m) and attitude (rad) at strokes in m from closed, both of shape (..., 3)."""
+        """Return the tip x, y (m) and attitude (rad) at strokes in m from closed, both of shape (..., 3)."""
         strokes = np.asarray(strokes, dtype=float)
         out = np.empty((strokes.size // 3, 3))
         fill_poses(np.ascontiguousarray(strokes.reshape(-1, 3)), self.axes, self.plant, self.limits, out)
         return out.reshape(strokes.shape)
 
     def strokes(self, poses: Array) -> Array:
-        """Strokes in m from closed that put the tip at poses (x, y in m, attitude in rad), both of shape (..., 3).
+        """Return the strokes in m from closed that put the tip at poses (x, y in m, attitude in rad).
+
+        Both of shape (..., 3).
 
         NaN where a pose cannot be reached.
         """

@@ -150,5 +150,5 @@ def bypass_conductances(valves: Array, axes: Array, plant: Array, motors: Motors
 
 
 def displacement_share(time_constant_s: float, step_s: float) -> float:
-    """exp(-step / time constant), the exact first-order step."""
+    """Return the exp(-step / time constant), the exact first-order step."""
     return math.exp(-step_s / time_constant_s)

@@ -90,7 +90,7 @@ class Snapshot:
 
 
 def _array(archive: ZipReader, name: str) -> NDArray[Any]:
-    """One array; its header must announce the bytes that are there, before NumPy takes memory for it."""
+    """Return one array; its header must announce the bytes that are there, before NumPy takes memory for it."""
     data = io.BytesIO(archive.read(name))
     version = np.lib.format.read_magic(data)
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -105,7 +105,7 @@ def _array(archive: ZipReader, name: str) -> NDArray[Any]:
 
 
 def capture(value: Any, arrays: list[NDArray[Any]]) -> Any:
-    """`value` as JSON-able data, its arrays copied into `arrays`; parts that never change become None."""
+    """Return `value` as JSON-able data, its arrays copied into `arrays`; parts that never change become None."""
     # Before np.generic: these are JSON as they are.
     if value is None or isinstance(value, bool | int | str):
         return {"value": value}
@@ -127,7 +127,7 @@ def capture(value: Any, arrays: list[NDArray[Any]]) -> Any:
 
 
 def _changes(value: Any) -> bool:
-    """Whether an object can change: functions, types and frozen dataclasses without arrays cannot."""
+    """Return whether an object can change: functions, types and frozen dataclasses without arrays cannot."""
     if callable(value) or isinstance(value, type) or not hasattr(value, "__dict__"):
         return False
     params = getattr(value, "__dataclass_params__", None)

@@ -96,7 +96,7 @@ def move_back(h: float, v: tuple[float, float, float, float], c: Array, ground: 
 
 @compiled
 def settle(state: Array, h: float, c: Array, ground: tuple[Array, ...]) -> None:
-    """After a step: forces for the log, distance and shear, swept soil, the chassis."""
+    """Complete a step: forces for the log, distance and shear, swept soil, chassis."""
     numbers, heights, memory = ground[0], ground[3], ground[4]
     v = tm.velocities(c, state[at.RATE], state[at.RATE + 1], state[at.RATE + 2])
     force = (0.0, 0.0, 0.0, 0.0)
@@ -156,7 +156,7 @@ def spill(angle: float, x: float, time_s: float, numbers: Array, heights: Array,
 
 @compiled
 def slide(x: float, numbers: Array, heights: Array) -> None:
-    """Slopes around `x` that are too steep give way, once forth and once back."""
+    """Let soil slide on slopes around `x` that are too steep, forwards and backwards once."""
     middle = cell_of(x, heights)
     # 1.2 m to either side of the edge: soil is moved nowhere else.
     first, last = max(middle - 24, 0), min(middle + 24, heights.shape[0] - 1)
@@ -173,7 +173,7 @@ def slide(x: float, numbers: Array, heights: Array) -> None:
 
 @compiled
 def carry(numbers: Array, memory: Array, axes: Array) -> None:
-    """Mass, centre and inertia of the bucket with its load."""
+    """Compute mass, centre and inertia of the bucket with its load."""
     own, load = numbers[tm.BUCKET_MASS], memory[at.PAYLOAD]
     mass = own + load
     x = (own * numbers[tm.BUCKET_X] + load * numbers[tm.LOAD_X]) / mass

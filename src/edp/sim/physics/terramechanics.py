@@ -64,7 +64,7 @@ PUSHED_BACK = 0.5
 
 
 def cutting_factors(rake_deg: float, friction_deg: float, metal_deg: float) -> tuple[float, float, float]:
-    """N_gamma, N_c and N_a of the earthmoving equation at the failure angle that minimises N_gamma."""
+    """Return the n_gamma, N_c and N_a of the earthmoving equation at the failure angle that minimises N_gamma."""
     # Steps of 0.1 deg: the minimum over the failure angle is flat.
     failure = np.radians(np.linspace(5.0, 85.0, 801))
     rake, phi, delta = (math.radians(a) for a in (rake_deg, friction_deg, metal_deg))
@@ -81,7 +81,7 @@ def cutting_factors(rake_deg: float, friction_deg: float, metal_deg: float) -> t
 
 @cache
 def cutting_table(material: Material) -> Array:
-    """`cutting_factors` for every degree of rake, shape (181, 3); constant where no wedge of soil can form.
+    """Return `cutting_factors` for every degree of rake, shape (181, 3); constant where no wedge of soil can form.
 
     Shared by all grounds of a material: not to be changed.
     """
@@ -201,7 +201,7 @@ def strength(numbers: Array, course: Array, memory: Array) -> tuple[float, float
 
 @compiled
 def engage_edge(inward: float, ground: Ground, floor: tuple[float, float], c: Array) -> None:
-    """Drag, the part across, and edge penetration at the tip in `c`, from depth and rake.
+    """Compute drag, its transverse part and edge penetration at the tip in `c`, from depth and rake.
 
     `inward`: 1 when the tip moves towards the machine, 0 when it moves away.
     """
@@ -251,7 +251,7 @@ def engage_heel(numbers: Array, heights: Array, memory: Array, c: Array) -> None
 
 @compiled
 def engage(state: Array, angles: Array, axes: Array, ground: Ground, c: Array) -> None:
-    """Positions, Jacobians and forces of this step in `c`; `angles`: cosine and sine of the absolute angles."""
+    """Compute positions, Jacobians and forces of this step in `c`; `angles`: cosine and sine of the absolute angles."""
     numbers, _, _, heights, memory = ground
     c1, s1, ca, sa, cb, sb = angles[0], angles[1], angles[2], angles[3], angles[4], angles[5]
     elbow_x, elbow_y = axes[0, at.LENGTH] * c1, axes[0, at.LENGTH] * s1
@@ -302,7 +302,7 @@ def engage(state: Array, angles: Array, axes: Array, ground: Ground, c: Array) -
 
 @inlined
 def velocities(c: Array, w1: float, w2: float, w3: float) -> Four:
-    """Velocity of tip and heel, m/s, at these joint rates and the chassis' own."""
+    """Return the velocity of tip and heel, m/s, at these joint rates and the chassis' own."""
     tip_x = c[TIP_JX] * w1 + c[TIP_JX + 1] * w2 + c[TIP_JX + 2] * w3 + c[PITCHED]
     tip_y = c[TIP_JY] * w1 + c[TIP_JY + 1] * w2 + c[TIP_JY + 2] * w3 + c[PITCHED + 1]
     heel_x = c[HEEL_JX] * w1 + c[HEEL_JX + 1] * w2 + c[HEEL_JX + 2] * w3 + c[PITCHED + 2]
@@ -339,7 +339,7 @@ def forces(c: Array, v: Four) -> Four:
 
 @inlined
 def torques(c: Array, w1: float, w2: float, w3: float) -> tuple[float, float, float]:
-    """Joint torques (N m) of the ground at these joint rates."""
+    """Return the joint torques (N m) of the ground at these joint rates."""
     fx, fy, hx, hy = forces(c, velocities(c, w1, w2, w3))
     return (
         c[TIP_JX] * fx + c[TIP_JY] * fy + c[HEEL_JX] * hx + c[HEEL_JY] * hy,
@@ -369,7 +369,7 @@ def hold(w1: float, w2: float, w3: float, c: Array) -> None:
 
 @compiled
 def damp(c: Array) -> None:
-    """Damping of the joints by the soil, N m s, into `c[DAMPING:]`, row by row: minus the Jacobian of `torques`."""
+    """Write the damping of the joints by the soil, N m s, to `c[DAMPING:]` by rows: minus the Jacobian of `torques`."""
     drag, edge, slide, across = c[DRAG], c[EDGE], c[SLIDE], c[ACROSS]
     xx, xy, yy = drag + edge * c[EDGE_X] * c[EDGE_X], edge * c[EDGE_X] * c[EDGE_Y], drag + edge * c[EDGE_Y] * c[EDGE_Y]
     for i in range(3):
@@ -382,7 +382,7 @@ def damp(c: Array) -> None:
 
 @compiled
 def rock(h: float, numbers: Array, memory: Array, c: Array, force: Four, at_rest: float) -> None:
-    """Pitch of the chassis over one step: a spring on its tracks that gives way at the lifting moment."""
+    """Compute the pitch of the chassis over one step: a spring on its tracks that yields at the lifting moment."""
     tip_x, tip_y, heel_x, heel_y = c[TIP_JY], -c[TIP_JX], c[HEEL_JY], -c[HEEL_JX]
     moment = tip_x * force[1] - tip_y * force[0] + heel_x * force[3] - heel_y * force[2]
     limit = numbers[LIFT_MOMENT]

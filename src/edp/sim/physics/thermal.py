@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 @compiled
 def set_temperature(celsius: float, plant: Array) -> None:
-    """Oil at this temperature: leakage goes with 1 / viscosity, viscous friction with the root of viscosity."""
+    """Set the oil temperature: leakage is proportional to 1 / viscosity, viscous friction to the root of viscosity."""
     plant[at.OIL_TEMPERATURE] = celsius
     # The modulus falls by 0.4 % a K; viscosity by 3.5 % a K about 40 degC, its root by half of that.
     plant[at.BULK_MODULUS] = plant[at.BULK_AT_45] * (1.0 - 0.004 * (celsius - 45.0))
@@ -49,7 +49,7 @@ def losses(row: Array, axes: Array, plant: Array, motors: Motors | None = None) 
 
 @compiled
 def warm(row: Array, axes: Array, plant: Array, time_s: float, motors: Motors | None = None) -> None:
-    """Heat and cool the oil over `time_s`, and let its properties follow."""
+    """Heat and cool the oil over `time_s`, and update its properties."""
     celsius = plant[at.OIL_TEMPERATURE]
     heat = losses(row, axes, plant, motors) - plant[at.COOLING] * (celsius - plant[at.AMBIENT])
     set_temperature(celsius + heat * time_s / plant[at.HEAT_CAPACITY], plant)

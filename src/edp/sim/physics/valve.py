@@ -18,7 +18,10 @@ SPOOL_DAMPING = 1.0
 
 @compiled
 def shape_demand(lever: Array, axes: Array, plant: Array, out: Array) -> None:
-    """Lever positions in [-1, 1], shape (3,), to signed spool demands, shape (6,): primary, then conflux spools."""
+    """Convert lever positions in [-1, 1], shape (3,), to signed spool demands, shape (6,).
+
+    Primary, then conflux spools.
+    """
     zone, start = plant[at.LEVER_DEAD_ZONE], plant[at.CONFLUX_START]
     for i in range(at.AXES):
         size = min(max((abs(lever[i]) - zone) / (1.0 - zone), 0.0), 1.0)
@@ -31,7 +34,7 @@ def shape_demand(lever: Array, axes: Array, plant: Array, out: Array) -> None:
 
 @compiled
 def fill_pilots(levers: Array, full: float, axes: Array, plant: Array, demand: Array, out: Array) -> None:
-    """One-sided pilot pressures (Pa), shape (time, 12), of lever positions, shape (time, 3), into `out`.
+    """Write one-sided pilot pressures (Pa), shape (time, 12), of lever positions, shape (time, 3), to `out`.
 
     In the order of Table A.1; `demand` is scratch, one value per spool.
     """
@@ -43,7 +46,7 @@ def fill_pilots(levers: Array, full: float, axes: Array, plant: Array, demand: A
 
 
 def oscillator(frequency_hz: float, damping: float, step_s: float) -> list[float]:
-    """Exact transition of (error, rate) of a low-pass of damping <= 1 over one step, row by row, 4 values."""
+    """Return exact transition of (error, rate) of a low-pass of damping <= 1 over one step, row by row, 4 values."""
     omega = 2.0 * math.pi * frequency_hz
     # The exact solution instead of an integration step: stable and of the same result for any step.
     ringing = omega * math.sqrt(1.0 - damping * damping)
@@ -56,7 +59,7 @@ def oscillator(frequency_hz: float, damping: float, step_s: float) -> list[float
 
 
 def spool_filters(machine: Machine, step_s: float) -> Array:
-    """Transitions over `step_s` of pilot and spool, shape (6, 2, 4)."""
+    """Return the transitions over `step_s` of pilot and spool, shape (6, 2, 4)."""
     valves = machine.valves
     pilots = valves.pilot_frequency * 2
     spools = valves.spool_frequency + valves.conflux_spool_frequency
@@ -69,7 +72,7 @@ def spool_filters(machine: Machine, step_s: float) -> Array:
 
 
 def dead_times(machine: Machine) -> Array:
-    """Dead time of each spool's command, shape (6,), s."""
+    """Return the dead time of each spool's command, shape (6,), s."""
     first = np.array(machine.valves.dead_time)
     return np.concatenate((first, first + machine.valves.conflux_extra_dead_time))
 
@@ -118,7 +121,7 @@ def cushion(distance: float, length: float, least: float) -> float:
 
 @inlined
 def open_spools(valves: Array, stroke: Array, axes: Array, out: Array) -> None:
-    """Conductances of this step from spool positions and cushions, `out` shape (3, OPENINGS)."""
+    """Compute the conductances of this step from spool positions and cushions, `out` shape (3, OPENINGS)."""
     for i in range(at.AXES):
         for n in range(at.OPENINGS):
             out[i, n] = 0.0

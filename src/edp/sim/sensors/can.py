@@ -46,7 +46,7 @@ class Frames:
 
 
 def frames(samples: int, rate_hz: float, bus: Bus, phase: float, latency_s: float, rng: np.random.Generator) -> Frames:
-    """Frames of one ECU over a recording.
+    """Return the frames of one ECU over a recording.
 
     Args:
         samples: samples of the recording.

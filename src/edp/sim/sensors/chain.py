@@ -95,7 +95,7 @@ def between(history: Array, position: float) -> tuple[Array, Array, float]:
 
 @inlined
 def read_joints(drawn: Array, setup: Setup, history: Array, out: Array) -> None:
-    """Cylinder velocities that the joints' ECU sends: v = J(measured angle) * measured rate."""
+    """Compute the cylinder velocities sent by the joints' ECU: v = J(measured angle) * measured rate."""
     numbers, _, plant, _ = setup
     low, high, part = between(history, drawn[AT_JOINTS])
     for i in range(at.AXES):
@@ -113,7 +113,7 @@ def read_joints(drawn: Array, setup: Setup, history: Array, out: Array) -> None:
 
 @inlined
 def read_pressures(drawn: Array, numbers: Array, history: Array, out: Array) -> None:
-    """Cylinder pressures that the transmitters' ECU sends, into ``out[6:12]``."""
+    """Compute the cylinder pressures sent by the transmitters' ECU, in ``out[6:12]``."""
     low, high, part = between(history, drawn[AT_PRESSURES])
     warmer = low[TEMPERATURE] + part * (high[TEMPERATURE] - low[TEMPERATURE]) - REFERENCE_TEMPERATURE
     drift = numbers[DRIFT] * warmer
@@ -138,7 +138,7 @@ def read_pilots(position: float, full: float, history: Array, out: Array) -> Non
 
 @inlined
 def differentiate(tick: int, numbers: Array, memory: Array, out: Array) -> None:
-    """Accelerations, the filtered derivative of the velocities shown, into ``out[3:6]``."""
+    """Compute accelerations, the filtered derivative of the shown velocities, in ``out[3:6]``."""
     coefficients = numbers[DERIVATIVE : DERIVATIVE + 5]
     for i in range(at.AXES):
         first = DERIVATIVE_STATE + 2 * i
@@ -215,5 +215,5 @@ def sense_all(
 
 
 def new_state(depth: int, fault_memory: tuple[int, int] = (0, 2)) -> State:
-    """Memory, history of `depth` ticks, scratch, and memory of faults of this shape."""
+    """Return the memory, history of `depth` ticks, scratch, and memory of faults of this shape."""
     return np.zeros(SENSOR_MEMORY), np.zeros((depth, REMEMBERED)), np.zeros((2, at.AXES)), np.zeros(fault_memory)

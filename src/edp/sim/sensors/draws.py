@@ -83,7 +83,7 @@ def draw(machine: Machine, samples: int, rate_hz: float, rng: np.random.Generato
 
 
 def depth(drawn: Array) -> int:
-    """How many ticks back the oldest value is read that is shown, and the tick itself."""
+    """Return how many ticks back the oldest value is read that is shown, and the tick itself."""
     late = np.arange(len(drawn))[:, None] - np.floor(drawn[:, : len(ECUS)])
     return int(late.max()) + 1
 
@@ -98,7 +98,7 @@ def _bus(machine: Machine, samples: int, rate_hz: float, rng: np.random.Generato
 
 
 def pack_sensors(machine: Machine, rate_hz: float, noisy: bool, faults: Array | None = None) -> chain.Setup:
-    """Numbers of the chain, `axes` and `plant` of the machine as built, and the table of faults.
+    """Return the numbers of the chain, `axes` and `plant` of the machine as built, and the table of faults.
 
     As built, since payload, oil and faults change the plant's own.
 

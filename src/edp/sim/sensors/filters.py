@@ -16,7 +16,7 @@ DERIVATIVE_DAMPING = 0.7
 
 @inlined
 def biquad(x: float, numbers: Array, state: Array) -> float:
-    """One sample of a filter of order two with a[0] = 1, transposed direct form II.
+    """Return one sample of a filter of order two with a[0] = 1, transposed direct form II.
 
     `numbers` is b[0], b[1], b[2], a[1], a[2]; `state`, two values, goes on.
     """
@@ -53,7 +53,7 @@ def derivative_numbers(bandwidth_hz: float, rate_hz: float) -> Array:
 
 
 def filtered_derivative(values: Array, bandwidth_hz: float, rate_hz: float) -> Array:
-    """Causal derivative along time by the filter of `derivative_numbers`, shape ``(time, channel)``.
+    """Return the causal derivative along time by the filter of `derivative_numbers`, shape ``(time, channel)``.
 
     The filter starts in steady state at the first value.
     """

@@ -61,7 +61,7 @@ def write_events(
 
 @compiled
 def write_tip(state: Array, axes: Array, row: Array) -> None:
-    """Bucket tip (m from the boom foot) and attitude (rad)."""
+    """Write the bucket tip (m from the boom foot) and attitude (rad)."""
     x = y = angle = 0.0
     for i in range(at.AXES):
         angle += state[at.PSI + i]
@@ -78,7 +78,7 @@ def write_log(
     row: Array,
     motors: Motors | None = None,
 ) -> None:
-    """One sample: plant state, demands, strokes (m from closed), velocities (m/s), then what else is true."""
+    """Write one sample: plant state, demands, strokes (m from closed), velocities (m/s), and additional true values."""
     (state, valves), (axes, plant, _, ground) = moving, setup
     heights, memory = ground[3], ground[4]
     for n in range(at.LOGGED_STATES):

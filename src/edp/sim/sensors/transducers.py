@@ -31,7 +31,7 @@ def random_walk(shape: tuple[int, int], step_s: float, size: float, rng: np.rand
 
 
 def lag(time_constant_s: float, step_s: float) -> tuple[float, float, float]:
-    """First-order lag that is exact for a signal that is linear between samples.
+    """Return the first-order lag that is exact for a signal that is linear between samples.
 
     Returns:
         a, b and c of y[k] = a x[k] + s[k - 1] and s[k] = b x[k] + c y[k].

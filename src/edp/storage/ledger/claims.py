@@ -17,7 +17,7 @@ from edp.storage.writing import make_folder, write_bytes
 
 
 def claim(folder: str | Path, key: str) -> Claim:
-    """Claim a training for this process until it ends or releases the claim.
+    """Return the claim a training for this process until it ends or releases the claim.
 
     Raises:
         BusyError: another process trains it.
@@ -44,7 +44,7 @@ class Claim:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Free the claim."""
+        """Release the claim."""
         release(self.file, self.stream)
 
 

@@ -48,7 +48,7 @@ FINAL = frozenset(TrainingStatus) - {TrainingStatus.LOST}
 
 
 def canonical(value: Any) -> str:
-    """One text for one value: JSON with sorted keys, in which 1, 1.0, true and "1" differ.
+    """Return one text for one value: JSON with sorted keys, in which 1, 1.0, true and "1" differ.
 
     Raises:
         NotFiniteError: a number is NaN or infinite, which equals nothing, not even itself.
@@ -77,13 +77,13 @@ def _check_plain(value: Any, where: str) -> None:
 
 
 def digest_of(value: Any) -> str:
-    """blake2b of the canonical text."""
+    """Return the blake2b of the canonical text."""
     return hashlib.blake2b(canonical(value).encode(), digest_size=16).hexdigest()
 
 
 @cache
 def code_version(whole: bool = False) -> str:
-    """Version of the package and blake2b of its source and tables, without what decides no result.
+    """Return the version of the package and blake2b of its source and tables, without what decides no result.
 
     Args:
         whole: whether to include all of the source: a unit of work may call any part.
@@ -138,7 +138,7 @@ class TrainingIdentity:
         return digest_of(asdict(self))
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return the plain values."""
         return asdict(self)
 
 

@@ -45,7 +45,7 @@ def _parse_record(file: Path, data: bytes) -> Record:
 
 
 def _read(folder: Path) -> tuple[dict[str, bytes], list[Damage]]:
-    """Bytes of the whole records by key, not yet taken apart: with ten thousand that is most of the time."""
+    """Return the bytes of the whole records by key, not yet taken apart: with ten thousand that is most of the time."""
     record_bytes: dict[str, bytes] = {}
     damaged = []
     for name in (entry.name for entry in entries_of(folder, "*.json")):

@@ -81,7 +81,7 @@ class TreeLearner:
         self.every = _sample(np.arange(len(work.table.columns)), most, rng)
 
     def fit(self) -> None:
-        """Every output of all models; progress after each."""
+        """Fit every output of all models, with progress after each output."""
         began, outputs = time.perf_counter(), self.work.table.targets.shape[1]
         total = len(self.kinds) * outputs
         for number, kind in enumerate(self.kinds):

@@ -24,7 +24,7 @@ MIN_GAIN = 0.005
 
 
 def band(values: DoubleArray, width: float | DoubleArray) -> DoubleArray:
-    """Values behind a dead band, as `edp.networks.heads.OutputBand` has it."""
+    """Return the values behind a dead band, as `edp.networks.heads.OutputBand` has it."""
     return np.asarray(values - 2.0 * np.clip(values, -width, width) + np.clip(values, -2.0 * width, 2.0 * width))
 
 

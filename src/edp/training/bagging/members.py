@@ -63,7 +63,7 @@ class MemberGroup:
             self.judged.append(torch.from_numpy(np.sort(chosen)))
 
     def forward(self, x: Tensor, parameters: list[Tensor], dropping: bool = False) -> Tensor:
-        """``(member, row, column)`` to ``(member, row, output)``."""
+        """Return ``(member, row, column)`` to ``(member, row, output)``."""
         rate = self.members.dropout.p if dropping else 0.0
         for weight, bias in zip(parameters[:-2:2], parameters[1:-2:2], strict=True):
             x = self.members.function(torch.baddbmm(bias, x, weight))
@@ -72,7 +72,7 @@ class MemberGroup:
         return torch.baddbmm(parameters[-1], x, parameters[-2])
 
     def _penalty(self, error: Tensor, kind: Tensor) -> Tensor:
-        """Mean penalty of each member by its own loss; error ``(member, row, output)``, kind ``(member,)``."""
+        """Return mean penalty of each member by its own loss; error ``(member, row, output)``, kind ``(member,)``."""
         each = torch.zeros(len(error))
         for number, loss in enumerate(self.losses):
             mine = torch.nonzero(kind == number).flatten()

@@ -57,7 +57,7 @@ class PerceptronLearner:
         self.rate = self.rows_per_s = 0.0
 
     def fit(self) -> None:
-        """All updates, with checks between; each check keeps the members that are better than before.
+        """Run all updates with checks in between; each check stores the members that have improved.
 
         Raises:
             Diverged: the loss is not finite any more.

@@ -103,7 +103,7 @@ class RadialLearner:
         return [self._require_fit().ridge.left_out]
 
     def write(self, shares: DoubleArray) -> HeadPart:
-        """Centres and length into the network; the mean of the folds' models into the head."""
+        """Return the centres and length into the network; the mean of the folds' models into the head."""
         kernel = self._require_fit()
         weight, intercept = kernel.ridge.mean()
         full = np.zeros((self.features.count, weight.shape[1]))
@@ -125,6 +125,6 @@ class RadialLearner:
 
 
 def _arguments(rows: NDArray[np.floating], centres: DoubleArray) -> DoubleArray:
-    """``-|row - centre|^2 / 2``, ``(row, centre)``."""
+    """Return ``-|row - centre|^2 / 2``, ``(row, centre)``."""
     distance = np.square(rows).sum(axis=1)[:, None] + np.square(centres).sum(axis=1) - 2.0 * rows @ centres.T
     return np.asarray(-0.5 * np.maximum(distance, 0.0))

@@ -20,7 +20,7 @@ MIN_FOLD = 1e-4
 def stacking_weights(
     models: Sequence[DoubleArray], residual: DoubleArray, owner: NDArray[np.int64], further: Sequence[bool]
 ) -> DoubleArray:
-    """Non-negative weight of each model in the sum, ``(model, output)``.
+    """Return the non-negative weight of each model in the sum, ``(model, output)``.
 
     Whether an output has further models is evaluated by weights that left out one more fold: all folds' weights have
     seen the rows that they would be evaluated by.
@@ -45,7 +45,9 @@ def stacking_weights(
 
 
 def _weights(columns: DoubleArray, truth: DoubleArray, owner: NDArray[np.int64]) -> DoubleArray:
-    """Non-negative least squares, in which a fold counts by the root of the mean square that its best model leaves.
+    """Return the non-negative least squares.
+
+    In which a fold counts by the root of the mean square that its best model leaves.
 
     With squares alone the fold with the liveliest motion would choose. Over eight sets of recordings weights that did
     not see the fold they are evaluated by have 0.8 % less error this way, 2 % less in the mean over folds.

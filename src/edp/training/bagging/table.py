@@ -79,7 +79,9 @@ def committee_of(net: Predictor) -> Committee:
 
 
 def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> BaggingTable:
-    """Rows of the training and validation parts as the network sees them; its bank then gives changes of unit spread.
+    """Return the rows of the training and validation parts as the network sees them.
+
+    Its bank then gives changes of unit spread.
 
     Raises:
         ConfigError: more rows than the memory takes.
@@ -154,7 +156,10 @@ def _limits(columns: NDArray[np.float32], present: int) -> tuple[torch.Tensor, t
 def _whole_recordings(
     stretches: Sequence[Series], test: Sequence[Series], lengths: Sequence[int], folds: int
 ) -> Folds | None:
-    """Folds of whole recordings where whole recordings test, of which no row trains; None where parts of them do."""
+    """Return the folds of whole recordings where whole recordings test, of which no row trains.
+
+    None where parts of them do.
+    """
     names = [part.recording for part in stretches]
     if not test or not all(names) or not {part.recording for part in test}.isdisjoint({*names, ""}):
         return None

@@ -48,7 +48,7 @@ class SoftmaxDivergence:
         check_bounds("softmax divergence", self, temperature=WEIGHT)
 
     def evaluate(self, answer: Prediction, target: Tensor) -> Tensor:
-        """Terms of the divergence times the number of outputs, so that their mean is the divergence."""
+        """Return the terms of the divergence times the number of outputs, so that their mean is the divergence."""
         student = torch.log_softmax(answer.center / self.temperature, dim=-1)
         teacher = torch.log_softmax(target / self.temperature, dim=-1)
         scale = self.temperature**2 * target.shape[-1]
@@ -122,7 +122,10 @@ class Distillation:
         self.components: Components | None = None
 
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
-        """Series with teacher targets: a mark whether there is truth, predictions in SI units, hidden components."""
+        """Return the series with teacher targets.
+
+        A mark whether there is truth, predictions in SI units, hidden components.
+        """
         check_same_ends(task, self.teachers[0].task, "the student", "the teacher")
         if self.spec.hint and self.components is None:
             self.components = Components.fitted(
@@ -170,7 +173,7 @@ class Distillation:
         return loss
 
     def end(self, net: Predictor) -> None:
-        """Nothing was done to the network but to its weights."""
+        """End the distillation, which has changed only weights."""
 
     def _add_teacher_outputs(self, part: Series, truth: bool) -> Series:
         answers = [stream_predictions(teacher, [part])[0] for teacher in self.teachers]
@@ -190,7 +193,7 @@ class Distillation:
 
     def _collect_hidden(self, part: Series) -> NDArray[np.float32]:
         # Side by side: hidden spaces of several teachers have no common axes to average over.
-        """Hidden features of all teachers side by side, ``(time, width)``."""
+        """Return the hidden features of all teachers side by side, ``(time, width)``."""
         return np.concatenate([stream_hidden(teacher, [part])[0] for teacher in self.teachers], axis=1)
 
 

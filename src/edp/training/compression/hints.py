@@ -27,7 +27,7 @@ class Components:
 
     @classmethod
     def fitted(cls, parts: Iterable[NDArray[np.float32]], components: int) -> Components:
-        """From the features ``(time, width)`` of the training series; no more components than features."""
+        """Fit to the features ``(time, width)`` of the training series; components are at most as many as features."""
         count, total, squares = 0, np.zeros(()), np.zeros(())
         for part in parts:
             values = part.astype(np.float64)
@@ -41,7 +41,7 @@ class Components:
         return cls(mean, vectors[:, strongest] / scale)
 
     def project(self, values: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Components ``(time, component)`` of features ``(time, width)``."""
+        """Return the components ``(time, component)`` of features ``(time, width)``."""
         return (values - self.mean) @ self.map
 
 

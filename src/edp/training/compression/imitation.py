@@ -247,14 +247,16 @@ class _Perceptrons:
 
 
 def _sample_lines(rows: Tensor, count: int, draw: torch.Generator) -> Tensor:
-    """Points on lines through rows that lie at most `REACH` apart, ``(point, column)``."""
+    """Return the points on lines through rows that lie at most `REACH` apart, ``(point, column)``."""
     first, second = _neighbours(rows, count, draw)
     share = (1.0 + 2.0 * BEYOND) * torch.rand(count, 1, generator=draw) - BEYOND
     return torch.lerp(rows[first], rows[second], share)
 
 
 def move_rows(rows: Tensor, count: int, draw: torch.Generator) -> Tensor:
-    """Rows moved by a part of what changes between two other ones that lie at most `REACH` apart, ``(point, column)``.
+    """Return the rows moved by a part of what changes between two other ones that lie at most `REACH` apart.
+
+    ``(point, column)``.
 
     Args:
         rows: rows of the bank, ``(row, column)``, in order of time.

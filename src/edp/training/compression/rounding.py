@@ -24,7 +24,7 @@ PIECE = 2048  # ticks of each series that ranges are found on
 
 
 def weight_levels(weight: Tensor, axes: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """8-bit levels of a weight, from -127 to 127, and the step of each output, which broadcasts against them.
+    """Return 8-bit levels of a weight, from -127 to 127, and the step of each output, which broadcasts against them.
 
     The step is the largest magnitude of the output's weights over 127, so weights that were rounded once have the same
     levels again.
@@ -88,12 +88,12 @@ class Site:
         return rounded
 
     def compare(self) -> None:
-        """From now on find out which range loses least."""
+        """Start to search for the range with the least loss."""
         self.largest = self.largest or 1.0
         self.errors = torch.zeros(len(self.shares))
 
     def settle(self) -> None:
-        """From now on round."""
+        """End the search and start to round."""
         best = 0 if self.errors is None else int(self.errors.argmin())
         self.limit = self.shares[best] * self.largest
 

@@ -120,7 +120,7 @@ def _record_outputs(predictor: Predictor) -> Iterator[dict[nn.Module, Tensor]]:
 
 
 def _compute_sensitivities(predictor: Predictor) -> list[Tensor]:
-    """``sum over ticks of z dL/dz`` of each hidden layer's features, from the gradients of what makes them.
+    """Return ``sum over ticks of z dL/dz`` of each hidden layer's features, from the gradients of what makes them.
 
     For ``z = W h + b`` it equals ``sum W dL/dW + b dL/db``; of a gated unit the first half alone makes the feature
     proportional to it.

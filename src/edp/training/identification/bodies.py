@@ -56,7 +56,7 @@ class Poses:
 
     @staticmethod
     def from_strokes(machine: Machine, strokes: Doubles) -> Poses:
-        """Angles and lever arms at strokes ``(pose, 3)``; at most `MAX_POSES`, evenly chosen."""
+        """Return angles and lever arms at strokes ``(pose, 3)``; at most `MAX_POSES`, evenly chosen."""
         axes, plant = pack(machine)
         chosen = strokes[:: max(1, -(-len(strokes) // MAX_POSES))]
         chosen = np.clip(chosen, 0.0, axes[:, sim.STROKE])
@@ -100,7 +100,7 @@ def load_by_base(poses: Poses, lengths: Sequence[float], gravity: float) -> tupl
 def grey_load(
     table: ParameterTable, load: Doubles, z_of: tuple[Doubles, Doubles], poses: Poses
 ) -> tuple[Doubles, Doubles]:
-    """Gravity torques ``(pose, 3)``, N m, and joint inertia ``(pose, 3, 3)``, kg m^2, of a grey box.
+    """Return the gravity torques ``(pose, 3)``, N m, and joint inertia ``(pose, 3, 3)``, kg m^2, of a grey box.
 
     Args:
         table: parameter table of the grey box.
@@ -193,7 +193,7 @@ def realise_bodies(base: Doubles, guess: Machine) -> Bodies:
 
 
 def _compute_centres(base: Doubles, mass: Doubles, length: Doubles) -> tuple[Doubles, Doubles, Doubles]:
-    """Centres of gravity and inertias about them, of bodies with these masses."""
+    """Return the centres of gravity and inertias about them, of bodies with these masses."""
     behind = np.array([mass[1] + mass[2], mass[2], 0.0])
     x, y = (base[[0, 2, 4]] - behind * length) / mass, base[[1, 3, 5]] / mass
     return x, y, base[6:] - behind * length**2 - mass * (x * x + y * y)

@@ -122,7 +122,7 @@ _LEAST = {"conflux_extra_dead_time": 5e-3, "spool_leakage": 1e-16, "piston_leaka
 
 
 def guesses(machine: Machine) -> Doubles:
-    """Values of a machine from which a fit begins ``(number,)``; never zero."""
+    """Return the values of a machine from which a fit begins ``(number,)``; never zero."""
     values = np.array([number.read(machine) for number in MACHINE_NUMBERS])
     for k, number in enumerate(MACHINE_NUMBERS):
         if values[k] > 0.0:

@@ -16,7 +16,9 @@ DIGITS = 7
 
 
 def machine_text(machine: Machine, head: Sequence[str], comments: Mapping[tuple[str, str], str]) -> str:
-    """TOML that `edp.sim.machine.machine_files.parse_machine` reads back to the same machine, rounded to `DIGITS`.
+    """Return TOML that `edp.sim.machine.machine_files.parse_machine` reads back to the same machine.
+
+    Rounded to `DIGITS`.
 
     Args:
         machine: machine to write.
@@ -55,5 +57,5 @@ def _value(value: Any) -> str:
 
 
 def _one_line(text: str) -> str:
-    """Without characters that would end a comment."""
+    """Replace characters that would end a comment."""
     return "".join(c if c.isprintable() else " " for c in text)

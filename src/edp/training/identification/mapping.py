@@ -73,7 +73,7 @@ class GreyParts:
 
 
 def grey_numbers(machine: Machine, parts: GreyParts, load: Doubles) -> Doubles:
-    """Numbers of the grey box of a machine, in its own units ``(number,)``.
+    """Return the numbers of the grey box of a machine, in its own units ``(number,)``.
 
     Args:
         machine: machine of the simulator.
@@ -102,7 +102,7 @@ def grey_numbers(machine: Machine, parts: GreyParts, load: Doubles) -> Doubles:
 
 
 def _put_cylinder(si: Doubles, a: int, axis: Doubles, plant: Doubles) -> None:
-    """Numbers of one cylinder, from its row of the simulator's."""
+    """Write the parameters of one cylinder from its row in the simulator."""
     same = {
         grey.HEAD_AREA: sim.HEAD_AREA, grey.ROD_AREA: sim.ROD_AREA, grey.HEAD_DEAD: sim.HEAD_DEAD,
         grey.ROD_DEAD: sim.ROD_DEAD, grey.HEAD_RELIEF: sim.RELIEF_HEAD, grey.ROD_RELIEF: sim.RELIEF_ROD,
@@ -171,7 +171,7 @@ def _curve(band: float, reach: float, stretches: int) -> Doubles:
 
 @lru_cache(maxsize=4)
 def _polygon(stretches: int) -> Doubles:
-    """Increments between the knots of the polygon through zero that is nearest to values on a fine grid."""
+    """Return the increments between the knots of the polygon through zero that is nearest to values on a fine grid."""
     grid, knots = np.linspace(0.0, 1.0, FINE), opening_knots(stretches)
     rising = np.clip((grid[:, None] - knots[:-1]) / np.diff(knots), 0.0, 1.0)
     return np.asarray(np.linalg.pinv(rising))

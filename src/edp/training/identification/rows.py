@@ -50,13 +50,13 @@ class IdentifiedNumber:
     is_told: bool
 
     def interval(self, unknown: str) -> str:
-        """For readers: its ends, roughly or not, or `unknown`."""
+        """Return the interval as text: its ends, exact or approximate, or `unknown`."""
         if not self.excited:
             return unknown
         return f"{'' if self.is_told else 'roughly '}{typed(self.low, 3)} to {typed(self.high, 3)}"
 
     def to_dict(self) -> dict[str, object]:
-        """For JSON."""
+        """Return the row in JSON types."""
         return dict(vars(self))
 
 

@@ -66,14 +66,14 @@ class Meta(ABC):
         )
 
     def end(self, net: Predictor) -> None:  # noqa: B027 - part of the interface; there is nothing to undo
-        """Nothing was done to the network but to its weights."""
+        """End the strategy, which has changed only weights."""
 
     def sampler(self, series: Sequence[Series], task: Task, spec: TrainingSpec) -> Sampler:
-        """Episodes of the machines that train."""
+        """Return the episodes of the machines that train."""
         return EpisodeSampler(series, task.horizons, spec.chunks, self.spec.shots, spec.seed)
 
     def episode(self, net: Predictor, objective: Objective, batch: Pieces) -> Tensor:
-        """Mean cost of the machines of a batch."""
+        """Return the mean cost of the machines of a batch."""
         shots = self.spec.shots
         costs = []
         for first in range(0, len(batch[0]), 2 * shots):
@@ -121,7 +121,7 @@ class Meta(ABC):
 
     def _halves(self, net: Predictor, parts: Sequence[Series]) -> tuple[Pieces, list[Series]]:
         # The first half adapts and the second judges: the order on a machine, too.
-        """Pieces of the first halves, as many as an episode has, and the second halves."""
+        """Return the pieces of the first halves, as many as an episode has, and the second halves."""
         chunks, horizons = self.training.chunks, net.task.horizons
         starts, rest = [], []
         for index, part in enumerate(parts):

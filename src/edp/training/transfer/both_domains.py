@@ -62,7 +62,10 @@ class BothDomains:
         self.base, self.source_series, self.spec = WarmStart(start), list(source_series), spec
 
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
-        """Series of both domains, the shorter repeated, with their domain and the source network's predictions."""
+        """Return the series of both domains, the shorter repeated.
+
+        With their domain and the source network's predictions.
+        """
         own = [self._mark_domain(part, TARGET, None) for part in own_series]
         source_predictions = (
             stream_predictions(self.base.start, self.source_series)
@@ -121,7 +124,7 @@ class BothDomains:
         self.base.end(net)
 
     def _confusion(self, logits: Tensor, here: Tensor, there: Tensor) -> Tensor:
-        """Cross-entropy of the classifier, both domains with equal weight."""
+        """Return the cross-entropy of the classifier, both domains with equal weight."""
         parts = [
             nn.functional.binary_cross_entropy_with_logits(domain_logits, torch.full_like(domain_logits, domain))
             for domain_logits, domain in ((logits[here], TARGET), (logits[there], SOURCE))
@@ -151,13 +154,13 @@ class Classifier(nn.Module):
         self.layers = nn.Sequential(nn.Linear(width, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, 1))
 
     def forward(self, hidden: Tensor) -> Tensor:
-        """Logits; positive for the source."""
+        """Return the logits; positive for the source."""
         logits: Tensor = self.layers(hidden)
         return logits.squeeze(-1)
 
 
 def ramp(progress: float) -> float:
-    """``2 / (1 + exp(-10 p)) - 1``: the adversary comes in slowly (Ganin et al. 2016, arXiv 1505.07818)."""
+    """Return ``2 / (1 + exp(-10 p)) - 1``: the adversary comes in slowly (Ganin et al. 2016, arXiv 1505.07818)."""
     return 2.0 / (1.0 + math.exp(-STEEPNESS * progress)) - 1.0
 
 

@@ -41,7 +41,7 @@ class Centred:
         self._known: list[Series] = []
 
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
-        """Those of the base strategy."""
+        """Return the series of the base strategy."""
         self._known = list(own_series)
         return self.base.series(task, own_series)
 

@@ -216,7 +216,7 @@ def _pairs(data: Prepared) -> Iterator[PilotPair]:
 
 
 def correlation(data: Prepared, parts: Sequence[Series], pair: PilotPair) -> float:
-    """Pearson's correlation of a pilot pressure with a target, at the lag within `SEARCHED_S` where it is largest."""
+    """Return Pearson's correlation of a pilot pressure with a target, at the lag with the largest correlation."""
     column, target = data.task.inputs.index(pair.pilot), data.task.targets.index(pair.target)
     reach = round(SEARCHED_S * data.task.rate_hz)
     pilot = [part.inputs[:, column].astype(np.float64) for part in parts]

@@ -80,7 +80,7 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
 
 
 def fit_adaptation(predictor: Predictor, data: Prepared, spec: AdaptationSpec) -> Adaptation:
-    """Scales, directions and units of an adaptation.
+    """Return the scales, directions and units of an adaptation.
 
     Directions are the leading principal components of the training inputs, standardised, without the targets
     themselves, which are features of their own. Units are the spread of the network's errors on the validation part.
@@ -125,7 +125,7 @@ def _widths(rows: Rows) -> Rows:
 
 
 def _directions(scaled: Rows, columns: Sequence[int], rank: int) -> Rows:
-    """Leading principal components ``(rank, inputs)``, each of them scaled to a spread of 1."""
+    """Return the leading principal components ``(rank, inputs)``, each of them scaled to a spread of 1."""
     cut = np.clip(scaled, -FEATURE_LIMIT, FEATURE_LIMIT)
     # The targets are features of their own; directions need not tell them again.
     cut[:, list(columns)] = 0.0

@@ -68,7 +68,10 @@ class Replay:
     learned: RlsState
 
     def errors(self, of: str, horizon: int) -> list[tuple[Rows, NDArray[np.float64]]]:
-        """Absolute errors ``(tick, target)`` of ``base`` or ``adapted``, with the seconds of motion before each."""
+        """Return absolute errors ``(tick, target)`` of ``base`` or ``adapted``.
+
+        With the seconds of motion before each.
+        """
         horizon_index, errors = self.horizons.index(horizon), []
         for part in self.recordings:
             predictions = getattr(part, of)[self.skip : len(part.targets) - horizon, horizon_index]
@@ -77,7 +80,10 @@ class Replay:
         return errors
 
     def mae(self, of: str, horizon: int, low: float = 0.0, high: float = np.inf) -> NDArray[np.float64] | None:
-        """MAE of each target ``(target,)`` from `low` to `high` seconds of motion, SI units; None without ticks."""
+        """Return the MAE of each target ``(target,)`` from `low` to `high` seconds of motion, SI units.
+
+        None without ticks.
+        """
         selected = [error[(at >= low) & (at < high)] for error, at in self.errors(of, horizon)]
         rows = np.concatenate(selected)
         return rows.mean(axis=0, dtype=np.float64) if len(rows) else None
@@ -125,7 +131,7 @@ def relative_change(errors: NDArray[np.float64]) -> float:
 
 
 def motion_s(adaptation: Adaptation, targets: Rows) -> NDArray[np.float64]:
-    """Seconds of motion before each tick ``(time,)``, as the adaptation counts motion."""
+    """Return the seconds of motion before each tick ``(time,)``, as the adaptation counts motion."""
     moving = (np.abs(targets - adaptation.middle) > adaptation.dead_zone).any(axis=1)
     return np.concatenate([[0.0], np.cumsum(moving)[:-1]]) / adaptation.rate_hz
 
@@ -187,7 +193,7 @@ def replay_run(
     progress: Progress = SILENT,
     twin: str | Path | None = None,
 ) -> AdaptationFile:
-    """Replay logs through a run that `edp adapt` wrote; see `replay`.
+    """Return the replay logs through a run that `edp adapt` wrote; see `replay`.
 
     Args:
         run: run with an adaptation.

@@ -75,7 +75,7 @@ class TwinMoves:
     def __call__(
         self, recordings: Sequence[Recording], predictions: Sequence[Rows], carry: bool, learn: bool
     ) -> list[Rows]:
-        """Predictions ``(time, horizon, target)`` of each recording, moved.
+        """Return the predictions ``(time, horizon, target)`` of each recording, moved.
 
         Args:
             recordings: recordings with the twin's channels.

@@ -49,7 +49,7 @@ def check_together(recordings: Sequence[Recording]) -> None:
 
 
 def matrix_of(values: Any, number: int) -> NDArray[Any]:
-    """Array `number` of those that a user gave, ``(time, channel)``.
+    """Return array `number` of those that a user gave, ``(time, channel)``.
 
     Raises:
         DataError: another shape, or no numbers.
@@ -104,7 +104,7 @@ def names_of(names: Sequence[str] | None, usual: list[str], what: str, counted: 
 
 
 def units_of(units: Sequence[str | None] | Mapping[str, str] | None, names: Sequence[str]) -> dict[str, str]:
-    """Units that a user gave, by channel.
+    """Return the units that a user gave, by channel.
 
     Raises:
         DataError: another number of them, an unknown channel, an unknown unit, or no texts.

@@ -15,7 +15,7 @@ from edp.errors import ConfigError, DataError
 
 
 def frame_library(name: str) -> ModuleType:
-    """Pandas or polars.
+    """Return the pandas or polars.
 
     Raises:
         ConfigError: it is not installed.
@@ -40,10 +40,10 @@ class OneFrame(ABC):
 
     @abstractmethod
     def _columns(self) -> Mapping[str, NDArray[Any] | list[Any]]:
-        """Columns by name, all of one length."""
+        """Return the columns by name, all of one length."""
 
     def to_pandas(self) -> Any:
-        """One pandas frame with the columns that the class lists.
+        """Return one pandas frame with the columns that the class lists.
 
         Raises:
             ConfigError: pandas is not installed.
@@ -60,7 +60,7 @@ class OneFrame(ABC):
 
 
 def columns_of(frame: Any, where: str) -> dict[str, NDArray[Any]]:
-    """Columns of a frame by name, each ``(time,)``.
+    """Return the columns of a frame by name, each ``(time,)``.
 
     Raises:
         DataError: it is no frame, or a name is no text or stands twice.
@@ -79,7 +79,7 @@ def columns_of(frame: Any, where: str) -> dict[str, NDArray[Any]]:
 
 
 def _numpy(column: Any) -> NDArray[Any]:
-    """Values of a column; missing integers, which NumPy cannot hold, become NaN."""
+    """Return the values of a column; missing integers, which NumPy cannot hold, become NaN."""
     # Object columns hold Python values, such as None beside integers.
     values = np.asarray(column.to_numpy())
     if values.dtype != object:
@@ -91,6 +91,6 @@ def _numpy(column: Any) -> NDArray[Any]:
 
 
 def _missing(value: Any) -> bool:
-    """None, and pandas' NA, which is not even equal to itself."""
+    """Return whether a value is None or pandas' NA, which does not equal itself."""
     # Compared by name: pandas is not imported where a user has only Polars.
     return value is None or type(value).__name__ == "NAType"

@@ -123,7 +123,7 @@ class TrainedPredictor:
         return JudgedScores(read_facts(train_evaluate.evaluate(self.folder, source, names)))
 
     def predict(self, recordings: Recordings | Recording | Sequence[Recording]) -> Predictions:
-        """Predictions at every tick of every recording, each from reset; targets need not be recorded.
+        """Return the predictions at every tick of every recording, each from reset; targets need not be recorded.
 
         Raises:
             DataError: another rate, a missing input, or one that is not finite.

@@ -187,7 +187,7 @@ class Recordings(Sequence[Recording]):
         return self._recordings[which]
 
     def to_numpy(self) -> list[FloatArray]:
-        """Values of each recording, float32 ``(time, channel)``, SI units."""
+        """Return the values of each recording, float32 ``(time, channel)``, SI units."""
         return [recording.values for recording in self._recordings]
 
     def to_pandas(self) -> list[Any]:

@@ -30,7 +30,7 @@ class ShownTable:
         return "\n\n".join(map(text_of, self._tables))
 
     def _repr_html_(self) -> str:
-        """For a notebook."""
+        """Return an HTML table for a notebook."""
         return html_of(self._tables)
 
 
@@ -52,7 +52,7 @@ class JudgedScores(OneFrame):
         return self._facts.folder
 
     def to_dict(self) -> Mapping[str, object]:
-        """Everything that was measured: the content of ``scores.json``."""
+        """Return everything that was measured: the content of ``scores.json``."""
         return {} if self._facts.scores is None else self._facts.scores.to_table()
 
     def table(self) -> ShownTable:

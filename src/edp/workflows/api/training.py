@@ -164,7 +164,7 @@ def _table(settings: Mapping[str, object] | str | Path | None) -> dict[str, obje
 
 
 def _nest_keys(settings: Mapping[str, object]) -> dict[str, object]:
-    """Dotted keys as tables, in the order given."""
+    """Return the dotted keys as tables, in the order given."""
     table: dict[str, object] = {}
     for key, value in settings.items():
         plain = _nest_keys(value) if isinstance(value, Mapping) else _plain(value)

@@ -288,7 +288,7 @@ class Amount:
         return span
 
     def seconds(self, kind: str) -> float:
-        """Processor time for a kind of learner."""
+        """Return the processor time for a kind of learner."""
         budget = 60 * self.minutes
         left = max(budget - _estimate_fixed_seconds(self), MIN_SHARE * budget)
         shares = LONG_SHARE if self.rows > LONG_ROWS else SHARE
@@ -342,7 +342,10 @@ class Spans:
 
 
 def spans_of(amount: Amount) -> Spans:
-    """1, 2, 3, 4, 6, 8, 12, ... up to the longest span, and means over 4, 8, 16, ...; fewer where channels are many."""
+    """Return 1, 2, 3, 4, 6, 8, 12, ... up to the longest span, and means over 4, 8, 16, .
+
+    Fewer where channels are many.
+    """
     powers = [2**power for power in range(amount.span.bit_length())]
     halves = {3 * lag // 2 for lag in powers if lag > 1 and 3 * lag // 2 <= amount.span}
     smoothed = powers[2:]
@@ -374,7 +377,7 @@ def _estimate_fixed_seconds(amount: Amount) -> float:
 
 
 def _list_near_spans(amount: Amount) -> list[int]:
-    """Spans of the basis functions on few columns."""
+    """Return the spans of the basis functions on few columns."""
     lags = spans_of(amount).lags
     return [span for span in NEAR if span == 0 or span in lags] if amount.rows <= NEAR_ROWS else []
 

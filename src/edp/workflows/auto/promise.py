@@ -199,14 +199,14 @@ def choose(promises: Mapping[str, Promise]) -> PortfolioChoice:
 
 
 def to_report_units(error: DoubleArray, data: Prepared) -> dict[str, dict[str, float]]:
-    """Root-mean-square errors, standardised by the data, by horizon and target in report units."""
+    """Return the root-mean-square errors, standardised by the data, by horizon and target in report units."""
     factors = np.array([KINDS[kind].report_factor for kind in data.target_kinds])
     scale = np.asarray(data.scaler().target_scale, dtype=np.float64)
     return by_output((error.reshape(len(data.task.horizons), -1) * scale * factors).ravel(), data)
 
 
 def by_output(values: DoubleArray, data: Prepared) -> dict[str, dict[str, float]]:
-    """Numbers ``(output,)`` by horizon and target."""
+    """Return the numbers ``(output,)`` by horizon and target."""
     return {
         str(horizon): dict(zip(data.task.targets, map(float, row), strict=True))
         for horizon, row in zip(data.task.horizons, values.reshape(len(data.task.horizons), -1), strict=True)

@@ -85,7 +85,10 @@ class CompressionRequest:
         return QuantisationAware(teachers[0] if start is None else start, strategy, self.rounding)
 
     def on_rows(self, teachers: Sequence[Predictor]) -> bool:
-        """Whether the student learns on rows of the teacher's bank: a committee's does where no objective is given."""
+        """Return whether the student learns on rows of the teacher's bank.
+
+        A committee's does where no objective is given.
+        """
         if self.distillation is not None or self.rounding is not None or self.pruned:
             return False
         return imitates(teachers, self.model(teachers[0].spec))

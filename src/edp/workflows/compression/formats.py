@@ -37,7 +37,7 @@ class Format(Protocol):
     rounded: ClassVar[bool]
 
     def parameter_bytes(self, predictor: Predictor, estimate: Estimate) -> int:
-        """Memory for the parameters of a network, whose C code takes `estimate`."""
+        """Return the memory for the parameters of a network, whose C code takes `estimate`."""
         ...
 
     def predictions(self, predictor: Predictor, training_series: Sequence[Series]) -> Predict:
@@ -61,7 +61,10 @@ class DynamicInt8:
     rounded: ClassVar[bool] = False
 
     def parameter_bytes(self, predictor: Predictor, estimate: Estimate) -> int:
-        """One byte for each weight of a linear layer, four for the others, as in Table 4.9; no code is exported."""
+        """Return one byte for each weight of a linear layer, four for the others, as in Table 4.9.
+
+        No code is exported.
+        """
         return dynamic_int8(predictor).weight_bytes
 
     def predictions(self, predictor: Predictor, training_series: Sequence[Series]) -> Predict:
@@ -78,7 +81,7 @@ class Float32:
     rounded: ClassVar[bool] = False
 
     def parameter_bytes(self, predictor: Predictor, estimate: Estimate) -> int:
-        """All constants of the exported C code."""
+        """Return all constants of the exported C code."""
         return estimate.parameter_bytes
 
     def predictions(self, predictor: Predictor, training_series: Sequence[Series]) -> Predict:
@@ -98,11 +101,11 @@ class W8A16:
     rounded: ClassVar[bool] = True
 
     def parameter_bytes(self, predictor: Predictor, estimate: Estimate) -> int:
-        """All constants of the exported C code."""
+        """Return all constants of the exported C code."""
         return estimate.parameter_bytes
 
     def predictions(self, predictor: Predictor, training_series: Sequence[Series]) -> Predict:
-        """Ranges and weights are chosen on `training_series`."""
+        """Return the ranges and weights are chosen on `training_series`."""
         return partial(stream_predictions, integer_predictor(predictor, training_series))
 
 

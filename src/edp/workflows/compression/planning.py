@@ -134,7 +134,7 @@ def _orders(teacher: Predictor, width: int, recipes: Sequence[str], notes: list[
 
 
 def _why_not(teacher: Predictor, model: ModelSpec) -> str:
-    """Why a network of these settings cannot be built; empty where it can."""
+    """Return why a network of these settings cannot be built; empty where it can."""
     try:
         _build_untrained(model, teacher.task)
     except ConfigError as error:

@@ -97,7 +97,10 @@ class ControlBench:
         self.models = models or self._prepare_models(probe, sources)
 
     def _prepare_models(self, probe: Any, sources: ControlSources) -> ControlModels:
-        """Models of the sources, and a valve map where one is needed: measured before the loops, on the plant."""
+        """Return the models of the sources, and a valve map where one is needed.
+
+        Measured before the loops, on the plant.
+        """
         valve_map: ValveMap | None = None
         if "valve_map" in self.experiment.controller.needs:
             valve_map = measure_valve_map(probe, self.plant, self.experiment.seed)

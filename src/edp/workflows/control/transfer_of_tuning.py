@@ -73,5 +73,5 @@ def draw_settings(controller: ControllerSpec, spec: TransferSpec) -> list[Contro
 
 
 def costs_of(bench: ControlBench, settings: list[ControllerSpec]) -> Array:
-    """Position error (rms, mean over the loops, mm) of each setting on a bench, shape (settings,)."""
+    """Return the position error (rms, mean over the loops, mm) of each setting on a bench, shape (settings,)."""
     return np.array([bench.cost(setting) for setting in settings])

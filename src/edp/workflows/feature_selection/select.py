@@ -227,7 +227,7 @@ def _sets(screening: ScreeningResult, first: Recording) -> dict[str, FeatureSett
 def _write(
     folder: Path, screening: ScreeningResult, quality: DataQuality, sets: Mapping[str, FeatureSettings]
 ) -> dict[str, Path]:
-    """Everything but page and pictures."""
+    """Return everything but page and pictures."""
     files = {name: folder / f"{name}.json" for name in ("screening", "quality")}
     write_json(files["screening"], {"schema": 1, "command": command_line()} | screening.to_json())
     write_json(files["quality"], {"schema": 1} | quality.to_json())

@@ -299,7 +299,7 @@ def _tabulate_trials(
 
 
 def _recordings(runs: Sequence[_Finished], ahead: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Error by horizon and recording, mean over seeds."""
+    """Return the error by horizon and recording, mean over seeds."""
     each = [run.scores.models["network"].recordings for run in runs]
     return {
         h: {name: float(np.mean([metric(one[name][h][MEAN], "mae") for one in each])) for name in each[0]}
@@ -308,7 +308,7 @@ def _recordings(runs: Sequence[_Finished], ahead: Sequence[str]) -> dict[str, di
 
 
 def _difference(ours: Mapping[str, float], reference: Mapping[str, float]) -> PairedDifference:
-    """Paired over recordings, with Student's t."""
+    """Return the paired over recordings, with Student's t."""
     gaps = np.array([ours[name] - reference[name] for name in reference])
     mean = float(gaps.mean())
     # Pairs by recording: recordings differ more than feature sets do.

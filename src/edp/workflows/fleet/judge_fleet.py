@@ -124,7 +124,7 @@ def _make_report(machine: StoredMachine, result: UnitResult) -> ReportedMachine:
 
 
 def _deltas(folder: Path) -> dict[str, Path]:
-    """Files of deltas by machine."""
+    """Return the files of deltas by machine."""
     return {row.machine: folder / row.delta for row in read_fleet(folder).machines if row.delta is not None}
 
 
@@ -150,7 +150,7 @@ def _hash(content: bytes) -> str:
 
 
 def _state_of(folder: Path) -> str:
-    """Names, sizes and times of the files of a folder, as one hash."""
+    """Return the names, sizes and times of the files of a folder, as one hash."""
     files = sorted(files_below(folder))
     facts = [(str(file.relative_to(folder)), status_of(file).st_size, status_of(file).st_mtime_ns) for file in files]
     return _hash(repr(facts).encode())
@@ -222,7 +222,7 @@ def drift_of(error: NDArray[np.floating], rate_hz: float) -> ErrorDrift | None:
 
 
 def _inputs(recordings: list[Recording], names: list[str]) -> dict[str, InputSpread]:
-    """Mean and deviation of each input, SI units."""
+    """Return the mean and deviation of each input, SI units."""
     values = np.concatenate([recording.select(names) for recording in recordings]).astype(np.float64)
     means, spreads = values.mean(axis=0), values.std(axis=0)
     return {name: InputSpread(float(m), float(s)) for name, m, s in zip(names, means, spreads, strict=True)}

@@ -24,7 +24,7 @@ class MachineSource(DataSource):
     machine: str = ""
 
     def read(self) -> list[Recording]:
-        """Its recordings, in the order of the store.
+        """Read the machine's recordings in the order of the store.
 
         Raises:
             DataError: the store has none of it.

@@ -227,7 +227,10 @@ def tune_machine(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithSt
 
 
 def _errors(network: Predictor, data: Prepared) -> float:
-    """Mean absolute error over the outputs at the first horizon, on the ends of the recordings, in report units."""
+    """Return the mean absolute error over the outputs at the first horizon, on the ends of the recordings.
+
+    In report units.
+    """
     skip = max(network.spec.window, data.task.features.starting_ticks)
     scores = score_predictions(stream_predictions(network, data.test), data, skip)
     return metric(scores.overall[str(data.task.horizons[0])][MEAN], "mae")

@@ -66,7 +66,7 @@ class FrontChannels:
         return np.clip(result / self.full, -1.0, 1.0)
 
     def pressures(self, row: NDArray[np.float32]) -> Doubles:
-        """Heads, rods and pump lines ``(8,)``, NaN where not measured."""
+        """Return the heads, rods and pump lines ``(8,)``, NaN where not measured."""
         places = np.concatenate([self.columns[:, 2], self.columns[:, 3], self.lines])
         return np.where(places >= 0, row[places], np.nan).astype(np.float64)
 

@@ -428,7 +428,10 @@ def _notes(parts: GreyParts) -> list[str]:
 def _scores(
     fitted: _Fitted, machines: tuple[Machine, Machine], parts: GreyParts, logs: tuple[Prepared, TwinExperiment]
 ) -> dict[str, FreeRunScores]:
-    """Free runs along held-out recordings: the identified machine, the guess, the grey box and the static map."""
+    """Return the free runs along held-out recordings.
+
+    The identified machine, the guess, the grey box and the static map.
+    """
     data, settings = logs
     twin, judge = fitted.twin, settings.judge
     prefix, grey = twin.prefix_ticks, free_runs(twin, data.test, judge.seconds, judge.starts)

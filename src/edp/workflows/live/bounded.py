@@ -77,7 +77,7 @@ class Repetition:
         self._shown: dict[str, _Shown] = {}
 
     def is_due(self, group: str, tick: int) -> bool:
-        """Whether a message of a group is shown at a tick; messages without a group always are."""
+        """Return whether a message of a group is shown at a tick; messages without a group always are."""
         if not group:
             return True
         shown = self._shown.setdefault(group, _Shown())

@@ -61,7 +61,7 @@ class LiveNetwork(LivePart):
         return np.array([self._make_row(tick) for tick in ticks])
 
     def _make_row(self, tick: StreamTick) -> Row:
-        """Predictions by horizon and target, then lower and upper bounds."""
+        """Return the predictions by horizon and target, then lower and upper bounds."""
         if not tick.valid:
             return np.full(self.width, np.nan, np.float32)
         parts = [tick.prediction]

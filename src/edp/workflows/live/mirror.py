@@ -127,7 +127,7 @@ class RerunMirror:
 
 
 def entities(layout: LiveLayout, escaped: Any = str) -> Mapping[str, tuple[int, float, float, float]]:
-    """Path in Rerun of each column that is shown: column, factor and offset to the shown unit, seconds ahead.
+    """Return path in Rerun of each column that is shown: column, factor and offset to the shown unit, seconds ahead.
 
     Predictions stand at the time for which they were made, below the same unit as what is measured.
 
@@ -157,7 +157,7 @@ def quiet_environment(folder: Path) -> dict[str, str]:
 
 
 def _start_server(folder: Path, port: int, page: int) -> subprocess.Popen[bytes]:
-    """Rerun's server, once it listens."""
+    """Return the Rerun's server, once it listens."""
     variables, call = quiet_environment(folder), [str(_program())]
     quiet: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "env": variables}
     done = subprocess.run([*call, "analytics", "disable"], stderr=subprocess.PIPE, timeout=START_S, **quiet)
@@ -178,7 +178,10 @@ def _start_server(folder: Path, port: int, page: int) -> subprocess.Popen[bytes]
 
 
 def _program() -> Path:
-    """Rerun's own program: the module of the same purpose starts it as a child, which would outlive its end."""
+    """Return Rerun's own program.
+
+    The module of the same purpose starts a child process, which would outlive the session.
+    """
     spec = importlib.util.find_spec("rerun_cli")
     if spec is None or spec.origin is None:
         raise ConfigError("rerun-sdk is installed without its command line; install it from its wheel")

@@ -191,7 +191,10 @@ class LiveRun:
                 self._recorder.row(self.session.ticks - 1, full)
 
     def _compute_part(self, part: LivePart, rows: Row, missed: int) -> Row:
-        """Columns of a part for rows, shape (ticks, width), by one call of its model where that gives the same."""
+        """Return the columns of a part for rows, shape (ticks, width).
+
+        By one call of its model where that gives the same.
+        """
         if not self._trusted and not isinstance(part, LiveFront):
             return np.full((len(rows), part.width), np.nan, np.float32)
         self._ahead = 0

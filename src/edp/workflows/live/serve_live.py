@@ -93,7 +93,7 @@ async def _serve(live: LiveRun, playing: threading.Thread, on_ready: Callable[[L
 
 @contextlib.contextmanager
 def _interrupts(stop: asyncio.Event) -> Iterator[None]:
-    """Ctrl-C and the system's request end the session, and files are finished; only the main thread hears them."""
+    """End the session on Ctrl-C or a termination request, and complete its files; only in the main thread."""
     loop = asyncio.get_running_loop()
     signals = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
     handlers_before = {number: signal.getsignal(number) for number in signals}

@@ -30,7 +30,7 @@ class _Chunks(MonitorStream):
         return self._statistics
 
     def chunk(self, rows: NDArray[np.float32]) -> list[MonitorAlarm]:
-        """Alarms that some ticks raise; `rows` in the monitor's order, shape (ticks, inputs)."""
+        """Return alarms that some ticks raise; `rows` in the monitor's order, shape (ticks, inputs)."""
         verdicts, self.state = self.monitor.advance(rows, self.state)
         alarms = []
         for verdict in verdicts:
@@ -101,7 +101,7 @@ class LiveMonitor(LivePart):
         self._rows.clear()
 
     def statistics(self, first: int) -> Mapping[str, int]:
-        """Columns of the statistics by name."""
+        """Return the columns of the statistics by name."""
         watches = self._stream.monitor.chain.watches
         return {
             f"{type(watch.detector).__name__.removesuffix('Spec').lower()} {n + 1}": first + n

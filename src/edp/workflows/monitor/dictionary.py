@@ -213,7 +213,7 @@ def draw_faults(job: DrawJob) -> DrawnFaults:
 def _draw(
     monitor: Monitor, classes: Sequence[FaultClass], plan: _Plan, draw: int, progress: Progress
 ) -> list[SimulatedFault]:
-    """All sessions of one draw, each less its sound twin."""
+    """Return all sessions of one draw, each less its sound twin."""
     before = plan.seconds[0]
     further = [name for name in FURTHER if name not in monitor.inputs]
     total, mirrored = len(cases_of(classes)), mirrors(classes)
@@ -244,7 +244,7 @@ def _mirror(change: Array) -> Array:
 
 
 def _average_blocks(monitor: Monitor, recording: Recording, onset_s: float) -> Array:
-    """Mean features of the blocks at an onset and of those after it, shape (2, features)."""
+    """Return the mean features of the blocks at an onset and of those after it, shape (2, features)."""
     rows = monitor.conditioned_rows(recording)
     at, after = parts_of(rows[int(onset_s / monitor.block_s) :])
     if at is None or after is None:
@@ -278,7 +278,7 @@ def _standardise(
 
 
 def _missing_noise(monitor: Monitor, healthy: Sequence[Recording], machine: str, seed: int) -> dict[str, float]:
-    """Noise that healthy logs have on channels which the simulator shows without."""
+    """Return the noise that healthy logs have on channels which the simulator shows without."""
     names = [name for name in QUIET if name in monitor.inputs]
     session = next(simulated((), machine, (0.0, 60.0), (seed, 0), monitor.rate_hz)).recording
     shown = noise_of(session, names)

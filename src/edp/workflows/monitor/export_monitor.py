@@ -51,7 +51,7 @@ NO_RESIDUALS = GoldenResiduals(*(np.zeros((0, 0), np.float32),) * 2, np.zeros(0,
 
 
 def holds_monitor(path: str | Path) -> bool:
-    """Whether a folder is one that edp monitor fit wrote."""
+    """Return whether a folder is one that edp monitor fit wrote."""
     return is_file_at(Path(path) / HEADER)
 
 
@@ -129,7 +129,7 @@ def monitor_parts(monitor: Monitor, golden: bool = True) -> MonitorParts:
 
 
 def digest_of(chain: MonitorChain) -> str:
-    """Content address of a chain."""
+    """Return content address of a chain."""
     import hashlib
 
     state = hashlib.blake2b(digest_size=16)

@@ -42,7 +42,9 @@ class FaultSession:
 
 
 def fault_classes(kinds: Sequence[str] | None = None) -> tuple[FaultClass, ...]:
-    """Every kind of fault at every site, and negative sizes of kinds that have either sign as classes of their own.
+    """Return every kind of fault at every site.
+
+    And negative sizes of kinds that have either sign as classes of their own.
 
     Args:
         kinds: names of the kinds; all by default.
@@ -131,7 +133,7 @@ def _session(scenario: Scenario, base: int, seed: tuple[int, int]) -> Recording:
 
 
 def noise_of(recording: Recording, names: Sequence[str]) -> Mapping[str, float]:
-    """White noise of channels, SI units: from second differences in the quietest tenth of the seconds.
+    """Return the white noise of channels, SI units: from second differences in the quietest tenth of the seconds.
 
     A stroke at 100 Hz hardly bends from tick to tick, so that what is left is noise and rounding.
     """

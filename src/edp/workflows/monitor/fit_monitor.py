@@ -160,7 +160,7 @@ def fit_to_recordings(
     again: bool = False,
     side_by_side: SideBySide = ONE_BY_ONE,
 ) -> FittedMonitor:
-    """`fit_monitor` without files.
+    """Return `fit_monitor` without files.
 
     Args:
         recordings: healthy logs.
@@ -288,7 +288,7 @@ def select_watched(recordings: Sequence[Recording], experiment: MonitorExperimen
 
 
 def _check_values(recordings: Sequence[Recording], channels: Sequence[Channel]) -> None:
-    """Healthy logs have all values: what networks learn from must be there."""
+    """Raise an error for missing values, since networks train on healthy logs without gaps."""
     names = [channel.name for channel in channels]
     for recording in recordings:
         bad = ~np.isfinite(recording.select(names))

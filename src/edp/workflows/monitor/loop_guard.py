@@ -110,7 +110,7 @@ def list_evaluated_channels(monitor: Monitor) -> dict[str, tuple[str, ...]]:
 
 
 def suspected(alarm: MonitorAlarm, judged: Mapping[str, tuple[str, ...]]) -> tuple[tuple[str, ...], float]:
-    """Channels whose residuals deviate most, and their score from 0 to 1.
+    """Return the channels whose residuals deviate most, and their score from 0 to 1.
 
     A channel scores by the share of all deviation that lies in residuals that evaluate it, times how much of these
     residuals deviates: one that explains all, and has no residual that stays quiet, scores highest.

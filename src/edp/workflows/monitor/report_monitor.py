@@ -80,7 +80,7 @@ def _provenance(folder: Path, content: Mapping[str, object]) -> Provenance:
 
 
 def read_alarms(file: Path) -> list[AlarmFacts]:
-    """Alarms of a log of JSON lines.
+    """Return alarms of a log of JSON lines.
 
     Raises:
         StorageError: it is missing, too large or damaged; the message names the line.

@@ -85,7 +85,7 @@ class MonitorRun:
         return episodes(self.alarms)
 
     def to_json(self) -> dict[str, object]:
-        """Plain JSON values."""
+        """Return the plain JSON values."""
         return {
             "hours": self.hours,
             "recordings": list(self.recordings),

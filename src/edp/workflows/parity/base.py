@@ -137,7 +137,7 @@ class Row:
     note: str = ""
 
     def to_json(self) -> dict[str, object]:
-        """Plain values."""
+        """Return the plain values."""
         return dict(vars(self))
 
 
@@ -164,7 +164,7 @@ def compared(form: str, title: str, case: ParityCase, ran: Ran) -> Row:
 
 
 def need(program: str, package: str) -> str:
-    """Path of a program.
+    """Return the path of a program.
 
     Raises:
         Missing: it is not there.

@@ -16,7 +16,7 @@ WHAT = (
 
 
 def from_own_run(path: str | Path) -> bool:
-    """Whether a path is a run folder, or the bundle in one.
+    """Return whether a path is a run folder, or the bundle in one.
 
     A convenience and no proof: a folder that somebody sent whole looks like one of your own.
     """

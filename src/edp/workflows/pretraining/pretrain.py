@@ -159,7 +159,7 @@ def _start(path: str | Path) -> tuple[Predictor, dict[str, str]]:
 
 
 def _carrying(experiment: Experiment, episodic: bool, rate_hz: float) -> Experiment:
-    """With streams carried for a minute, where chunks are walked and the settings leave it open."""
+    """Return the settings with streams that continue for a minute, for chunk training without this setting."""
     chunks = experiment.training.chunks
     if episodic or chunks.carried or chunks.regime == "window":
         return experiment

@@ -95,7 +95,7 @@ def _find_related_columns(changes: Sequence[ColumnGuess], proposal: MapProposal)
 
 
 def _drop_common_suffix(one: str, other: str) -> tuple[str, str]:
-    """Two names without the letters that end both."""
+    """Return two names without the letters that end both."""
     shared = 0
     while shared < min(len(one), len(other)) and one[-1 - shared] == other[-1 - shared]:
         shared += 1
@@ -146,7 +146,7 @@ def _rests_in_most(group: LogGroup, proposal: MapProposal, targets: Sequence[str
 
 
 def _size(look: LogLook, name: str) -> float:
-    """How much a column of a log moves: its standard deviation."""
+    """Return how much a column of a log moves: its standard deviation."""
     values = next(column.values for column in look.columns if column.name == name)
     values = values[np.isfinite(values)]
     return float(np.std(values)) if len(values) else 0.0

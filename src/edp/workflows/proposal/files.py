@@ -24,7 +24,7 @@ _SLOW_TICKS = 5
 
 
 def horizons_for(rate_hz: float | None) -> tuple[int, int]:
-    """Look-ahead in samples: one, and a tenth of a second or five."""
+    """Return the look-ahead in samples: one, and a tenth of a second or five."""
     ahead = round(_AHEAD_S * (rate_hz or 0.0))
     return 1, ahead if ahead > 1 else _SLOW_TICKS
 
@@ -67,7 +67,7 @@ def remarks_of(paths: Sequence[Path], proposal: MapProposal) -> list[str]:
 
 
 def toml_text(table: Mapping[str, object], remarks: Iterable[str] = ()) -> str:
-    """TOML with comments above; a comment ends at no character of a name."""
+    """Return TOML with comments above; a comment ends at no character of a name."""
     visible = ["".join(letter if letter.isprintable() else "?" for letter in line) for line in remarks]
     return "".join(f"# {line}\n" for line in visible) + tomli_w.dumps(table)
 

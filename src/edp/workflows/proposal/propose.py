@@ -105,7 +105,7 @@ class LogsProposal:
         return f"edp twin {data}{mapped} --out {_quoted(folder / 'runs' / 'twin')}{repair}{named}{split}"
 
     def no_plant(self) -> str:
-        """Why no plant model is proposed, and what to record or to name, in a sentence; empty where one is."""
+        """Return why no plant model is proposed, and what to record or to name, in a sentence; empty where one is."""
         return propose_plant(self.proposal, self.targets, self.inputs).why_not
 
     def _logs(self, folder: Path) -> tuple[str, str, str]:
@@ -129,7 +129,7 @@ def _quoted(path: Path) -> str:
 
 
 def propose(path: str | Path | Sequence[str | Path], progress: Progress = SILENT) -> LogsProposal:
-    """Examine logs and propose a map and settings, without writing files.
+    """Return the examine logs and propose a map and settings, without writing files.
 
     Args:
         path: a log or a folder of logs, or several of them.
@@ -329,7 +329,7 @@ def _propose_from_pairs(
     proposal: MapProposal,
     pairs: dict[str, dict[str, ColumnGuess]],
 ) -> LogsProposal:
-    """Two experiments in the columns of one log: a recording each."""
+    """Return two experiments in the columns of one log: a recording each."""
     train = next(ending for ending in pairs if ending in _TRAINS)
     test = next(ending for ending in pairs if ending != train)
     recordings = []

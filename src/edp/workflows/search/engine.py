@@ -130,7 +130,7 @@ class Dispatcher:
     teacher_keys: set[str] = field(default_factory=set)
 
     def __call__(self, requests: list[TrainingRequest]) -> list[Outcome]:
-        """Outcomes in the order of the requests; equal ones are done once.
+        """Return the outcomes in the order of the requests; equal ones are done once.
 
         Parts of trainings go on from the latest part before them whose state is still there. Once a batch is trained,
         states of other batches are not needed any more and removed.

@@ -79,7 +79,7 @@ Shape: TypeAlias = Callable[[Arm], Arm]
 
 
 def _space(name: str) -> Mapping[str, Sequence[Any]]:
-    """Values worth searching of a block's options."""
+    """Return the values worth searching of a block's options."""
     return cast(type[BlockSpec], BLOCKS[name]).space
 
 
@@ -257,7 +257,7 @@ def _label(value: Any) -> Value:
 
 
 def conflicts(arm: Arm, names: Iterable[str], channels: Sequence[str] = ()) -> list[str]:
-    """Why these modules cannot be used together on this network; empty where they can.
+    """Return why these modules cannot be used together on this network; empty where they can.
 
     Two modules contradict one another where they set the same value differently, and all of them where the parts of
     the network say so.
@@ -289,7 +289,7 @@ def conflicts(arm: Arm, names: Iterable[str], channels: Sequence[str] = ()) -> l
 
 
 def fitting(arm: Arm, channels: Sequence[str] = (), among: Sequence[str] = ()) -> tuple[str, ...]:
-    """Modules that this network can have, in the order of the registry, and does not have already.
+    """Return the modules that this network can have, in the order of the registry, and does not have already.
 
     Args:
         arm: arm with the network.
@@ -301,7 +301,7 @@ def fitting(arm: Arm, channels: Sequence[str] = (), among: Sequence[str] = ()) -
 
 
 def contradicting(arm: Arm, names: Iterable[str], channels: Sequence[str] = ()) -> frozenset[frozenset[str]]:
-    """Pairs of modules that fit alone, but not together."""
+    """Return the pairs of modules that fit alone, but not together."""
     pairs = combinations(sorted(set(names)), 2)
     return frozenset(frozenset(pair) for pair in pairs if conflicts(arm, pair, channels))
 

@@ -106,7 +106,7 @@ def _use_task(search: Mapping[str, object], table: Mapping[str, object], experim
 
 
 def _read_named_files(table: Mapping[str, object], folder: Path) -> dict[str, object]:
-    """`table` with the feature sets and the budget that it names by files."""
+    """Return `table` with the feature sets and the budget that it names by files."""
     resolved = embed_feature_set(table, folder)
     budget, features = (value_at(table, f"search.{key}") for key in ("compression.budget", "features"))
     if isinstance(budget, str):
@@ -121,7 +121,7 @@ def _read_named_files(table: Mapping[str, object], folder: Path) -> dict[str, ob
 
 
 def _check_parts(spec: SearchSpec, base: Arm, where: str) -> None:
-    """Every backbone, feature set and value of the space makes an experiment; otherwise the first that does not."""
+    """Check that every backbone, feature set and value of the space makes a valid experiment."""
     for name in spec.backbones:
         if name not in DEFAULT_BACKBONE:
             backbone_names = ", ".join(DEFAULT_BACKBONE)

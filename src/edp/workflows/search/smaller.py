@@ -82,7 +82,7 @@ class Recipe:
         return replace(experiment, model=order.model(experiment.model), training=training)
 
     def to_json(self) -> dict[str, object]:
-        """Plain values."""
+        """Return the plain values."""
         lists = {"formats": list(self.formats), "validation": list(self.validation)}
         return {**vars(self), **lists, "budget": asdict(self.budget)}
 

@@ -107,7 +107,7 @@ def _dropout(arm: Arm, value: float) -> Arm:
 
 @DIMENSIONS.register("units")
 def _units(arm: Arm, value: int) -> Arm:
-    """Hidden unit capacity C: recurrent units, and channels of every convolution."""
+    """Return the hidden unit capacity C: recurrent units, and channels of every convolution."""
     if UNITS in arm:
         arm = arm.with_value(UNITS, int(value))
     if CHANNELS in arm:
@@ -117,7 +117,7 @@ def _units(arm: Arm, value: int) -> Arm:
 
 @DIMENSIONS.register("layers")
 def _layers(arm: Arm, value: int) -> Arm:
-    """Layer depth L: convolutions where the backbone has them, else recurrent layers."""
+    """Return the layer depth L: convolutions where the backbone has them, else recurrent layers."""
     if CHANNELS in arm:
         return arm.with_value(CHANNELS, [arm[CHANNELS][-1]] * int(value))
     return arm.with_value("model.backbone.layers", int(value))
@@ -269,5 +269,8 @@ def check(space: Space, candidate: Candidate) -> None:
 
 
 def names(space: Space) -> Sequence[str]:
-    """Dimensions in the order of the registry, so that a sampler always sees the same one; others behind, in theirs."""
+    """Return the dimensions in the order of the registry, so that a sampler always sees the same one.
+
+    Others behind, in theirs.
+    """
     return [name for name in DIMENSIONS if name in space] + [name for name in space if name not in DIMENSIONS]

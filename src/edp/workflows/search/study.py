@@ -229,7 +229,7 @@ class Study:
         self._open[number].report(value, step)
 
     def hopeless(self, number: int) -> bool:
-        """Whether the pruner would end a question after its last report, by the reports of earlier ones."""
+        """Return whether the pruner would end a question after its last report, by the reports of earlier ones."""
         return self.pruner != "none" and bool(self._open[number].should_prune())  # NumPy's would not be plain
 
     def tell(

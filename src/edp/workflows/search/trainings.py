@@ -106,7 +106,7 @@ class TrainingRequest:
         return replace(self, until=None, stops=())
 
     def to_json(self) -> dict[str, object]:
-        """Plain values, from which `from_json` makes the same order."""
+        """Return the plain values, from which `from_json` makes the same order."""
         return dict(plain_tree(self))
 
     @staticmethod
@@ -233,7 +233,7 @@ def session_scores(recordings: Mapping[str, ByHorizon]) -> SessionScores:
 
 
 def mean_scores(sessions: Mapping[str, Mapping[str, Mapping[str, float]]]) -> dict[str, float]:
-    """Mean of each score over sessions and horizons."""
+    """Return the mean of each score over sessions and horizons."""
     rows = [scores for horizons in sessions.values() for scores in horizons.values()]
     return {name: sum(row[name] for row in rows) / len(rows) for name in SCORES}
 
@@ -277,7 +277,7 @@ class _Named:
     judged: tuple[str, ...]
 
     def split(self, recordings: Sequence[Recording], gap: int) -> Split:
-        """Every session whole."""
+        """Return every session whole."""
         whole = {recording.name: Stretch(i, 0, recording.samples) for i, recording in enumerate(recordings)}
         parts = (self.train, self.validation, self.judged)
         return Split(*(tuple(whole[name] for name in part) for part in parts))
@@ -292,7 +292,7 @@ def _recordings(source: str) -> Sequence[Recording]:
 
 
 def costs_of(arm: Arm, channels: Sequence[str] = ()) -> dict[str, float]:
-    """Analytic costs of the network of an arm, before anything is trained: parameters, MACs of a tick.
+    """Return analytic costs of the network of an arm, before anything is trained: parameters, MACs of a tick.
 
     Raises:
         ConfigError: settings that cannot be, or a part that counts other work than it does.

@@ -229,7 +229,7 @@ def target_data(
 def _result(
     source: SourceModel, data: Prepared, experiment: Experiment, order: FinetuneRequest, results: dict[str, Made]
 ) -> tuple[TransferFile, dict[str, NDArray[np.float32]]]:
-    """Scores of all methods in both domains, and the predictions before and after that pictures show."""
+    """Return the scores of all methods in both domains, and the predictions before and after that pictures show."""
     # The longest start-up of all methods, so that all are scored on the same ticks.
     skip = max(source.predictor.spec.window, experiment.judge.history, data.task.features.starting_ticks)
     predictions = {name: one.predict(data) for name, one in results.items()}

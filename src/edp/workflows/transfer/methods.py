@@ -184,7 +184,7 @@ class Adapters(Method):
 
 
 def change_size(shape: tuple[int, ...], axes: tuple[int, ...], rank: int) -> int:
-    """Parameters of a change of a weight of this shape whose outputs lie along `axes`."""
+    """Return the parameters of a change of a weight of this shape whose outputs lie along `axes`."""
     rows = columns = 1
     for axis, size in enumerate(shape):
         rows, columns = (rows * size, columns) if axis in axes else (rows, columns * size)
@@ -302,7 +302,7 @@ class TwoPhase(Method):
     label = "Fine-tuned, two phases"
 
     def make(self, case: TransferCase) -> Made:
-        """Both phases; the first is a run of its own within the run of the second."""
+        """Return both phases; the first is a run of its own within the run of the second."""
         spec, parts = case.spec, decompose(case.source.predictor)
         # 0.999 is AdamW's usual value; the library's default of 0.99 is for short runs.
         heads = AdamW(learning_rate=spec.head_rate, weight_decay=spec.weight_decay, beta2=0.999)

@@ -55,7 +55,7 @@ def measure(predictions: Predictions, data: Prepared, skip: int) -> MeasuredMeth
 
 
 def errors_of(predictions: Predictions, data: Prepared, skip: int) -> Errors:
-    """Prediction minus truth of all scored ticks by horizon, ``(tick, target)``, report units."""
+    """Return the prediction minus truth of all scored ticks by horizon, ``(tick, target)``, report units."""
     factors = np.array([KINDS[kind].report_factor for kind in data.target_kinds])
     errors = {}
     for index, horizon in enumerate(data.task.horizons):
@@ -70,7 +70,7 @@ def errors_of(predictions: Predictions, data: Prepared, skip: int) -> Errors:
 
 
 def skew(errors: NDArray[np.float64]) -> float:
-    """Third standardised moment; 0 for errors that are all alike."""
+    """Return the third standardised moment; 0 for errors that are all alike."""
     centred = errors - errors.mean()
     deviation = float(np.sqrt(np.mean(centred**2)))
     return float(np.mean((centred / deviation) ** 3)) if deviation > 0 else 0.0

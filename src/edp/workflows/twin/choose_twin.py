@@ -91,7 +91,7 @@ class TwinCandidate:
         return None if self.trial is None else self.trial.spec
 
     def row(self) -> CandidateRow:
-        """For ``candidates.json``."""
+        """Return the row for ``candidates.json``."""
         return CandidateRow(
             label=self.label,
             error=self.error,
@@ -256,7 +256,7 @@ class TwinChoice:
         return self._attempt(label, form, fitted, rival, most)
 
     def _part(self, name: str, which: int) -> str:
-        """Folder of a fold's fit in the run."""
+        """Return the folder of a fold's fit in the run."""
         return f"{name}_fold_{which}" if len(self.folds) > 1 else name
 
     def _attempt(

@@ -196,7 +196,7 @@ class ContinuedTwin:
         return joined if len(fits) > 1 else replace(joined, twin=_set_members(joined.twin, start.members))
 
     def _error(self, twin: Twin) -> float:
-        """Error of free runs of the validation part over the static map's there."""
+        """Return the error of free runs of the validation part over the static map's there."""
         training, data = self.fit.experiment.training, self.fit.data
         static = StaticMap(prefix_ticks=twin.prefix_ticks).start(twin.channels, twin.scales, data.train, 0)
         ours, theirs = (

@@ -68,7 +68,7 @@ class TwinFit:
         return free_run_steps(self.progress)
 
     def fitted(self, spec: TwinSpec, run: KeyedRun | None) -> FittedFormulation:
-        """One formulation, fitted.
+        """Return one formulation, fitted.
 
         Raises:
             EdpError: it does not suit the channels, or its fit ends in no numbers.

@@ -192,7 +192,7 @@ def _add_forecasts(
 def _errors(
     values: np.ndarray, measured: np.ndarray, horizons: Sequence[int], settled: int
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """For each horizon, sums of absolute errors of forecast and present value ``(column,)``, and how many count."""
+    """Return sums of absolute errors of forecast and present value for each horizon ``(column,)``, and their count."""
     sums = []
     for at, k in enumerate(horizons):
         last = max(settled, len(values) - k)

@@ -135,7 +135,7 @@ def select_shown_runs(runs: FreeRuns, intervals: FreeRunIntervals | None) -> dic
 
 
 def _score_ahead(twin: Twin, data: Prepared, spec: FreeRunJudgeSpec) -> AheadErrors | None:
-    """Scores a few ticks ahead; None where no recording is long enough."""
+    """Return the scores a few ticks ahead; None where no recording is long enough."""
     longest = max(part.samples for part in data.test)
     if longest < twin.prefix_ticks + spec.ahead_ticks + 1:
         return None
@@ -238,7 +238,7 @@ def _rows(name: str, recordings: Mapping[str, Recording]) -> tuple[Recording, in
 
 
 def _predict_at_moments(predictor: Predictor, series: Sequence[Series], ahead: Ahead) -> NDArray[np.float32]:
-    """Predictions that far ahead at the moments ``(moment, target)``, SI units."""
+    """Return the predictions that far ahead at the moments ``(moment, target)``, SI units."""
     which = predictor.task.horizons.index(ahead.ticks)
     predictions = stream_predictions(predictor, series)
     return np.concatenate([p[at, which] for p, at in zip(predictions, ahead.moments, strict=True)])

@@ -133,7 +133,7 @@ def _only(recordings: Sequence[Recording]) -> Recording:
 
 
 def _span(twin: Twin, recording: Recording, seconds: float, start_s: float | None) -> tuple[int, int]:
-    """First tick of a free run and its length, which both lie in the log."""
+    """Return the first tick of a free run and its length, which both lie in the log."""
     rate, prefix = recording.rate_hz, twin.prefix_ticks
     if not above(0.0, MAX_SECONDS).holds(seconds):
         raise ConfigError(f"--seconds {setting_text(seconds)}: {above(0.0, MAX_SECONDS).rule('seconds')} must hold")

@@ -98,7 +98,7 @@ class Core:
         self._reset(self._state)
 
     def step(self, row: list[float]) -> CallStatus:
-        """One tick; `row` in SI units, in the order of `inputs`.
+        """Return one tick; `row` in SI units, in the order of `inputs`.
 
         Raises:
             ValueError: it has another length.

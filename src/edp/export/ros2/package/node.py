@@ -62,7 +62,7 @@ class PredictorNode(TickNode):
                     self.results[meaning, number, ahead["ticks"]].publish(message)
 
     def report(self) -> None:
-        """Once a second; where no joints came since, the prediction is no longer valid."""
+        """Report once a second; without joint messages since the last report, the prediction is invalid."""
         tick, core = self.last, self.ticks.core
         if not self.fresh:
             self.valid.publish(Bool(data=False))

@@ -60,7 +60,7 @@ class TickNode(Node):
         raise NotImplementedError
 
     def report(self) -> None:
-        """Once a second."""
+        """Report once a second."""
         raise NotImplementedError
 
 

@@ -35,7 +35,7 @@ class MonitorCore(Core):
         return dict(zip(self.about["outputs"], self.result()[0][0]))
 
     def evidence(self) -> list[tuple[str, float]]:
-        """Summaries that deviated most before the last alarm, with their mean deviation in usual widths."""
+        """Return the summaries that deviated most before the last alarm, with their mean deviation in usual widths."""
         self._evidence(self._state, self._deviations)
         ranked = sorted(zip(self.summaries, self._deviations), key=lambda entry: -abs(entry[1]))
         return [(name, value) for name, value in ranked[:SHOWN] if value != 0.0]
@@ -66,7 +66,7 @@ class MonitorReport:
         return new
 
     def report(self, tick: Tick | None, stamp: float, fresh: bool) -> tuple[int, str, dict[str, str]]:
-        """Level, message and values of a diagnostic status.
+        """Return the level, message and values of a diagnostic status.
 
         Args:
             tick: the last one.

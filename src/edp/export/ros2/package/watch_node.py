@@ -34,7 +34,7 @@ class MonitorNode(TickNode):
             self.report()
 
     def report(self) -> None:
-        """Once a second, and at every alarm."""
+        """Report once a second, and at every alarm."""
         level, text, values = self.watch.report(self.last, self.stamp, self.fresh)
         self.alarm.publish(Bool(data=level == ERROR))
         message = DiagnosticArray()

@@ -76,7 +76,7 @@ def _measure_v5(path: Path) -> tuple[int, int]:
 
 
 def _measure_packed(start: bytes, order: str) -> int:
-    """Bytes that a packed element announces; 0 where it is damaged, which its reader finds."""
+    """Return the bytes that a packed element announces; 0 where it is damaged, which its reader finds."""
     # Eight bytes unpacked tell the length, whatever the rest would lead to.
     head = unpack_start(start, 8)
     if len(head) < 8:

@@ -21,7 +21,7 @@ _EACH = ("InputData", "OutputData", "Ts", "Tstart", "SamplingInstants")
 
 
 def experiment_names(variables: Mapping[str, object]) -> list[str]:
-    """Names of the experiments of all variables that hold several alike: ``train{1}``, ``train{2}``, ..."""
+    """Return the names of the experiments of all variables that hold several alike: ``train{1}``, ``train{2}``, ..."""
     return [f"{name}{{{i + 1}}}" for name, value in variables.items() for i in range(len(_experiments(value)))]
 
 
@@ -49,7 +49,7 @@ def _experiments(value: Any) -> list[Any]:
 
 
 def _is_experiment(element: Any) -> bool:
-    """Whether a struct holds several signals of the same rows."""
+    """Return whether a struct holds several signals of the same rows."""
     if not element.dtype.names or element.size != 1:
         return False
     fields = [np.asarray(element.ravel()[0][name]) for name in element.dtype.names]

@@ -65,7 +65,7 @@ def _drop_copies(mat_variables: MatVariables) -> None:
 
 
 def _is_copy(part: Part, other: Part) -> bool:
-    """Whether two signals have the same values at the same times of their own, and one unit."""
+    """Return whether two signals have the same values at the same times of their own, and one unit."""
     if part.time is None or other.time is None or part.unit != other.unit:
         return False
     return np.array_equal(part.time, other.time) and np.array_equal(
@@ -182,7 +182,7 @@ def _struct_time(element: Any, fields: tuple[str, ...]) -> tuple[str, NDArray[np
 
 
 def _walk_structure_with_time(element: Any, path: str, mat_variables: MatVariables) -> None:
-    """Simulink's 'Structure with time': fields time and signals(k).values, signals(k).label."""
+    """Read Simulink's 'Structure with time': fields time and signals(k).values, signals(k).label."""
     stamps = np.asarray(element["time"], dtype=np.float64).ravel()
     signals = element["signals"]
     if not isinstance(signals, np.ndarray) or not signals.dtype.names or "values" not in signals.dtype.names:

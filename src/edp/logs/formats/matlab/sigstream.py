@@ -71,7 +71,7 @@ def _times(path: Path, records: h5py.Group, signal: Any, samples: int) -> NDArra
 
 
 def _signals(values: list[Any], depth: int) -> Iterator[Any]:
-    """Structs that refer to records, within objects, cells and structs."""
+    """Return the structs that refer to records, within objects, cells and structs."""
     if depth > _DEEPEST:
         return
     for value in values:

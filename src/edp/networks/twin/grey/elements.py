@@ -234,7 +234,10 @@ def _assign_pumps(
     second: Sequence[ValveElement],
     pumps: tuple[PumpElement, ...],
 ) -> Elements:
-    """Valves with their pumps: of two pumps, neighbouring spools take turns, and a second spool has the other pump."""
+    """Return the valves with their pumps: of two pumps, neighbouring spools take turns.
+
+    And a second spool has the other pump.
+    """
     cylinders = tuple(one for one in actuators if isinstance(one, CylinderElement))
     motors = tuple(one for one in actuators if isinstance(one, MotorElement))
     if not pumps:

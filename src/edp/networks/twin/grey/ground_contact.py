@@ -75,7 +75,7 @@ def tip_at(linkage: Array, bucket_m: float, strokes: Array, tip: Array, slopes: 
 
 @inner
 def height_at(x: float, profile: Array) -> float:
-    """Height (m) of the ground at `x`, linear between its cells."""
+    """Return the height (m) of the ground at `x`, linear between its cells."""
     cell = min(max(x / CELL_M, 0.0), len(profile) - 1.000001)
     k = int(cell)
     return float(profile[k] + (cell - k) * (profile[k + 1] - profile[k]))
@@ -89,7 +89,7 @@ def share(speed: float) -> float:
 
 @inner
 def depth_at(tip: Array, v_x: float, profile: Array) -> float:
-    """Depth (m) of the tip below the ground before it."""
+    """Return the depth (m) of the tip below the ground before it."""
     inward = share(v_x)
     uncut = inward * height_at(tip[0] - AHEAD_M, profile) + (1.0 - inward) * height_at(tip[0] + AHEAD_M, profile)
     return float(uncut - tip[1])
@@ -105,7 +105,7 @@ def size_of(numbers: Array, first: int, depth: float) -> float:
 
 @inner
 def dampers(numbers: Array, depth: float, v_x: float, v_y: float) -> tuple[float, float, float]:
-    """Along x, along y and across, N s/m, of a tip at a depth below ground (m) and at a velocity (m/s)."""
+    """Return along x, along y and across, N s/m, of a tip at a depth below ground (m) and at a velocity (m/s)."""
     if depth <= 0.0:
         return 0.0, 0.0, 0.0
     slow = 1.0 / math.sqrt(v_x * v_x + v_y * v_y + CREEP * CREEP)

@@ -159,7 +159,10 @@ class DragLaw(GroundLaw):
         return np.full(int(reach / contact.CELL_M) + 3, self.surface_m)
 
     def _rows_of(self, twin: GreyTwin, logs: Logs) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Terms ``(row, number, actuator)``, forces ``(row, actuator)`` and block of each row that a fit reads."""
+        """Return the terms ``(row, number, actuator)``.
+
+        Forces ``(row, actuator)`` and block of each row that a fit reads.
+        """
         parts: list[tuple[Array, Array, NDArray[np.int64]]] = []
         for number, (strokes, velocities, forces) in enumerate(logs):
             tips, terms = np.empty((len(strokes), 2)), np.empty((len(strokes), contact.NUMBERS, strokes.shape[1]))

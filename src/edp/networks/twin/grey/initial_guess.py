@@ -184,7 +184,7 @@ def _insert_friction(table: ParameterTable, solution: Array, declared: Sequence[
 def _rows(
     train: Sequence[Series], columns: Sequence[tuple[int, int, int, int]], by_stroke: NDArray[np.bool_], rate_hz: float
 ) -> Array:
-    """Velocity, acceleration, stroke, head and rod pressure ``(row, actuator, 5)``, far from the stops.
+    """Return the velocity, acceleration, stroke, head and rod pressure ``(row, actuator, 5)``, far from the stops.
 
     The stroke is zero where no load depends on it (`by_stroke`), as a motor has no stops.
     """
@@ -208,7 +208,7 @@ def _rows(
 
 
 def _ridge(matrix: Array, goal: Array) -> Array:
-    """Least squares on columns of one size."""
+    """Return the least-squares solution for columns of one size."""
     size = np.sqrt(np.square(matrix).mean(axis=0))
     scaled = matrix / np.maximum(size, 1e-12)
     normal = scaled.T @ scaled + 1e-6 * len(goal) * np.eye(matrix.shape[1])

@@ -87,7 +87,7 @@ class KnownLinkage:
 
     @staticmethod
     def from_arrays(arrays: Mapping[str, Singles]) -> KnownLinkage:
-        """From the arrays of a bundle, which may be damaged.
+        """Create the linkage from the arrays of a bundle, which may be damaged.
 
         Raises:
             ValueError: no linkage.
@@ -104,7 +104,7 @@ class KnownLinkage:
         return KnownLinkage(values, bodies)
 
     def arrays(self) -> dict[str, Singles]:
-        """For a bundle."""
+        """Return the arrays for a bundle."""
         return {"linkage": self.values.astype(np.float32), "bodies": self.bodies.astype(np.float32)}
 
     def numbers(self) -> list[Parameter]:
@@ -164,7 +164,7 @@ def _check_stroke(
 
 
 def _knots(body: int, axes: Array, plant: Array) -> Array:
-    """Stroke (m), joint angle (rad) and its first two derivatives by the stroke ``(knot, 4)``."""
+    """Return the stroke (m), joint angle (rad) and its first two derivatives by the stroke ``(knot, 4)``."""
     from edp.sim.machine import layout as sim
     from edp.sim.physics import linkage
 

@@ -27,7 +27,10 @@ angle continues linearly, so that a run that leaves the stroke stays finite."""
 
 @inner
 def joint_angle(linkage: Array, joint: int, stroke: float) -> tuple[float, float, float, float]:
-    """Joint angle (rad) at a stroke (m), and its three derivatives by it; `joint` is where the joint's values begin."""
+    """Return the joint angle (rad) at a stroke (m), and its three derivatives by it.
+
+    `joint` is where the joint's values begin.
+    """
     low, high = 0, at.LINKAGE_KNOTS - 1
     while high - low > 1:
         middle = (low + high) // 2

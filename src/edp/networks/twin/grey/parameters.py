@@ -114,7 +114,7 @@ class ParameterTable:
 
 
 def monomials(variables: int, degree: int) -> IntArray:
-    """Exponents of all monomials up to a degree, the lower ones first ``(term, variable)``."""
+    """Return the exponents of all monomials up to a degree, the lower ones first ``(term, variable)``."""
     chosen = [which for total in range(degree + 1) for which in combinations_with_replacement(range(variables), total)]
     return np.array([[which.count(variable) for variable in range(variables)] for which in chosen], dtype=np.int64)
 
@@ -233,7 +233,7 @@ def _load_exponents(elements: Elements, degree: int) -> IntArray:
 
 
 def _inertia(actuators: Sequence[Actuator], areas: Sequence[float], exponents: IntArray) -> list[Parameter]:
-    """Coefficients of the root of the inertia, row by row."""
+    """Return the coefficients of the root of the inertia, row by row."""
     numbers = []
     for a, actuator in enumerate(actuators):
         size = load_size(actuator, areas[a])

@@ -23,7 +23,7 @@ LONGEST_S = 0.0205
 
 
 def goes_twice(twin: GreyTwin) -> bool:
-    """Whether a step of a plan may go over two ticks behind the first `SINGLE_TICKS`."""
+    """Return whether a step of a plan may go over two ticks behind the first `SINGLE_TICKS`."""
     return twin.time[1] == 1 and 2.0 * twin.time[0] <= LONGEST_S
 
 

@@ -81,7 +81,7 @@ def _check_names(elements: Elements) -> None:
 
 
 def _check_actuator(actuator: Actuator, channels: TwinChannels, ports: _Ports) -> None:
-    """Its own ports, and whether its velocity is of its kind."""
+    """Check that an actuator has its own ports and that its velocity has the right kind."""
     here = _title(actuator)
     cylinder = isinstance(actuator, CylinderElement)
     position, first, second = ("stroke", "head", "rod") if cylinder else ("angle", "a", "b")

@@ -49,7 +49,7 @@ class _Tick:
         return self.build.pick(name, INPUT, [self.twin.inputs[channel] for channel in channels])
 
     def line(self, name: str, x: str, gain: float | Values, shift: float | Values = 0.0) -> str:
-        """``gain x + shift``."""
+        """Return ``gain x + shift``."""
         one = np.ones(self.build.width(x))
         return self.build.add(ScaleShift, name, x, gain=gain * one, shift=shift * one)
 
@@ -114,7 +114,7 @@ def lowered_answers(build: Builder, twin: ElementsTwin, fed: str) -> str:
 
 
 def _masses(tick: _Tick) -> str:
-    """Velocities after the half-implicit steps of a tick, SI units."""
+    """Return the velocities after the half-implicit steps of a tick, SI units."""
     twin, masses = tick.twin, tick.twin.elements.masses
     names, columns = [mass.name for mass in masses], [twin.columns[mass.velocity] for mass in masses]
     gain, viscous, skew, coulomb, offset = (
@@ -138,7 +138,7 @@ def _masses(tick: _Tick) -> str:
 
 
 def _lags(tick: _Tick, columns: list[int]) -> str:
-    """Pressures after a tick, scaled."""
+    """Return the pressures after a tick, scaled."""
     twin, lags = tick.twin, tick.twin.elements.lags
     gain, offset, lag_s = (tick.numbers([lag.name for lag in lags], n) for n in ("gain", "offset", "lag"))
     width, zero = (values[columns] for values in (twin.scales.answer_width, twin.scales.answer_offset))
@@ -150,7 +150,7 @@ def _lags(tick: _Tick, columns: list[int]) -> str:
 
 
 def _tanks(tick: _Tick) -> list[tuple[str, list[int]]]:
-    """Velocities and levels of the tanks that are measured, scaled, with their columns."""
+    """Return the velocities and levels of the tanks that are measured, scaled, with their columns."""
     twin, build, tanks = tick.twin, tick.build, tick.twin.elements.tanks
     measured = [tank for tank in tanks if tank.level]
     columns = [twin.columns[tank.level] for tank in measured]
@@ -204,7 +204,7 @@ def _add_level_changes(tick: _Tick, before: str) -> str:
 
 
 def _rates(tick: _Tick, levels: str, pumped: str) -> str:
-    """Rates of the levels, m/s."""
+    """Return the rates of the levels, m/s."""
     twin, build, tanks = tick.twin, tick.build, tick.twin.elements.tanks
     names, rate = [tank.name for tank in tanks], twin.channels.rate_hz
     inflow, outflow, exponent = (tick.numbers(names, n) for n in ("inflow", "outflow", "exponent"))

@@ -56,7 +56,7 @@ def _tanh(x: Any) -> Any:
 
 @inner
 def _clip(value: Any, low: float, high: float) -> Any:
-    """Within bounds; a slope passes where no bound acts."""
+    """Return the within bounds; a slope passes where no bound acts."""
     if value.real < low:
         return value * 0.0 + low
     if value.real > high:
@@ -66,7 +66,7 @@ def _clip(value: Any, low: float, high: float) -> Any:
 
 @inner
 def _move_lags(numbers: Values, command: Doubles, answer: Values, after: Values, wiring: Wiring) -> None:
-    """Pressures by the exact step of a first-order lag."""
+    """Advance pressures by the exact step of a first-order lag."""
     lags, low, high, rate = wiring[0], wiring[3], wiring[4], wiring[7]
     for k in range(len(lags)):
         which, column, at = lags[k, 0], lags[k, 1], lags[k, 2]
@@ -77,7 +77,7 @@ def _move_lags(numbers: Values, command: Doubles, answer: Values, after: Values,
 
 @inner
 def _move_masses(numbers: Values, command: Doubles, answer: Values, after: Values, wiring: Wiring) -> None:
-    """Velocities by a half-implicit step; strokes by the trapezoidal rule, held at the end stops."""
+    """Advance velocities by a half-implicit step and strokes by the trapezoidal rule, within the end stops."""
     masses, low, high, rate = wiring[1], wiring[3], wiring[4], wiring[7]
     steps, count, strokes = wiring[6]
     step = 1.0 / (rate * steps)
@@ -105,7 +105,7 @@ def _move_masses(numbers: Values, command: Doubles, answer: Values, after: Value
 
 @inner
 def _flows(numbers: Values, command: Doubles, levels: Values, work: Values, wiring: Wiring) -> None:
-    """Rates of the levels, m/s, into row 0 of `work`; rows 1 and 2 are what leaves each tank, and spills."""
+    """Write the rates of the levels, m/s, to row 0 of `work`, and outflow and overflow of each tank to rows 1 and 2."""
     tanks, widths, rate = wiring[2], wiring[5], wiring[7]
     for k in range(len(tanks)):
         pump, above, column, at = tanks[k, 0], tanks[k, 1], tanks[k, 2], tanks[k, 4]
@@ -130,7 +130,7 @@ def _flows(numbers: Values, command: Doubles, levels: Values, work: Values, wiri
 def _fill_tanks(
     numbers: Values, command: Doubles, answer: Values, hidden: Values, after: Values, work: Values, wiring: Wiring
 ) -> None:
-    """Levels by the midpoint rule; the velocity of a measured one is its mean over the tick."""
+    """Advance levels by the midpoint rule; a measured velocity is the mean over the sample."""
     tanks, low, high, rate = wiring[2], wiring[3], wiring[4], wiring[7]
     steps, count, _ = wiring[6]
     step, now, half = 1.0 / (rate * steps), work[3], work[4]

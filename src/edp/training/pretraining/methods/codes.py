@@ -44,7 +44,7 @@ class Codes:
         return replace(spec, blocks=(*spec.blocks, MachineCode()))
 
     def strategy(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy:
-        """Streams of machines, each with its code."""
+        """Return the streams of machines, each with its code."""
         return WithCodes(start)
 
 

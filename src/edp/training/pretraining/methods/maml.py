@@ -23,7 +23,7 @@ class Maml:
     episodic: ClassVar[bool] = True
 
     def strategy(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy | None:
-        """Episodes with second derivatives."""
+        """Return the episodes with second derivatives."""
         return AfterAdaptation(spec, start, second_order=True)
 
 
@@ -35,7 +35,7 @@ class FirstOrderMaml:
     episodic: ClassVar[bool] = True
 
     def strategy(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy | None:
-        """Episodes without second derivatives."""
+        """Return the episodes without second derivatives."""
         return AfterAdaptation(spec, start, second_order=False)
 
 

@@ -25,7 +25,7 @@ class Reptile:
     episodic: ClassVar[bool] = True
 
     def strategy(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy | None:
-        """Episodes without derivatives of the adaptation.
+        """Return the episodes without derivatives of the adaptation.
 
         Raises:
             ConfigError: only the head adapts, or there is one step: nothing else would learn, or nothing be new.

@@ -123,7 +123,7 @@ class Arrivals:
             )
 
     def take(self, row: Row, seconds: float | None = None, more: bool = False) -> None:
-        """Hand a row to the session, or leave the row out where its time is impossible.
+        """Pass a row to the session, or omit a row with an impossible time.
 
         Args:
             row: values of the source's channels, shape (channels,), SI units.

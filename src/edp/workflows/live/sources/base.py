@@ -168,7 +168,7 @@ SOURCES: Registry[type[LiveSource]] = Registry("live source")
 
 
 def choose_rate(options: SourceOptions, needs: Needs, what: str) -> float:
-    """Rate of a source that takes it from the models.
+    """Return the rate of a source that takes it from the models.
 
     Raises:
         ConfigError: nobody says it.

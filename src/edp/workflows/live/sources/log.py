@@ -29,7 +29,7 @@ class LogSource(LiveSource):
 
     @classmethod
     def from_options(cls, options: SourceOptions, needs: Needs) -> LogSource:
-        """`SourceOptions.value` is the path of one log."""
+        """Return `SourceOptions.value` is the path of one log."""
         recording = read_with_truth(
             DataSource(Path(options.value), options.signal_map(), options.settings.get("repair"))
         )

@@ -44,7 +44,7 @@ class LoopSource(LiveSource):
 
     @classmethod
     def from_options(cls, options: SourceOptions, needs: Needs) -> LoopSource:
-        """`SourceOptions.value` is the name of a task, or a file of settings of `edp control` (TOML).
+        """Return `SourceOptions.value` is the name of a task, or a file of settings of `edp control` (TOML).
 
         Settings: ``controller`` (a name), ``twin`` and ``predictor`` (run folders that it uses) and ``plant`` (a
         twin's run folder, or an FMU whose native code is trusted, in the simulator's place).

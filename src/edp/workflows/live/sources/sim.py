@@ -76,7 +76,7 @@ class SimSource(LiveSource):
 
     @classmethod
     def from_options(cls, options: SourceOptions, needs: Needs) -> SimSource:
-        """`SourceOptions.value` is the machine."""
+        """Return `SourceOptions.value` is the machine."""
         rate_hz = options.rate_hz or needs.rate_hz or USUAL_RATE_HZ
         names = [channel.name for channel in needs.channels]
         return cls(options.value, rate_hz, options.seed or 0, options.settings, names)

@@ -79,7 +79,7 @@ class UdpSource(LiveSource):
 
     @classmethod
     def from_options(cls, options: SourceOptions, needs: Needs) -> UdpSource:
-        """`SourceOptions.value` is the port; the setting ``bind`` another address than loopback."""
+        """Return `SourceOptions.value` is the port; the setting ``bind`` another address than loopback."""
         rate, signal_map = choose_rate(options, needs, "--udp"), options.signal_map()
         mapped = tuple(channel_from_entry(entry) for entry in signal_map.channels) if signal_map else ()
         names = {channel.name for channel in mapped}
@@ -181,7 +181,7 @@ def row_of(data: bytes) -> Mapping[str, float]:
 
 
 def _conversions(signal_map: SignalMap | None) -> Callable[[str, Mapping[str, float]], float]:
-    """From a channel's name and a row to its value in SI units."""
+    """Return a function for each channel that converts a value of a row to SI units."""
     entries: Table = {entry.name: entry for entry in (signal_map.channels if signal_map else ())}
     units = {
         name: unit_for(check_unit(entry.unit, where), channel_from_entry(entry).kind, where)

@@ -46,7 +46,7 @@ class Slave:
         self.put, self.take = (slave.setReal, slave.getReal) if version == 2 else (slave.setFloat64, slave.getFloat64)
 
     def stream(self, inputs: Rows) -> Rows:
-        """Predictions after each row ``(tick, number)``, from a reset."""
+        """Return the predictions after each row ``(tick, number)``, from a reset."""
         fmu, put, take, step_s, predictions = self.fmu, self.put, self.take, self.step_s, []
         fmu.reset()
         if self.version == 2:
@@ -60,7 +60,7 @@ class Slave:
         return np.array(predictions, dtype=np.float32)
 
     def close(self) -> None:
-        """Free the instance and its library."""
+        """Unload the instance and its library."""
         self.fmu.freeInstance()
 
 

@@ -32,5 +32,5 @@ class TorchTicks:
 
 
 def _numbers(tick: StreamTick) -> Rows:
-    """Predictions, then lower and upper bounds, in the order of `edp.export.golden.stream`."""
+    """Return the predictions, then lower and upper bounds, in the order of `edp.export.golden.stream`."""
     return np.concatenate([tick.prediction.ravel(), tick.lower.ravel(), tick.upper.ravel()])

@@ -112,7 +112,7 @@ def _prepare(context: SearchContext, quest: Quest, trial: Trial) -> Trial:
 
 
 def _goes_on(context: SearchContext, study: Study, trial: Trial, stop: int) -> bool:
-    """Whether a trial is trained beyond a rung: it ended well there, and is not hopeless."""
+    """Return whether a trial is trained beyond a rung: it ended well there, and is not hopeless."""
     score = trial.mean(context.spec.horizon)
     if score is None:
         return False

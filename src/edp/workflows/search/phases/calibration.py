@@ -139,7 +139,7 @@ def _quest(context: SearchContext, backbone: str, arm: Arm, space: Space) -> Que
 
 
 def _final(context: SearchContext, backbones: list[str], outcomes: Sequence[Outcome]) -> FinalRound:
-    """Mean score of each backbone over the folds, and the lowest against each of the others."""
+    """Return the mean score of each backbone over the folds, and the lowest against each of the others."""
     mask = context.folds(context.spec.folds)
     parts = np.split(np.arange(len(outcomes)), len(backbones))
     raw = np.stack([context.table([outcomes[index] for index in part]) for part in parts])

@@ -32,7 +32,7 @@ class CompressionPhase:
     title = NAME
 
     def trainings(self, context: SearchContext) -> int:
-        """Teacher, at most three networks a width, and teacher and choice once more on the second test set."""
+        """Return teacher, at most three networks a width, and teacher and choice once more on the second test set."""
         spec = context.spec.compression
         if not spec.on:
             return 0

@@ -54,7 +54,7 @@ class Confirmation:
 
 
 def _sound(context: SearchContext, passed: list[str], arms: list[Arm]) -> Course:
-    """One interim analysis after the other; a dropped module is not trained any more."""
+    """Return one interim analysis after the other; a dropped module is not trained any more."""
     runs = context.facts(PlanningFacts).runs
     interim_analyses = tuple(analysis for analysis in INTERIM_ANALYSES if analysis.runs < runs)
     mask = context.folds(runs)
@@ -113,7 +113,7 @@ def _thesis(context: SearchContext, passed: list[str], arms: list[Arm]) -> Cours
 
 
 def _collect_scores(context: SearchContext, outcomes: Sequence[Outcome], arms: int, seeds: int, runs: int) -> Array:
-    """``(metric, arm, split, seed)``; a failed training has the worst of its metric."""
+    """Return ``(metric, arm, split, seed)``; a failed training has the worst of its metric."""
     rows = [[outcome.mean(context.spec.horizon, metric) for outcome in outcomes] for metric in METRICS]
     scores = np.array(rows).reshape(len(METRICS), arms, seeds, runs).swapaxes(2, 3)
     for own in scores:

@@ -47,15 +47,15 @@ class Isolation:
     title = "isolation and variance"
 
     def arms(self, context: SearchContext) -> list[tuple[str, str]]:
-        """Backbone and feature set of each arm."""
+        """Return the backbone and feature set of each arm."""
         return [(backbone, features) for backbone in context.spec.backbones for features in context.spec.feature_sets]
 
     def trainings(self, context: SearchContext) -> int:
-        """All of them at once."""
+        """Return all of them at once."""
         return len(self.arms(context)) * context.spec.isolation.runs * context.spec.isolation.seeds
 
     def run(self, context: SearchContext) -> Course:
-        """All arms on the same folds with the same seeds, in one batch."""
+        """Return all arms on the same folds with the same seeds, in one batch."""
         spec = context.spec
         outcomes = yield [
             order
@@ -70,7 +70,7 @@ class Isolation:
         return self.decide(context, outcomes)
 
     def decide(self, context: SearchContext, outcomes: Sequence[Outcome]) -> Decision:
-        """Variance components of each arm; the feature set with the lowest mean score over all backbones."""
+        """Return the variance components of each arm; the feature set with the lowest mean score over all backbones."""
         spec, arms = context.spec, self.arms(context)
         tables = _tables(context, outcomes, len(arms))
         errors = _tables(context, outcomes, len(arms), "mae")
@@ -156,7 +156,7 @@ def lowest_against_others(tables: Mapping[str, Array], mask: NDArray[np.bool_]) 
 
 
 def _tables(context: SearchContext, outcomes: Sequence[Outcome], arms: int, name: str = "composite") -> list[Array]:
-    """Scores of each arm ``(seed, run, session)``; failed trainings count as the worst of all arms."""
+    """Return the scores of each arm ``(seed, run, session)``; failed trainings count as the worst of all arms."""
     spec = context.spec
     size = spec.isolation.runs
     mask, seen = _mask_sessions(context)

@@ -87,7 +87,7 @@ def winner_of(context: SearchContext, name: str, modules: Sequence[str], trials:
 
 
 def _inside(window: Space, values: Candidate) -> dict[str, Value]:
-    """Values of the window's dimensions, brought into it."""
+    """Return the values of the window's dimensions, brought into it."""
     # Values from outside of the window would be refused as a warm start.
     clipped: dict[str, Value] = {}
     for name, dimension in window.items():

@@ -37,7 +37,7 @@ class ModuleScreening:
         return max(spec.screening.runs, least_runs(len(spec.modules or MODULES))) * spec.screening.repeats
 
     def run(self, context: SearchContext) -> Course:
-        """Trainings of the mode, and what passes."""
+        """Return the trainings of the mode, and what passes."""
         return (yield from (_thesis(context) if context.spec.mode == "thesis" else _sound(context)))
 
 
@@ -79,7 +79,7 @@ def _sound(context: SearchContext) -> Course:
 
 
 def _draw_values(context: SearchContext, window: Space, count: int) -> list[dict[str, float]]:
-    """Values inside the window by chance, so that effects are averages over it."""
+    """Return the values inside the window by chance, so that effects are averages over it."""
     rng = np.random.default_rng(context.seed("screening"))
     candidates = []
     for _ in range(count):

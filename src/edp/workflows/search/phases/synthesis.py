@@ -92,7 +92,7 @@ def final_orders(context: SearchContext, arm: Arm) -> list[TrainingRequest]:
 def judged(
     context: SearchContext, arms: Sequence[str], outcomes: Sequence[Outcome]
 ) -> dict[str, dict[str, float | None]]:
-    """Means over seeds of each score on the test sessions, by arm; None where a training did not end well."""
+    """Return means over seeds of each score on the test sessions, by arm; None where a training did not end well."""
     seeds = context.spec.run_seeds
     arm_scores: dict[str, dict[str, float | None]] = {}
     for index, arm in enumerate(arms):
