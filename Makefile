@@ -12,7 +12,7 @@ INSTALL := pip install --quiet --no-deps
 BENCHMARKS = $(shell grep -l '^@benchmark' benchmarks/*.py)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup lock demo docs check test test-slow lint bench system-packages clean
+.PHONY: help setup lock demo docs english reading-test docs-test check test test-slow lint bench system-packages clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-16s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -58,7 +58,16 @@ docs: $(READY) .venv-docs/.ready ## the documentation site in site/, offline; wi
 	.venv-docs/bin/python -m $(INSTALL) --require-hashes -r requirements-docs.lock
 	@touch $@
 
-check: lint ## lint, contracts and unit tests that start no process and train for no seconds
+english: $(READY) ## the language: constructions and names that the style guide excludes, against tests/language/allowed.toml
+	$(BIN)/python tests/language/english.py
+
+reading-test: $(READY) ## samples for a reader without the repository in build/reading/SEED; SEED=1
+	$(BIN)/python tests/language/reading_test.py --seed $(or $(SEED),0)
+
+docs-test: $(READY) ## every code block, command line, link, figure and length of the documentation
+	$(BIN)/python -m pytest $(SIDE_BY_SIDE) tests/site tests/examples tests/unit/test_language.py
+
+check: lint english ## lint, language, contracts and unit tests that start no process and train for no seconds
 	$(BIN)/python -m pytest $(SIDE_BY_SIDE) --no-processes tests/contracts tests/unit
 
 test: $(READY) ## the fast tests

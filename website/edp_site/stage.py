@@ -9,7 +9,18 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from edp_site import commands, formats, gallery, markdown, notebooks, parts, python_api, repository_files, results
+from edp_site import (
+    commands,
+    errors,
+    formats,
+    gallery,
+    markdown,
+    notebooks,
+    parts,
+    python_api,
+    repository_files,
+    results,
+)
 
 ROOT = Path(__file__).parents[2]
 _PROJECT_PAGES = {
@@ -63,6 +74,7 @@ def _made(root: Path) -> dict[str, Callable[[], str]]:
         "reference/commands.md": commands.commands_page,
         "reference/python.md": python_api.python_page,
         "reference/parts.md": parts.parts_page,
+        "reference/errors.md": errors.errors_page,
         "reference/formats.md": formats.formats_page,
         "reference/c.md": formats.c_page,
         "leaderboard.md": lambda: results.results_page(

@@ -21,6 +21,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, Tas
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from edp.cli.error_index import identify
 from edp.cli.options import check_belonging, setting_of
 from edp.cli.process import exit_code_of_stop, memory_message, out_of_memory
 from edp.errors import ConfigError, EdpError
@@ -335,7 +336,8 @@ def run_app(app: typer.Typer | Callable[..., Any]) -> int:
         if code == INTERRUPTED:
             raise KeyboardInterrupt
     except EdpError as error:
-        _say_error(str(error))
+        identifier = identify(error)
+        _say_error(f"{error} [{identifier}]" if identifier else str(error))
         return error.exit_code
     except typer.Exit as done:
         return done.exit_code
