@@ -16,7 +16,7 @@ import yaml
 
 import edp
 import edp_site.commands as site_commands
-from edp_site import figures, markdown, notebooks, parts, python_api, result_files, results, settings_keys
+from edp_site import diagrams, markdown, notebooks, parts, python_api, result_files, results, settings_keys
 from edp_site.built import problems_of, seal
 from edp_site.links import broken_links
 from edp_site.stage import builder_settings, stage
@@ -93,11 +93,13 @@ def test_entries_of_pages_that_are_not_there_are_left_out(tmp_path):
 
 def test_a_menu_entry_with_a_star_lists_the_other_pages_of_its_folder(tmp_path):
     (tmp_path / "howto").mkdir()
-    for name in ("first", "b", "a"):
+    for name in ("first", "a", "index"):
         (tmp_path / "howto" / f"{name}.md").write_text("# A", encoding="utf-8")
-    (tmp_path / "mkdocs.yml").write_text("nav:\n  - First: howto/first.md\n  - How-to: howto/*.md\n", encoding="utf-8")
+    given = "nav:\n  - First: howto/first.md\n  - How-to: howto/*.md\n  - howto/*.md\n  - Missing: other/*.md\n"
+    (tmp_path / "mkdocs.yml").write_text(given, encoding="utf-8")
     text = builder_settings(tmp_path / "mkdocs.yml", tmp_path)
-    assert text == "nav:\n  - First: howto/first.md\n  - How-to:\n      - howto/a.md\n      - howto/b.md\n"
+    group = "  - How-to:\n      - howto/index.md\n      - howto/a.md\n"
+    assert text == f"nav:\n  - First: howto/first.md\n{group}  - howto/index.md\n  - howto/a.md\n"
 
 
 def test_every_public_name_is_in_the_reference_with_its_members_and_a_text(staged):
@@ -133,10 +135,10 @@ def test_faults_controllers_machines_and_soils_are_in_the_reference(staged):
         assert f"\n| `{name}` |" in text
 
 
-def test_the_figures_are_those_that_the_script_draws():
-    for name, draw in figures.FIGURES.items():
+def test_the_diagrams_are_those_that_the_script_draws():
+    for name, draw in diagrams.FIGURES.items():
         shown = (ROOT / "docs" / "images" / f"{name}.svg").read_text(encoding="utf-8")
-        assert shown == draw(), f"{name}: PYTHONPATH=website python -m edp_site.figures"
+        assert shown == draw(), f"{name}: PYTHONPATH=website python -m edp_site.diagrams"
 
 
 def test_every_command_and_option_is_in_the_reference(staged):

@@ -105,17 +105,19 @@ def decisions_page(folder: Path) -> str:
 def builder_settings(path: Path, pages: Path) -> str:
     """Return the settings of the builder for a folder of pages.
 
-    Menu entries of missing pages are omitted. An entry such as ``- How-to: howto/*.md`` becomes a group of all pages of
-    that folder which have no entry of their own.
+    Menu entries of missing pages are omitted. ``- How-to: howto/*.md`` becomes a group of the pages of that folder
+    without an entry of their own, ``- howto/*.md`` becomes their entries.
     """
     text = path.read_text(encoding="utf-8")
     lines = []
     for line in text.splitlines():
         entry = re.fullmatch(r"(\s+)- (?:(.+): )?([\w./*-]+\.md)", line)
         if entry and "*" in entry[3]:
-            names = sorted(place.relative_to(pages).as_posix() for place in pages.glob(entry[3]))
-            lines.append(f"{entry[1]}- {entry[2]}:")
-            lines += [f"{entry[1]}    - {name}" for name in names if name not in text]
+            names = [page.relative_to(pages).as_posix() for page in pages.glob(entry[3])]
+            names = sorted((name for name in names if name not in text), key=lambda name: ("/index." not in name, name))
+            indent = entry[1] + 4 * " " if entry[2] else entry[1]
+            lines += [f"{entry[1]}- {entry[2]}:"] if entry[2] and names else []
+            lines += [f"{indent}- {name}" for name in names]
             continue
         if entry and not (pages / entry[3]).exists():
             continue

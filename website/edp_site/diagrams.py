@@ -1,4 +1,7 @@
-"""Figures of the explanation pages: block diagrams, and charts of the kept benchmark results, as SVG files."""
+"""Figures of the explanation pages: block diagrams, and charts of the kept benchmark results, as SVG files.
+
+``python -m edp_site.diagrams`` writes them to ``docs/images``.
+"""
 
 from __future__ import annotations
 
@@ -124,7 +127,7 @@ def which_model() -> str:
         ("green", "Twin, grey box", "simulation, physical parameters", "plant model, datasheet, other machine"),
         ("violet", "Monitor", "alarms with cause", "condition monitoring, guard of a controller"),
     )
-    drawing = Drawing("Four kinds of models, what each one returns, and its typical use", 860, 290)
+    drawing = Drawing("Four kinds of models, their outputs and typical uses", 860, 290)
     drawing.box(Box(15, 105, 150, 80, "blue", ("Recordings", "channels at one", "rate, SI units")))
     for number, (colour, name, returned, use) in enumerate(rows):
         y = 20 + 65 * number
