@@ -67,10 +67,16 @@ def _title(place: str, registry: Registry[Any]) -> str:
 def _table(registry: Registry[Any]) -> list[str]:
     rows = ["| Name | Options and their defaults | What it is |", "|---|---|---|"]
     texts = {name: first_sentence(part) for name, part in registry.items()}
-    common = {text for text in texts.values() if list(texts.values()).count(text) > 1}  # of a class that all share
     for name, part in registry.items():
-        rows.append(f"| `{name}` | {options(part)} | {'' if texts[name] in common else _cell(texts[name])} |")
+        is_shared = list(texts.values()).count(texts[name]) > 1  # the text of a class of several parts
+        rows.append(f"| `{name}` | {options(part)} | {_cell(_own_text(part) if is_shared else texts[name])} |")
     return rows
+
+
+def _own_text(part: Any) -> str:
+    """Return the text that a part has as an attribute; empty without such an attribute."""
+    texts = [getattr(part, name, "") for name in ("title", "text", "label", "content")]
+    return next((text for text in texts if isinstance(text, str) and text), "")
 
 
 def _fault_table(registry: Registry[Any]) -> list[str]:
