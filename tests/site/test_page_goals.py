@@ -39,7 +39,7 @@ def _part_of(page: Path) -> str:
 
 
 NEW = [page for page in hand_written() if page.stem not in OLD_PAGES or page.parent != ROOT / "docs"]
-NOTEBOOKS = sorted((ROOT / "examples" / "notebooks").glob("*.ipynb"))
+NOTEBOOKS = sorted([*ROOT.glob("docs/tutorials/*.ipynb"), *ROOT.glob("examples/notebooks/*.ipynb")])
 
 
 def words_of(text: str) -> int:
