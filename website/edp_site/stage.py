@@ -1,4 +1,4 @@
-"""Lays out what the builder of the site reads: hand-written pages, pages made from the code, and files they link to."""
+"""Input of the site builder: hand-written pages, generated pages, and the files that the pages link to."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ _PROJECT_PAGES = {
     "CHANGELOG.md": "project/changelog.md",
     "SECURITY.md": "project/security.md",
 }
-"""Pages beside docs/ by their place on the site."""
+"""Pages outside of docs/ and their place on the site."""
 _OUTSIDE = ("http://", "https://", "mailto:", "data:", "#")
 _FOLDERS_SHOWN = ("examples",)
-"""Folders whose files get a page each where the folder itself is linked to."""
+"""Folders for which a link to the folder shows a page for each file."""
 
 
 def stage(out: Path, demo: Path | None = None, root: Path = ROOT, version: str | None = None) -> list[Path]:
@@ -127,14 +127,14 @@ def builder_settings(path: Path, pages: Path) -> str:
 
 
 class _Copier:
-    """Copies hand-written pages, and whatever in the repository they link to, with links that hold on the site."""
+    """Copy of the hand-written pages and of the files that they link to, with the links of the site."""
 
     def __init__(self, root: Path, pages: Path) -> None:
         self.root, self.pages = root.resolve(), pages
         self.shown: set[Path] = set()
 
     def copy(self, made: dict[str, Callable[[], str]]) -> None:
-        """Write all pages of docs/ and of the project, each followed by what is generated for its place.
+        """Write all pages of docs/ and of the project, followed by the generated content for their place.
 
         Args:
             made: function that generates a page, by place.
@@ -152,7 +152,7 @@ class _Copier:
                 _write(self.pages / name, make())
 
     def _moved(self, source: Path, place: Path, target: str) -> str:
-        """A link of `source`, which goes to `place`, as it must read there."""
+        """Return a link of `source` as it must be in a page at `place`."""
         name, hash_sign, anchor = target.partition("#")
         linked = (source.parent / name).resolve()
         if not name or not linked.exists() or not linked.is_relative_to(self.root):
@@ -171,7 +171,7 @@ class _Copier:
         return self._show(linked)
 
     def _show(self, linked: Path) -> Path:
-        """The page that shows a file or lists a folder of the repository; written the first time."""
+        """Return the page that shows a file or lists a folder of the repository; write it at the first call."""
         name = linked.relative_to(self.root)
         if linked.is_dir():
             place = Path("files") / name / "index.md"
@@ -187,7 +187,7 @@ class _Copier:
         return place
 
     def _within(self, folder: Path) -> dict[str, str]:
-        """Pages of the files of a folder by name, as links from the folder's page."""
+        """Return the pages of the files of a folder by name, as links from the page of the folder."""
         if folder.relative_to(self.root).parts[0] not in _FOLDERS_SHOWN:
             return {}
         files = sorted(path for path in folder.iterdir() if path.is_file() and path.suffix in (".toml", ".py"))
@@ -195,7 +195,7 @@ class _Copier:
 
 
 def _write(path: Path, text: str) -> None:
-    """A page, whose headings get the anchors that they have on GitHub, where the builder would make others."""
+    """Write a page. Its headings get the anchors of GitHub, since the builder has other rules."""
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = text.splitlines()
     for heading in markdown.headings(text):
