@@ -123,6 +123,10 @@ def monitor(folder: Path, request: pytest.FixtureRequest) -> Names:
     return {"recording": replace(named[0], values=values)}
 
 
+def which_model(folder: Path, request: pytest.FixtureRequest) -> Names:
+    return twin(folder, request)
+
+
 def exported(folder: Path, target: str) -> edp.Model:
     model = trained(folder / "runs" / "first")
     model.export(target, folder / "exported")
@@ -200,6 +204,7 @@ GROUNDS: Mapping[str, Ground] = {
     part.__name__: part
     for part in (
         adaptation, compress, howto_watch, monitor, mpc, onnx, recordings, screening, store, tutorial, twin,
+        which_model,
     )
 }  # fmt: skip
 """By the stem of the page."""

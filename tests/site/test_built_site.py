@@ -18,7 +18,17 @@ ROOT = Path(__file__).parents[2]
 BUILDER = ROOT / ".venv-docs" / "bin" / "zensical"
 NOTEBOOKS = sorted((ROOT / "examples" / "notebooks").glob("*.ipynb"))
 MOST_BYTES = 100_000
-VISITED = ("index", "tutorial", "howto", "concepts", "faq", "settings", "leaderboard", "reference/commands", "gallery")
+VISITED = (
+    "index",
+    "tutorial",
+    "howto",
+    "explanation/which_model",
+    "faq",
+    "settings",
+    "leaderboard",
+    "reference/commands",
+    "gallery",
+)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +75,7 @@ def test_pages_are_accessible_load_nothing_from_elsewhere_and_fit_the_window(sit
 @pytest.mark.slow
 def test_the_search_finds_a_page_and_loads_nothing_from_elsewhere(site, axe):
     (visit,) = browser.visit(site, ["index.html"], axe, words="feedback port")
-    assert any("twin.html" in link for link in visit.words)
+    assert any("which_model.html" in link for link in visit.words)
     assert visit.elsewhere == []
 
 
@@ -77,7 +87,7 @@ def test_the_search_works_from_files_too(site):
     script = browser.SEARCH + "search('feedback port')"
     with opened(executable) as page:
         page.open(site / "index.html")
-        assert any("twin.html" in link for link in page.run(script))
+        assert any("which_model.html" in link for link in page.run(script))
         assert page.complaints() == []
         assert page.requests() == []
 

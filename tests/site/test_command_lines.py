@@ -24,7 +24,7 @@ from edp_site import markdown
 
 ROOT = Path(__file__).parents[2]
 HISTORY = ("CHANGELOG.md", "findings.md")
-FOLDERS = (ROOT, ROOT / "docs", ROOT / "website" / "pages")
+FOLDERS = (ROOT, *(ROOT / "docs" / name for name in ("", "explanation", "reference")), ROOT / "website" / "pages")
 PAGES = [page for folder in FOLDERS for page in sorted(folder.glob("*.md")) if page.name not in HISTORY]
 LEFT_OUT = {
     "edp live runs/m22 --ros2": "needs ROS 2; tests/unit/live/test_live_sources.py has a stand-in",
@@ -62,7 +62,6 @@ SHELL_LEFT_OUT = {
     "export": "names its keys",
     "colcon": "needs ROS 2",
     "ros2": "needs ROS 2",
-    "for": "loads this machine for minutes",
 }
 """First words of lines of other programs that are not run, and why; targets of make: tests/unit/test_code_blocks.py."""
 LIVE_S = 240.0

@@ -1,4 +1,4 @@
-"""Links and anchors of Markdown pages: where each leads, and which lead nowhere."""
+"""Check of the links and anchors of Markdown pages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _OUTSIDE = ("http://", "https://", "mailto:", "data:")
 
 
 def broken_links(pages: Iterable[Path], root: Path) -> list[str]:
-    """Links to files, folders or anchors that do not exist; links out of the repository are refused, too.
+    """Return the links to missing files, folders or anchors, and the links out of the repository.
 
     Args:
         pages: Markdown files.
@@ -32,7 +32,7 @@ def broken_links(pages: Iterable[Path], root: Path) -> list[str]:
 
 
 def _reason(page: Path, target: str, root: Path) -> str:
-    """Why a link leads nowhere; empty where it leads somewhere."""
+    """Return why a link is broken; empty for a valid link."""
     name, _, anchor = target.partition("#")
     place = (page.parent / name).resolve() if name else page.resolve()
     if not place.is_relative_to(root.resolve()):

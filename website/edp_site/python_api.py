@@ -1,4 +1,4 @@
-"""The reference of the Python interface: every public name with its signature and docstring."""
+"""Reference of the Python interface: every public name with its signature and docstring."""
 
 from __future__ import annotations
 
@@ -9,33 +9,34 @@ from types import ModuleType
 from typing import Any
 
 import edp
+from edp_site import markdown
+from edp_site.parts import first_sentence
 
 _SECTION = re.compile(r"^(Args|Attributes|Returns|Yields|Raises|Example|Note):\s*$")
 _ENTRY = re.compile(r"^(\*{0,2}[\w`., |*]+?)(?: \([^)]*\))?: (.*)$")
 _WIDTH = 88
-"""A signature that is longer gets a line for each parameter."""
+"""Maximum width of a signature in one line; a longer signature gets a line for each parameter."""
 
 
 def python_page() -> str:
-    """Every name of ``edp.__all__`` and the public members of its classes."""
-    parts = [
-        "# Python",
-        "",
-        "Made from the code. [EDP from Python](../python.md) shows how the names go together; its examples are run by "
-        "a test. Names that are not on this page are private and may move.",
-    ]
-    for name in sorted(public_names(), key=lambda name: (name.lower(), name)):
-        parts += ["", *_entry(f"edp.{name}", getattr(edp, name), 2)]
-    return "\n".join(parts) + "\n"
+    """Describe every name of ``edp.__all__`` and the public members of its classes, below an overview."""
+    names = sorted(public_names(), key=lambda name: (name.lower(), name))
+    lines = ["## Public names", "", "| Name | What it is |", "|---|---|"]
+    for name in names:
+        text = first_sentence(getattr(edp, name)) if name != "__version__" else "Version of the package."
+        lines.append(f"| [`edp.{name}`](#{markdown.anchor_of(f'edp.{name}')}) | {text} |")
+    for name in names:
+        lines += ["", *_entry(f"edp.{name}", getattr(edp, name), 2)]
+    return "\n".join(lines) + "\n"
 
 
 def public_names() -> tuple[str, ...]:
-    """The names of ``edp.__all__``."""
+    """Return the names of ``edp.__all__``."""
     return tuple(vars(edp)["__all__"])
 
 
 def members(cls: type) -> Iterator[tuple[str, Any]]:
-    """Public methods and properties of a class, those of its bases in this package included."""
+    """Yield the public methods and properties of a class and of its base classes in this package."""
     shown: dict[str, Any] = {}
     for owner in cls.__mro__:
         if owner.__module__.partition(".")[0] == "edp":
@@ -56,7 +57,7 @@ def _entry(name: str, value: Any, depth: int) -> list[str]:
             lines += ["", *_entry(f"{name}.{inner}", getattr(value, inner), depth + 1)]
         return lines
     if isinstance(value, str):
-        return [*lines, f"Version of the package, a text; this page is of `{value}`."]
+        return [*lines, f"Version of the package as text; this page describes `{value}`."]
     if inspect.isclass(value):
         if not issubclass(value, BaseException):
             lines += _signature(name, value)
@@ -115,7 +116,7 @@ def _default(value: Any) -> str:
 
 
 def described(value: Any) -> list[str]:
-    """A docstring in Google's form as Markdown: sections become lists."""
+    """Return a docstring in Google style as Markdown, with lists for its sections."""
     text = inspect.getdoc(value) or ""
     lines: list[str] = []
     section = ""
@@ -136,7 +137,7 @@ def described(value: Any) -> list[str]:
 
 
 def _joined(lines: list[str]) -> list[str]:
-    """Entries of a ``Returns`` section that go on over lines are one entry."""
+    """Return the lines with each entry of a ``Returns`` section joined to one list entry."""
     result: list[str] = []
     returns = False
     for line in lines:

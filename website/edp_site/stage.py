@@ -1,4 +1,4 @@
-"""Lays out what the builder of the site reads: hand-written pages, pages made from the code, and files they link to."""
+"""Input of the site builder: hand-written pages, generated pages, and the files that the pages link to."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from edp_site import (
     parts,
     python_api,
     repository_files,
+    result_files,
     results,
 )
 
@@ -29,10 +30,10 @@ _PROJECT_PAGES = {
     "CHANGELOG.md": "project/changelog.md",
     "SECURITY.md": "project/security.md",
 }
-"""Pages beside docs/ by their place on the site."""
+"""Pages outside of docs/ and their place on the site."""
 _OUTSIDE = ("http://", "https://", "mailto:", "data:", "#")
 _FOLDERS_SHOWN = ("examples",)
-"""Folders whose files get a page each where the folder itself is linked to."""
+"""Folders for which a link to the folder shows a page for each file."""
 
 
 def stage(out: Path, demo: Path | None = None, root: Path = ROOT, version: str | None = None) -> list[Path]:
@@ -52,8 +53,6 @@ def stage(out: Path, demo: Path | None = None, root: Path = ROOT, version: str |
     pages.mkdir(parents=True)
     for path in sorted((root / "website" / "pages").glob("*.md")):
         _write(pages / path.name, path.read_text(encoding="utf-8"))
-    for name, make in _made(root).items():
-        _write(pages / name, make())
     gallery.write_gallery(pages, demo)
     for path in sorted((root / "examples" / "notebooks").glob("*.ipynb")):
         folder = pages / "notebooks"
@@ -64,18 +63,20 @@ def stage(out: Path, demo: Path | None = None, root: Path = ROOT, version: str |
         script = pages / "theme" / "site.js"
         text = script.read_text(encoding="utf-8")
         script.write_text(f"window.edpVersion = {json.dumps(version)};\n{text}", encoding="utf-8")
-    _Copier(root, pages).copy()
+    _Copier(root, pages).copy(_made(root))
     (out / "mkdocs.yml").write_text(builder_settings(root / "mkdocs.yml", pages), encoding="utf-8")
     return sorted(pages.rglob("*.md"))
 
 
 def _made(root: Path) -> dict[str, Callable[[], str]]:
+    """Return the function for each generated page; a page of docs/ with the same place is its introduction."""
     return {
         "reference/commands.md": commands.commands_page,
         "reference/python.md": python_api.python_page,
         "reference/parts.md": parts.parts_page,
         "reference/errors.md": errors.errors_page,
         "reference/formats.md": formats.formats_page,
+        "reference/files.md": result_files.files_page,
         "reference/c.md": formats.c_page,
         "leaderboard.md": lambda: results.results_page(
             root / "benchmarks" / "results",
@@ -104,11 +105,23 @@ def decisions_page(folder: Path) -> str:
 
 
 def builder_settings(path: Path, pages: Path) -> str:
-    """The settings of the builder for pages that lie beside them; entries of pages that are not there are left out."""
+    """Return the settings of the builder for a folder of pages.
+
+    Menu entries of missing pages are omitted. ``- How-to: howto/*.md`` becomes a group of the pages of that folder
+    without an entry of their own, ``- howto/*.md`` becomes their entries.
+    """
+    text = path.read_text(encoding="utf-8")
     lines = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        entry = re.fullmatch(r"\s+- (?:.+: )?([\w./-]+\.md)", line)
-        if entry and not (pages / entry[1]).exists():
+    for line in text.splitlines():
+        entry = re.fullmatch(r"(\s+)- (?:(.+): )?([\w./*-]+\.md)", line)
+        if entry and "*" in entry[3]:
+            names = [page.relative_to(pages).as_posix() for page in pages.glob(entry[3])]
+            names = sorted((name for name in names if name not in text), key=lambda name: ("/index." not in name, name))
+            indent = entry[1] + 4 * " " if entry[2] else entry[1]
+            lines += [f"{entry[1]}- {entry[2]}:"] if entry[2] and names else []
+            lines += [f"{indent}- {name}" for name in names]
+            continue
+        if entry and not (pages / entry[3]).exists():
             continue
         line = re.sub(r"^docs_dir:.*", "docs_dir: pages", line)
         lines.append(re.sub(r"^site_dir:.*", "site_dir: site", line))
@@ -116,24 +129,32 @@ def builder_settings(path: Path, pages: Path) -> str:
 
 
 class _Copier:
-    """Copies hand-written pages, and whatever in the repository they link to, with links that hold on the site."""
+    """Copy of the hand-written pages and of the files that they link to, with the links of the site."""
 
     def __init__(self, root: Path, pages: Path) -> None:
         self.root, self.pages = root.resolve(), pages
         self.shown: set[Path] = set()
 
-    def copy(self) -> None:
-        """All pages of docs/ and of the project."""
+    def copy(self, made: dict[str, Callable[[], str]]) -> None:
+        """Write all pages of docs/ and of the project, followed by the generated content for their place.
+
+        Args:
+            made: function that generates a page, by place.
+        """
         sources = {path: Path(*path.relative_to(self.root / "docs").parts) for path in self.root.glob("docs/**/*.md")}
         sources |= {self.root / name: Path(place) for name, place in _PROJECT_PAGES.items()}
         for source, place in sources.items():
             text = source.read_text(encoding="utf-8")
             targets = {link.target for link in markdown.links(text) if not link.target.startswith(_OUTSIDE)}
             moved = {target: self._moved(source, place, target) for target in targets}
-            _write(self.pages / place, markdown.with_links(text, moved))
+            generated = made.get(place.as_posix())
+            _write(self.pages / place, markdown.with_links(text, moved) + (f"\n{generated()}" if generated else ""))
+        for name, make in made.items():
+            if Path(name) not in sources.values():
+                _write(self.pages / name, make())
 
     def _moved(self, source: Path, place: Path, target: str) -> str:
-        """A link of `source`, which goes to `place`, as it must read there."""
+        """Return a link of `source` as it must be in a page at `place`."""
         name, hash_sign, anchor = target.partition("#")
         linked = (source.parent / name).resolve()
         if not name or not linked.exists() or not linked.is_relative_to(self.root):
@@ -152,7 +173,7 @@ class _Copier:
         return self._show(linked)
 
     def _show(self, linked: Path) -> Path:
-        """The page that shows a file or lists a folder of the repository; written the first time."""
+        """Return the page that shows a file or lists a folder of the repository; write it at the first call."""
         name = linked.relative_to(self.root)
         if linked.is_dir():
             place = Path("files") / name / "index.md"
@@ -168,7 +189,7 @@ class _Copier:
         return place
 
     def _within(self, folder: Path) -> dict[str, str]:
-        """Pages of the files of a folder by name, as links from the folder's page."""
+        """Return the pages of the files of a folder by name, as links from the page of the folder."""
         if folder.relative_to(self.root).parts[0] not in _FOLDERS_SHOWN:
             return {}
         files = sorted(path for path in folder.iterdir() if path.is_file() and path.suffix in (".toml", ".py"))
@@ -176,7 +197,7 @@ class _Copier:
 
 
 def _write(path: Path, text: str) -> None:
-    """A page, whose headings get the anchors that they have on GitHub, where the builder would make others."""
+    """Write a page. Its headings get the anchors of GitHub, since the builder has other rules."""
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = text.splitlines()
     for heading in markdown.headings(text):
