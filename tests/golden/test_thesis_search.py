@@ -216,7 +216,7 @@ def test_the_page_says_what_the_planner_counts():
     held = context()
     asked = [phase.trainings(held) for phase in PHASES.values()]
     assert (
-        f"{sum(asked):,}" in re.search(r"^\| `thesis` \|.*$", (DOC.parent / "search.md").read_text(), re.MULTILINE)[0]
+        f"{sum(asked):,}" in re.search(r"^\| `thesis` \|.*$", (DOC.parent / "howto" / "run_search.md").read_text(), re.MULTILINE)[0]
     )
     assert f"**{sum(asked):,} trainings**" in DOC.read_text()
 

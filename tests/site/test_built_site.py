@@ -16,8 +16,8 @@ from edp_site.stage import stage
 
 ROOT = Path(__file__).parents[2]
 BUILDER = ROOT / ".venv-docs" / "bin" / "zensical"
-NOTEBOOKS = sorted((ROOT / "examples" / "notebooks").glob("*.ipynb"))
-MOST_BYTES = 100_000
+NOTEBOOKS = sorted((ROOT / "docs" / "tutorials").glob("*.ipynb"))
+MOST_BYTES = 150_000
 VISITED = ("index", "tutorial", "howto", "concepts", "faq", "settings", "leaderboard", "reference/commands", "gallery")
 
 
@@ -36,7 +36,7 @@ def site(tmp_path_factory) -> Path:
 
 
 def pages_of(site: Path) -> list[str]:
-    return [f"{name}.html" for name in VISITED] + [f"notebooks/{path.stem}.html" for path in NOTEBOOKS[:1]]
+    return [f"{name}.html" for name in VISITED] + [f"tutorials/{path.stem}.html" for path in NOTEBOOKS[:1]]
 
 
 @pytest.fixture(scope="module")
