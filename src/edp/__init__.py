@@ -1,7 +1,7 @@
 """Excavator Dynamics Predictor: learn a deployable plant model of a hydraulic machine from recordings.
 
-The public names are imported when they are first asked for, so that ``import edp`` costs nothing; docs/python.md lists
-them. `__init__.pyi` states their types.
+The public names are imported when they are first asked for, so that ``import edp`` costs nothing.
+docs/reference/python.md describes them, `__init__.pyi` states their types.
 """
 
 from importlib import import_module

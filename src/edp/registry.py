@@ -1,4 +1,4 @@
-"""Named parts, and the plug-ins that add parts from packages of users (docs/plugins.md)."""
+"""Named parts, and the plug-ins that add parts from packages of users (docs/reference/parts.md)."""
 
 from __future__ import annotations
 

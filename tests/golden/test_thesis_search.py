@@ -26,7 +26,7 @@ from edp.workflows.search.space import Choice, Real, apply, elastic, halved
 from edp.workflows.search.trainings import SCORES, Outcome, costs_of
 
 PLAN = load_plan(None, "thesis")
-DOC = Path(__file__).parents[2] / "docs/thesis_preset.md"
+DOC = Path(__file__).parents[2] / "docs/explanation/thesis.md"
 SESSIONS = tuple(f"s{number:02d}" for number in range(31))
 
 
@@ -216,7 +216,8 @@ def test_the_page_says_what_the_planner_counts():
     held = context()
     asked = [phase.trainings(held) for phase in PHASES.values()]
     assert (
-        f"{sum(asked):,}" in re.search(r"^\| `thesis` \|.*$", (DOC.parent / "howto" / "run_search.md").read_text(), re.MULTILINE)[0]
+        f"{sum(asked):,}"
+        in re.search(r"^\| `thesis` \|.*$", (DOC.parents[1] / "howto" / "run_search.md").read_text(), re.MULTILINE)[0]
     )
     assert f"**{sum(asked):,} trainings**" in DOC.read_text()
 

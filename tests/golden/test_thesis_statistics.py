@@ -50,7 +50,7 @@ def test_printed_p(name, splits, p, d_z):
 
 
 def test_the_only_module_confirmed_at_one_sample_does_not_survive_the_adjustment():
-    # statistics.md, section 2.2: z 0.085 over the 13 modules that were tested at k = 1.
+    # design/statistics.md, section 2.2: z 0.085 over the 13 modules that were tested at k = 1.
     rows = [(name, float(printed_p(rows[0][1], 10))) for name, rows in TABLE_4_5.items() if rows[0] is not None]
     adjusted = dict(zip([name for name, _ in rows], benjamini_hochberg([p for _, p in rows])))
     assert len(rows) == 13

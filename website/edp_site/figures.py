@@ -1,302 +1,472 @@
-"""Figures of the how-to pages: drawn from simulated data, from kept results, or taken of pages that commands write.
-
-``python -m edp_site.figures [NAME...]`` writes them to ``docs/images``; pages are pictured by Chromium.
-"""
+"""Figures of the explanation pages: block diagrams, and charts of the kept benchmark results, as SVG files."""
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
-import shutil
-import subprocess
 import sys
-import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Sequence
+from html import escape
+from math import log10
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from matplotlib import pyplot as plt
-
-from edp_site.notebooks import run_line
+from typing import Any, NamedTuple
 
 ROOT = Path(__file__).parents[2]
-IMAGES = ROOT / "docs" / "images"
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-LABELS = {"nmpc": "predictive control", "pi": "PI"}
-TRAINING = "--set training.epochs={epochs} --set training.updates=40"
-FIGURES: dict[str, Callable[[Path], None]] = {}
-"""Functions that draw a figure, by name; each runs in a folder with simulated logs in ``data`` and gets its path."""
+_STYLE = (
+    "text{font:13px system-ui,sans-serif;fill:#1c2333}.s{font-size:11.5px;fill:#3b4560}.b{font-weight:600}"
+    ".a,.l{fill:none;stroke:#3b4560;stroke-width:1.5}.a{marker-end:url(#m)}.g{stroke:#d5dae5;stroke-width:1}"
+)
+_MARKER = (
+    '<defs><marker id="m" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
+    '<path d="M0 0 8 4 0 8z" fill="#3b4560"/></marker></defs>'
+)
+_COLOURS = {
+    "blue": ("#e8eefc", "#3451a3"),
+    "green": ("#e6f4ea", "#2c6e3f"),
+    "orange": ("#fdf0e1", "#96530d"),
+    "violet": ("#f3e8fb", "#6a2f96"),
+    "grey": ("#f1f3f7", "#5a6478"),
+}
+"""Fill and edge by name."""
 
 
-def figure(draw: Callable[[Path], None]) -> Callable[[Path], None]:
-    """Register a function under its name."""
-    FIGURES[draw.__name__] = draw
-    return draw
+class Box(NamedTuple):
+    """A rectangle of a diagram: place and size, colour, a title and further lines."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+    colour: str
+    lines: tuple[str, ...]
 
 
-def save(path: Path) -> None:
-    """Write the current plot as a PNG."""
-    plt.savefig(path, dpi=90, bbox_inches="tight", metadata={"Software": None})
-    plt.close("all")
+class Drawing:
+    """An SVG picture.
 
-
-def picture(page: Path, path: Path, height: int = 900) -> None:
-    """Write the top of an HTML page as a PNG of 1,000 pixels width.
-
-    Raises:
-        RuntimeError: there is no Chromium.
+    Args:
+        title: text for readers who do not see the picture.
+        width: width in pixels.
+        height: height in pixels.
     """
-    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
-    if browser is None:
-        raise RuntimeError("the pictures of pages need Chromium: install it, or name other figures")
-    options = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--virtual-time-budget=8000"]
-    target = [f"--window-size=1000,{height}", f"--screenshot={path}", page.resolve().as_uri()]
-    subprocess.run([browser, *options, *target], check=True, capture_output=True, timeout=120)
+
+    def __init__(self, title: str, width: int, height: int) -> None:
+        self.parts = [
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" role="img">',
+            f"<title>{escape(title)}</title>",
+            f"<style>{_STYLE}</style>",
+            _MARKER,
+            f'<rect width="{width}" height="{height}" rx="8" fill="#ffffff"/>',
+        ]
+
+    def text(self, x: float, y: float, text: str, anchor: str = "middle", style: str = "") -> None:
+        """Add a line of text; `style` is a class of the style sheet."""
+        styled = f' class="{style}"' if style else ""
+        self.parts.append(f'<text x="{x:g}" y="{y:g}" text-anchor="{anchor}"{styled}>{escape(text)}</text>')
+
+    def box(self, box: Box) -> None:
+        """Add a box, its lines centred, the first one bold."""
+        fill, edge = _COLOURS[box.colour]
+        self.parts.append(
+            f'<rect x="{box.x:g}" y="{box.y:g}" width="{box.width:g}" height="{box.height:g}" rx="6" '
+            f'fill="{fill}" stroke="{edge}"/>'
+        )
+        top = box.y + box.height / 2 - 8 * (len(box.lines) - 1) + 4.5
+        for number, line in enumerate(box.lines):
+            self.text(box.x + box.width / 2, top + 16 * number, line, style="b" if number == 0 else "")
+
+    def arrow(self, *points: float) -> None:
+        """Add an arrow through points, given as x, y, x, y and so on."""
+        places = " L".join(f"{x:g} {y:g}" for x, y in zip(points[::2], points[1::2], strict=True))
+        self.parts.append(f'<path d="M{places}" class="a"/>')
+
+    def line(self, points: tuple[float, float, float, float], style: str = "l") -> None:
+        """Add a line from the first point to the second."""
+        x, y, to_x, to_y = points
+        self.parts.append(f'<path d="M{x:g} {y:g} L{to_x:g} {to_y:g}" class="{style}"/>')
+
+    def bar(self, x: float, y: float, width: float, colour: str) -> None:
+        """Add a horizontal bar of a chart, 16 pixels high."""
+        self.parts.append(
+            f'<rect x="{x:g}" y="{y:g}" width="{max(width, 1.0):.4g}" height="16" rx="2" fill="{_COLOURS[colour][1]}"/>'
+        )
+
+    def dot(self, x: float, y: float, colour: str) -> None:
+        """Add a point of a chart."""
+        self.parts.append(
+            f'<circle cx="{x:.5g}" cy="{y:.5g}" r="4.5" fill="{_COLOURS[colour][1]}" fill-opacity="0.75"/>'
+        )
+
+    def svg(self) -> str:
+        """Return the file."""
+        return "\n".join([*self.parts, "</svg>"]) + "\n"
 
 
-def details(name: str) -> Any:
+def _diagram(title: str, size: tuple[int, int], boxes: Iterable[Box], arrows: Iterable[Sequence[float]]) -> Drawing:
+    drawing = Drawing(title, *size)
+    for box in boxes:
+        drawing.box(box)
+    for points in arrows:
+        drawing.arrow(*points)
+    return drawing
+
+
+def _details(name: str) -> Any:
     """Return the details of a kept result."""
-    return json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text(encoding="utf-8"))["details"]
+    path = ROOT / "benchmarks" / "results" / f"{name}.json"
+    return json.loads(path.read_text(encoding="utf-8"))["details"]
 
 
-@figure
-def map_units(path: Path) -> None:
-    time_s = np.arange(0, 10, 0.01)
-    velocity = 0.12 * np.sin(1.3 * time_s) + 0.04 * np.sin(4.1 * time_s)
-    plt.figure(figsize=(7, 2.4))
-    plt.plot(time_s, velocity, label='unit = "mm/s": 0.16 m/s at most')
-    plt.plot(time_s, 10 * velocity, label='unit = "cm/s": 1.6 m/s, which no cylinder reaches', linewidth=1)
-    plt.xlabel("time, s")
-    plt.ylabel("velocity, m/s")
-    plt.legend(loc="upper right")
-    save(path)
-
-
-@figure
-def repair_gaps(path: Path) -> None:
-    from edp.logs import Repair, read_recording
-    from edp.signals import SignalMap
-
-    time_s = np.arange(0, 4, 0.01)
-    values = np.sin(3 * time_s)
-    there = (time_s < 1.5) | (time_s > 2.0)
-    np.savetxt("gap.csv", np.c_[time_s, values][there], delimiter=",", header="t,speed", comments="", fmt="%.4f")
-    everything = SignalMap(others=True, channels={})
-    plt.figure(figsize=(7, 2.2))
-    plt.plot(time_s, values, color="0.8", linewidth=4, label="what happened")
-    held = read_recording("gap.csv", everything, repair=Repair(gaps="hold"))
-    cut = read_recording("gap.csv", everything, repair=Repair(gaps="cut"))
-    plt.plot(np.arange(held.samples) / held.rate_hz, held.values[:, 0], label="gaps=hold", linewidth=1)
-    start = 2.01 if cut.samples > 160 else 0.0
-    plt.plot(start + np.arange(cut.samples) / cut.rate_hz, cut.values[:, 0], label="gaps=cut", linewidth=2, linestyle="--")
-    plt.xlabel("time, s")
-    plt.legend(loc="lower left")
-    save(path)
-
-
-@figure
-def screening(path: Path) -> None:
-    run_line("edp data screen data --out screen --targets CylVels_1 --horizon 10 --set screen.max_lag=60 --no-pictures")
-    picture(Path("screen/report.html"), path)
-
-
-@figure
-def coverage(path: Path) -> None:
-    run_line("edp data check data --page coverage.html")
-    picture(Path("coverage.html"), path)
-
-
-def train(name: str, epochs: int = 2, *more: str) -> Path:
-    """Train a small run of the preset quick, once."""
-    run = Path("runs") / name
-    if not run.exists():
-        line = f"edp train data --preset quick {TRAINING.format(epochs=epochs)} {' '.join(more)} --out {run}"
-        run_line(line)
-        run_line(f"edp evaluate {run} --baselines persistence,ridge_arx")
-    return run
-
-
-@figure
-def learning_curves(path: Path) -> None:
-    plt.figure(figsize=(7, 2.6))
-    for rate, says in (("6e-3", "the preset"), ("2e-4", "too small"), ("0.3", "too large")):
-        run = train(f"rate_{rate}", 6, f"--set training.optimizer.learning_rate={rate}")
-        lines = [json.loads(line) for line in (run / "history.jsonl").read_text(encoding="utf-8").splitlines()]
-        key = next(key for key in ("validation", "validation_mae", "score") if key in lines[0])
-        plt.plot([line["epoch"] for line in lines], [line[key] for line in lines], marker="o", label=f"{rate}, {says}")
-    plt.xlabel("epoch")
-    plt.ylabel("validation error")
-    plt.legend(title="learning rate", loc="upper left", bbox_to_anchor=(1.01, 1.0))
-    save(path)
-
-
-@figure
-def intervals(path: Path) -> None:
-    import edp
-
-    run = train("intervals", 6, "--set model.output.kind=quantiles --set training.loss.kind=quantile")
-    model, recording = edp.load(run), edp.read("data")[0]
-    predictions = model.predict(recording)
-    assert predictions.bounds is not None
-    lower, upper = predictions.bounds[0][:, 0, 0], predictions.bounds[0][:, 0, 1]
-    shown, time_s = slice(1000, 1600), np.arange(recording.samples) / recording.rate_hz
-    ahead = time_s[shown] + model.horizons[0] / recording.rate_hz
-    plt.figure(figsize=(7, 2.4))
-    plt.fill_between(ahead, lower[shown, 0, 0], upper[shown, 0, 0], alpha=0.3, label="90 % interval, 100 ms before")
-    plt.plot(time_s[shown], recording.column(model.targets[0])[shown], label="measured", linewidth=1)
-    plt.xlabel("time, s")
-    plt.ylabel("boom velocity, m/s")
-    plt.legend(loc="upper right")
-    save(path)
-
-
-@figure
-def compare(path: Path) -> None:
-    runs = [train("rate_6e-3", 6), train("units_16", 6, "--set model.backbone.units=16"), train("rate_2e-4", 6)]
-    run_line(f"edp compare {' '.join(map(str, runs))} --out compare.html")
-    picture(Path("compare.html"), path)
-
-
-@figure
-def footprint(path: Path) -> None:
-    run = train("rate_6e-3", 6)
-    parts = json.loads(run_line(f"edp compress estimate {run} --json"))["parts"]
-    shown = [part for part in parts if part["parameters"]]
-    plt.figure(figsize=(7, 2.2))
-    plt.barh([part["name"] for part in shown], [part["parameters"] for part in shown])
-    plt.xlabel("parameters")
-    save(path)
-
-
-@figure
-def adaptation(path: Path) -> None:
-    mae = details("adaptation")["mae"]
-    plt.figure(figsize=(7, 2.4))
-    for number, (name, label) in enumerate((("frozen", "network"), ("adapted", "network and adaptation"))):
-        plt.bar(np.arange(len(mae)) + 0.4 * number, [mae[one][name] for one in mae], 0.4, label=label)
-    plt.xticks(np.arange(len(mae)) + 0.2, list(mae))
-    plt.ylabel("MAE, mm/s")
-    plt.legend()
-    save(path)
-
-
-@figure
-def mpc_errors(path: Path) -> None:
-    network, grey = (details(f"closed_loop_{name}") for name in ("nmpc", "grey"))
-    bars = {
-        "PI": network["nmpc"]["loops"]["as it was"]["pi"],
-        "predictive control,\nrecurrent plant model": network["nmpc"]["loops"]["as it was"]["nmpc"],
-        "predictive control,\ngrey box": grey["grey"]["loops"]["as it was"]["nmpc"],
-    }
-    errors = {name: np.array(one["path_rms_mm"]) for name, one in bars.items()}
-    plt.figure(figsize=(7, 2.6))
-    for place, values in enumerate(errors.values()):
-        plt.scatter(np.full(len(values), place), values, s=14, alpha=0.6)
-        plt.hlines(values.mean(), place - 0.25, place + 0.25)
-    plt.yscale("log")
-    plt.xticks(range(len(errors)), list(errors))
-    plt.ylabel("path error, mm (rms)")
-    plt.title("Each point is one of 18 lines, the line is the mean")
-    save(path)
-
-
-@figure
-def calibration(path: Path) -> None:
-    machines = details("identify_short")
-    names = {"static map": "static map", "machine M22": "guess", "identified machine": "calibrated machine"}
-    plt.figure(figsize=(7, 2.4))
-    for number, (name, label) in enumerate(names.items()):
-        values = [one["models"][name]["velocity_mae"]["mean"] for one in machines.values()]
-        plt.bar(np.arange(len(values)) + 0.27 * number, values, 0.27, label=label)
-    plt.xticks(np.arange(len(machines)) + 0.27, list(machines))
-    plt.ylabel("free-run MAE, mm/s")
-    plt.legend()
-    save(path)
-
-
-@figure
-def excitations(path: Path) -> None:
-    from edp.sim import Scenario, simulate
-
-    figure, axes = plt.subplots(3, 2, figsize=(8, 4.2), sharex=True)
-    names = ("isolated", "combined", "aprbs", "reversals", "grading", "dig")
-    for axis, name in zip(axes.flat, names, strict=True):
-        recording = simulate(Scenario(excitation=name, duration_s=30.0, seed=1))
-        axis.plot(np.arange(recording.samples) / recording.rate_hz, recording.column("CylVels_1"), linewidth=0.8)
-        axis.set_title(name, fontsize=9)
-    for axis in axes[-1]:
-        axis.set_xlabel("time, s")
-    figure.supylabel("boom velocity, m/s")
-    figure.tight_layout()
-    save(path)
-
-
-@figure
-def fault(path: Path) -> None:
-    from edp.sim import Scenario, simulate
-
-    plt.figure(figsize=(7, 2.4))
-    for faults, label in (((), "healthy"), (("internal_leak:boom:10L/min@10s",), "leak of 10 L/min from 10 s on")):
-        recording = simulate(Scenario(excitation="isolated", duration_s=40.0, seed=6, faults=list(faults)))
-        time_s = np.arange(recording.samples) / recording.rate_hz
-        plt.plot(time_s, 1000 * recording.column("CylStroke_1"), label=label, linewidth=1)
-    plt.axvline(10.0, color="0.5", linestyle=":")
-    plt.xlabel("time, s")
-    plt.ylabel("boom stroke, mm")
-    plt.legend()
-    save(path)
-
-
-@figure
-def twin_report(path: Path) -> None:
-    line = "edp train data --focus simulation --set \"twin.candidates=['static','arx']\" --set evaluation.seconds=30 --out"
-    run_line(f"{line} runs/twin")
-    run_line("edp report runs/twin")
-    picture(Path("runs/twin/report.html"), path)
-
-
-@figure
-def monitor(path: Path) -> None:
-    from edp.logs import write_recording
-    from edp.testing.monitor import rig_sessions
-
-    Path("healthy").mkdir()
-    Path("today").mkdir()
-    for number, session in enumerate(rig_sessions(19, 2000, seed=4)):
-        if number == 18:
-            session.values[800:, 0] += 3 * np.std(session.values[:, 0])
-        write_recording(session, Path("today" if number == 18 else "healthy") / f"session_{number:02d}.parquet")
-    run_line(
-        "edp monitor fit healthy --hours-per-false-alarm 0.04 --time-budget 0.1min --machine none --out watch"
+def which_model() -> str:
+    """Draw the question that each kind of model answers."""
+    rows = (
+        ("green", "Predictor", "target some samples ahead", "soft sensor, look-ahead, MPC with sensors"),
+        ("green", "Twin, learned", "simulation on commands, range of the data", "plant model for control and tests"),
+        ("green", "Twin, grey box", "simulation, physical parameters", "plant model, datasheet, other machine"),
+        ("violet", "Monitor", "alarms with cause", "condition monitoring, guard of a controller"),
     )
-    run_line("edp monitor run watch today --out watched")
-    run_line("edp monitor report watched")
-    picture(Path("watched/report.html"), path)
+    drawing = Drawing("Four kinds of models, what each one returns, and its typical use", 860, 290)
+    drawing.box(Box(15, 105, 150, 80, "blue", ("Recordings", "channels at one", "rate, SI units")))
+    for number, (colour, name, returned, use) in enumerate(rows):
+        y = 20 + 65 * number
+        drawing.arrow(165, 145, 228, y + 25)
+        drawing.box(Box(230, y, 150, 50, colour, (name,)))
+        drawing.text(400, y + 22, returned, "start")
+        drawing.text(400, y + 40, use, "start", "s")
+    return drawing.svg()
 
 
-@contextlib.contextmanager
-def workshop() -> Iterator[None]:
-    """Work in a temporary folder with simulated logs."""
-    before = Path.cwd()
-    with tempfile.TemporaryDirectory() as folder:
-        os.chdir(folder)
-        try:
-            run_line("edp simulate data --duration 8min --recordings 8 --seed 3")
-            yield
-        finally:
-            os.chdir(before)
+def errors_of_the_default() -> str:
+    """Draw the test error of the preset auto over the error of the best baseline, for each task of the public sets."""
+    tasks = _details("auto_preset")["tasks"]
+    titles = list(dict.fromkeys(task["title"] for task in tasks))
+    drawing = Drawing("Test error of the preset auto divided by the error of the best of four baselines", 860, 290)
+    left, scale = 230.0, 520.0
+    for number in range(6):
+        ratio = 0.5 + 0.15 * number
+        x = left + scale * (ratio - 0.45) / 0.75
+        drawing.line((x, 30, x, 240), "g")
+        drawing.text(x, 258, f"{ratio:.2f}", style="s")
+    one = left + scale * (1.0 - 0.45) / 0.75
+    drawing.line((one, 24, one, 240))
+    drawing.text(one, 18, "equal to the best baseline", style="s")
+    for number, title in enumerate(titles):
+        y = 45 + 30 * number
+        drawing.text(left - 12, y + 4, title, "end")
+        for task in tasks:
+            ratio = _value(task) / _reference(task)
+            if task["title"] == title:
+                drawing.dot(left + scale * (ratio - 0.45) / 0.75, y, "green" if ratio <= 1.0 else "orange")
+    drawing.text(
+        left + scale / 2, 280, "error over the error of the best baseline, one point per output and horizon", style="s"
+    )
+    return drawing.svg()
 
 
-def main(names: list[str]) -> None:
-    """Draw the named figures, or all."""
-    plt.switch_backend("agg")
-    with workshop():
-        for name in names or list(FIGURES):
-            FIGURES[name](IMAGES / f"{name}.png")
-            print(f"{name}: {(IMAGES / f'{name}.png').stat().st_size:,} bytes", flush=True)
+def _value(entry: dict[str, Any]) -> float:
+    return float(entry["value"] if "value" in entry else entry["ours"])
+
+
+def _reference(entry: dict[str, Any]) -> float:
+    return float(entry["reference"] if "reference" in entry else entry["rival"])
+
+
+def automatic_choice() -> str:
+    """Draw the steps of the preset auto."""
+    boxes = (
+        Box(15, 85, 130, 70, "blue", ("Recordings", "training and", "validation part")),
+        Box(190, 15, 150, 46, "green", ("linear",)),
+        Box(190, 71, 150, 46, "green", ("ensemble",)),
+        Box(190, 127, 150, 46, "green", ("recurrent", "only long logs")),
+        Box(190, 183, 150, 46, "green", ("pretrained", "if you name one")),
+        Box(385, 85, 140, 70, "orange", ("Left-out error", "10 blocks, all", "outputs, horizons")),
+        Box(565, 85, 140, 70, "orange", ("Simplest model", "within one standard", "error of the best")),
+        Box(745, 85, 100, 70, "violet", ("Test part", "evaluated", "once")),
+    )
+    arrows = [
+        *((145, 120, 188, y) for y in (38, 94, 150, 206)),
+        *((340, y, 383, 120) for y in (38, 94, 150, 206)),
+        (525, 120, 563, 120),
+        (705, 120, 743, 120),
+    ]
+    title = "The preset auto: candidates are compared on left-out data, the test part is used once"
+    return _diagram(title, (860, 245), boxes, arrows).svg()
+
+
+def expected_errors() -> str:
+    """Draw the error ratio that the training states against the one on the test part."""
+    tasks = [task for task in _details("auto_preset")["tasks"] if task.get("skill") is not None]
+    drawing = Drawing("Expected and measured error, both relative to the linear model", 860, 400)
+    left, bottom, scale = 260.0, 340.0, 300.0
+
+    def place(ratio: float) -> float:
+        return scale * (ratio - 0.2) / 1.0
+
+    for number in range(6):
+        ratio = 0.2 + 0.2 * number
+        drawing.line((left + place(ratio), bottom, left + place(ratio), bottom - scale), "g")
+        drawing.line((left, bottom - place(ratio), left + scale, bottom - place(ratio)), "g")
+        drawing.text(left + place(ratio), bottom + 18, f"{ratio:.1f}", style="s")
+        drawing.text(left - 8, bottom - place(ratio) + 4, f"{ratio:.1f}", "end", "s")
+    drawing.line((left, bottom, left + scale, bottom - scale))
+    for task in tasks:
+        expected = task.get("skill_promised", task.get("skill_expected"))
+        near = abs(expected / task["skill"] - 1.0) <= 0.1
+        drawing.dot(left + place(expected), bottom - place(task["skill"]), "green" if near else "orange")
+    drawing.text(
+        left + scale / 2, bottom + 42, "expected: cross-validated error over that of the linear model", style="s"
+    )
+    drawing.text(left + scale + 20, 60, "measured on the test part", "start")
+    drawing.text(left + scale + 20, 78, "green: within 10 % of the expected value", "start", "s")
+    drawing.text(left + scale + 20, 94, "orange: further away", "start", "s")
+    return drawing.svg()
+
+
+def grey_box() -> str:
+    """Draw the elements of a grey box."""
+    boxes = (
+        Box(15, 90, 110, 60, "blue", ("Command", "u(t)")),
+        Box(165, 90, 140, 60, "green", ("Valve", "dead time, lags,", "play, openings")),
+        Box(345, 90, 150, 60, "green", ("Chambers", "p_A, p_B", "oil and free air")),
+        Box(535, 90, 130, 60, "green", ("Piston force", "friction, stops")),
+        Box(705, 90, 140, 60, "green", ("Load", "inertia, gravity", "of all axes")),
+        Box(345, 15, 150, 46, "green", ("Pumps", "demand, power limit")),
+        Box(345, 190, 150, 46, "grey", ("Tank", "reliefs, leakage")),
+        Box(535, 190, 310, 46, "orange", ("Outputs", "velocity, stroke, pressures")),
+    )
+    arrows = (
+        (125, 120, 163, 120),
+        (305, 120, 343, 120),
+        (495, 120, 533, 120),
+        (665, 120, 703, 120),
+        (420, 61, 420, 88),
+        (420, 150, 420, 188),
+        (775, 150, 775, 188),
+        (705, 140, 667, 140),
+    )
+    drawing = _diagram(
+        "Elements of a grey box: valves, pumps, chambers, pistons and the load", (860, 250), boxes, arrows
+    )
+    drawing.text(235, 38, "pilots of all valves", style="s")
+    drawing.arrow(235, 88, 235, 46, 343, 46)
+    return drawing.svg()
+
+
+def false_modules() -> str:
+    """Draw how often a study of useless modules confirms one, for two procedures."""
+    results = _details("null_calibration")["null"]
+    drawing = Drawing(
+        "Share of studies without a useful module that confirm one, default and thesis procedure", 860, 300
+    )
+    left, scale = 300.0, 480.0
+    names = {
+        "k = 1": "effects differ by session (4 %)",
+        "k = 10": "effects differ by session (2 %)",
+        "sessions decide": "effects differ by session (8 %)",
+        "training sets decide": "effects depend on the training set",
+    }
+    for number in range(6):
+        x = left + scale * 0.2 * number
+        drawing.line((x, 20, x, 250), "g")
+        drawing.text(x, 268, f"{0.2 * number:.1f}", style="s")
+    for number, (model, title) in enumerate(names.items()):
+        y = 28 + 56 * number
+        drawing.text(left - 12, y + 24, title, "end")
+        for offset, method, colour in ((0, "sound", "green"), (20, "thesis: mixed model z, any of 4", "orange")):
+            share = results[model][method]["any_false"]
+            drawing.bar(left, y + offset, scale * share, colour)
+            label = left + max(scale * share, scale * 0.05) + 8  # not across the line of the nominal level
+            drawing.text(label, y + offset + 12, f"{share:.3f}", "start", "s")
+    nominal = left + scale * 0.05
+    drawing.line((nominal, 20, nominal, 250))
+    drawing.text(
+        left + scale / 2,
+        290,
+        "green: default procedure, orange: procedure of the thesis, line: nominal level 0.05",
+        style="s",
+    )
+    return drawing.svg()
+
+
+def monitor_chain() -> str:
+    """Draw the way from measured channels to an alarm."""
+    boxes = (
+        Box(15, 70, 110, 70, "blue", ("Channels", "measured,", "each sample")),
+        Box(160, 70, 130, 70, "green", ("Residuals", "measured minus", "expected")),
+        Box(325, 70, 130, 70, "green", ("Blocks of 1 s", "mean, spread,", "gain, lag")),
+        Box(490, 70, 140, 70, "green", ("Whitening", "by operating point", "of healthy data")),
+        Box(665, 70, 90, 70, "green", ("Detectors", "CUSUM")),
+        Box(785, 70, 65, 70, "violet", ("Alarm",)),
+        Box(160, 180, 295, 46, "grey", ("Healthy sessions, first third", "fit the residuals")),
+        Box(490, 180, 265, 46, "grey", ("Other healthy sessions", "set the limit")),
+    )
+    arrows = (
+        (125, 105, 158, 105),
+        (290, 105, 323, 105),
+        (455, 105, 488, 105),
+        (630, 105, 663, 105),
+        (755, 105, 783, 105),
+        (225, 180, 225, 142),
+        (710, 180, 710, 142),
+    )
+    title = "From channels to alarms; separate healthy sessions fit the residuals and set the limit"
+    return _diagram(title, (865, 245), boxes, arrows).svg()
+
+
+def false_alarms() -> str:
+    """Draw the false alarms in 8 h of a monitor in several conditions."""
+    details = _details("monitor")
+    rows = [
+        ("healthy sessions, 24.3 h", details["healthy"]["in_8_h"]),
+        ("gravel", details["nuisance"]["gravel"]["in_8_h"]),
+        ("oil at 78 degC", details["nuisance"]["oil_78"]["in_8_h"]),
+        ("oil at 5 degC", details["nuisance"]["oil_5"]["in_8_h"]),
+        ("dry sand", details["nuisance"]["dry_sand"]["in_8_h"]),
+        ("other machine, parameters within 1 %", details["nuisance"]["sister_1"]["in_8_h"]),
+        ("other machine, parameters within 3 %", details["nuisance"]["sister_3"]["in_8_h"]),
+    ]
+    drawing = Drawing("False alarms in 8 h of a monitor that was set to one in 8 h, by condition", 860, 300)
+    left, scale = 300.0, 130.0
+    for power in range(4):
+        x = left + scale * (power + 1)
+        drawing.line((x, 20, x, 250), "g")
+        drawing.text(x, 268, f"{10**power:,}", style="s")
+    one = left + scale
+    drawing.line((one, 14, one, 250))
+    for number, (title, rate) in enumerate(rows):
+        y = 26 + 32 * number
+        drawing.text(left - 12, y + 12, title, "end")
+        width = 0.0 if rate == 0 else scale * (log10(rate) + 1)
+        drawing.bar(left, y, width, "green" if rate <= 1.0 else "orange")
+        label = left + (scale if 0.0 < rate <= 1.0 else width) + 8  # not across the line of the set rate
+        drawing.text(label, y + 12, "none" if rate == 0 else f"{rate:.3g}", "start", "s")
+    drawing.text(left + 2 * scale, 290, "false alarms in 8 h, logarithmic; line: one in 8 h, as set", style="s")
+    return drawing.svg()
+
+
+def sandbox() -> str:
+    """Draw the layers around the process that reads a log."""
+    drawing = Drawing("Layers around the process that reads a log", 860, 280)
+    layers = (
+        (180, 15, 660, 250, "grey", "Limits: memory, processor time, file size"),
+        (205, 50, 610, 205, "blue", "File rules: only the log and Python's folders can be read"),
+        (230, 85, 560, 160, "orange", "System-call filter: no sockets, programs or processes"),
+        (255, 120, 510, 115, "violet", "Audit hook: last check of Python code"),
+    )
+    for x, y, width, height, colour, text in layers:
+        drawing.box(Box(x, y, width, height, colour, ()))
+        drawing.text(x + 14, y + 22, text, "start")
+    drawing.box(Box(480, 160, 180, 60, "green", ("Reader", "parses the log")))
+    drawing.box(Box(15, 120, 130, 60, "blue", ("Log", "of a stranger")))
+    drawing.box(Box(15, 195, 130, 60, "green", ("Command", "checks the result")))
+    drawing.arrow(145, 172, 478, 172)
+    drawing.arrow(480, 208, 147, 208)
+    drawing.text(270, 224, "numbers and names over a pipe", "start", "s")
+    return drawing.svg()
+
+
+def data_flow() -> str:
+    """Draw the flow of data through a training."""
+    boxes = (
+        Box(15, 30, 110, 60, "blue", ("Log file", "logs")),
+        Box(160, 30, 120, 60, "blue", ("Recording", "recording")),
+        Box(315, 30, 120, 60, "blue", ("Task, split", "data")),
+        Box(470, 30, 120, 60, "green", ("Scaler, chunks", "data")),
+        Box(625, 30, 100, 60, "green", ("Training", "training")),
+        Box(755, 30, 95, 60, "green", ("Bundle", "training")),
+        Box(755, 150, 95, 60, "violet", ("Export", "export")),
+        Box(600, 150, 120, 60, "orange", ("Evaluation", "evaluation")),
+        Box(445, 150, 120, 60, "orange", ("Page", "report")),
+        Box(15, 150, 180, 60, "grey", ("Commands, Python", "cli, workflows")),
+    )
+    arrows = (
+        (125, 60, 158, 60),
+        (280, 60, 313, 60),
+        (435, 60, 468, 60),
+        (590, 60, 623, 60),
+        (725, 60, 753, 60),
+        (802, 90, 802, 148),
+        (755, 80, 700, 148),
+        (600, 180, 567, 180),
+    )
+    drawing = _diagram("Flow of data through a training, with the package of each step", (865, 235), boxes, arrows)
+    drawing.text(215, 184, "start each step", "start", "s")
+    return drawing.svg()
+
+
+def thesis_phases() -> str:
+    """Draw the number of trainings in each phase of the thesis search."""
+    phases = (
+        ("0 baseline", 180),
+        ("1 calibration", 84),
+        ("2 module screening", 143),
+        ("2.5 planning", 0),
+        ("3 confirmation", 600),
+        ("4 synthesis", 21),
+        ("5 exploration", 161),
+        ("6 compression", 18),
+    )
+    drawing = Drawing("Trainings in each phase of the thesis search with 31 sessions", 860, 280)
+    for number, (title, trainings) in enumerate(phases):
+        y = 15 + 30 * number
+        drawing.text(240, y + 13, title, "end")
+        drawing.bar(252, y, 0.8 * trainings, "green")
+        drawing.text(262 + 0.8 * trainings, y + 13, str(trainings), "start", "s")
+    drawing.text(430, 270, "trainings at most", style="s")
+    return drawing.svg()
+
+
+def simulator() -> str:
+    """Draw the parts of the simulator."""
+    boxes = (
+        Box(15, 90, 130, 60, "blue", ("Operator model", "7 ways of driving")),
+        Box(185, 90, 130, 60, "green", ("Levers, pilots", "valves")),
+        Box(355, 20, 140, 56, "green", ("Pumps", "demand, power limit")),
+        Box(355, 100, 140, 56, "green", ("Cylinders", "oil, friction, stops")),
+        Box(355, 180, 140, 56, "green", ("Oil", "temperature")),
+        Box(535, 100, 130, 56, "green", ("Linkage, bodies", "rigid, planar")),
+        Box(535, 180, 130, 56, "grey", ("Soil", "cutting, heap, heel")),
+        Box(705, 100, 145, 56, "orange", ("Sensors, bus", "noise, lag, latency")),
+        Box(705, 180, 145, 56, "violet", ("Recording", "at 100 Hz")),
+    )
+    arrows = (
+        (145, 120, 183, 120),
+        (315, 110, 353, 60),
+        (315, 125, 353, 128),
+        (425, 76, 425, 98),
+        (495, 128, 533, 128),
+        (665, 128, 703, 128),
+        (425, 180, 425, 158),
+        (600, 180, 600, 158),
+        (777, 156, 777, 178),
+    )
+    drawing = _diagram("Parts of the simulator, from the operator to the recording", (865, 255), boxes, arrows)
+    drawing.arrow(600, 100, 600, 8, 80, 8, 80, 88)
+    drawing.text(215, 24, "sees strokes, speeds and the ground", style="s")
+    return drawing.svg()
+
+
+FIGURES: dict[str, Callable[[], str]] = {
+    "which_model": which_model,
+    "errors_of_the_default": errors_of_the_default,
+    "automatic_choice": automatic_choice,
+    "expected_errors": expected_errors,
+    "grey_box": grey_box,
+    "false_modules": false_modules,
+    "monitor_chain": monitor_chain,
+    "false_alarms": false_alarms,
+    "sandbox": sandbox,
+    "data_flow": data_flow,
+    "thesis_phases": thesis_phases,
+    "simulator": simulator,
+}
+"""Functions that draw a figure, by the name of its file in ``docs/images``."""
+
+
+def main(folder: Path) -> None:
+    """Write all figures into a folder."""
+    for name, draw in FIGURES.items():
+        (folder / f"{name}.svg").write_text(draw(), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "images")

@@ -1,4 +1,4 @@
-"""References of file formats, export forms and the C interface, from the registries and the headers themselves."""
+"""Reference of log formats, export formats and the C interface, from the registries and the headers."""
 
 from __future__ import annotations
 
@@ -9,54 +9,43 @@ from pathlib import Path
 import edp
 from edp.export.base import TARGETS
 from edp.logs.formats.base import FORMATS
-from edp_site.parts import first_sentence
+from edp.logs.formats.mat_layouts import LAYOUTS
+from edp_site.parts import first_sentence, options
 
 _COMMENT = re.compile(r"/\*(.*?)\*/", re.DOTALL)
 _HEADERS = {
-    "edp_runtime.h": "Of every network: statuses, rings, layers, checksums.",
-    "edp_integer.h": "In integer arithmetic (W8A16), besides.",
-    "edp_tangent.h": "With derivatives (`--set tangent=true`), besides.",
-    "edp_adaptation.h": "Of a correction learned on board, besides.",
-    "edp_hydraulics.h": "Of a grey box: its equations.",
-    "edp_linkage.h": "Of a grey box with a known linkage: its bodies.",
+    "edp_runtime.h": "Every network uses it: statuses, ring buffers, layers, checksums.",
+    "edp_integer.h": "Networks in integer arithmetic (W8A16) use it in addition.",
+    "edp_tangent.h": "Networks with derivatives (`--set tangent=true`) use it in addition.",
+    "edp_adaptation.h": "Networks with an on-board adaptation use it in addition.",
+    "edp_hydraulics.h": "Grey boxes use it: their equations.",
+    "edp_linkage.h": "Grey boxes with a known linkage use it: their rigid bodies.",
 }
 """Headers of the runtime in the order in which a reader meets them."""
 
 
 def formats_page() -> str:
-    """Log formats and export forms, one row each."""
+    """Describe log formats, MAT layouts and export formats, one row each."""
     importlib.import_module("edp.export")  # the folders register what they hold
     importlib.import_module("edp.logs.formats")
-    lines = [
-        "# Formats",
-        "",
-        "Made from the code: what is registered. [Recordings](../recordings.md) say what of each format is read.",
-        "",
-        "## Logs",
-        "",
-        "| Name | Endings | Content |",
-        "|---|---|---|",
-    ]
+    lines = ["## Log formats", "", "| Name | File endings | Content |", "|---|---|---|"]
     for name, log_format in FORMATS.items():
         endings = ", ".join(f"`{suffix}`" for suffix in log_format.suffixes)
         lines.append(f"| `{name}` | {endings} | {log_format.content} |")
-    lines += ["", "## Exported forms", "", "For `edp export --to NAME`.", "", "| Name | What it is |", "|---|---|"]
-    lines += [f"| `{name}` | {first_sentence(target)} |" for name, target in TARGETS.items()]
+    layouts = ", ".join(f"`{name}`" for name in LAYOUTS)
+    lines += ["", f"Layouts of MAT files: {layouts}."]
+    lines += ["", "## Export formats", "", "| Name | Options and their defaults | Files |", "|---|---|---|"]
+    lines += [f"| `{name}` | {options(target)} | {first_sentence(target)} |" for name, target in TARGETS.items()]
     return "\n".join(lines) + "\n"
 
 
 def c_page() -> str:
-    """The headers of the exported C: the runtime as it is, and the template of a model's header."""
+    """Show the headers of the exported C: the template of a model's header, then the runtime."""
     root = Path(edp.__path__[0]) / "export" / "c"
     lines = [
-        "# C interface",
-        "",
-        "Made from the headers that an export contains. [Export to C](../export.md) says how to build and call it. "
-        "A program calls the functions of its model's header; those of the runtime are what the model itself calls.",
-        "",
         "## NAME.h: a model",
         "",
-        "The template of the header of an exported model; what stands in braces is filled in from the network.",
+        "Template of the header of an exported model. The export replaces the names in braces.",
         "",
         "```c",
         (root / "templates" / "model.h.in").read_text(encoding="utf-8").rstrip("\n"),

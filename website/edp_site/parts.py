@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import pkgutil
 import re
+import tomllib
 from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
@@ -12,20 +14,24 @@ from typing import Any
 
 import edp
 from edp.registry import Registry
+from edp.sim.faults.base import MachineFault
 from edp_site import markdown
 
 _DEFINED = re.compile(r"^(\w+): Registry\[.+\] = Registry\(", re.MULTILINE)
 
 
 def registries() -> dict[str, Registry[Any]]:
-    """Every registry of the package that has parts, by the place of its definition: ``edp.networks.heads.HEADS``."""
+    """Return every registry of the package that has parts, by its place, such as ``edp.networks.heads.HEADS``."""
     root = Path(edp.__path__[0])
     found: dict[str, Registry[Any]] = {}
     for source in sorted(root.rglob("*.py")):
         for name in _DEFINED.findall(source.read_text(encoding="utf-8")):
             module = ".".join(("edp", *source.relative_to(root).with_suffix("").parts))
-            # The folder imports the files that hold the parts.
-            importlib.import_module(module.rpartition(".")[0])
+            # The folder, or a folder in it, imports the files that hold the parts.
+            package = importlib.import_module(module.rpartition(".")[0])
+            for inner in pkgutil.iter_modules(package.__path__):
+                if inner.ispkg:
+                    importlib.import_module(f"{package.__name__}.{inner.name}")
             registry = getattr(importlib.import_module(module), name)
             if len(registry):
                 found[f"{module}.{name}"] = registry
@@ -33,23 +39,23 @@ def registries() -> dict[str, Registry[Any]]:
 
 
 def parts_page() -> str:
-    """All registries with their parts."""
+    """Describe all registries with their parts, then the machines and soils of the simulator."""
     listed = sorted(registries().items(), key=lambda item: (item[1].what, item[0]))
-    lines = [
-        "# Parts",
-        "",
-        "Made from the code: every registered part by its name, with its options. In settings a table with `kind` "
-        "names one; [settings](../settings.md) say in which table and what the options do, "
-        "[the architecture](../architecture.md#to-add-a-part) how to add one.",
-        "",
-        "| Parts | Number |",
-        "|---|---|",
-    ]
+    lines = ["## Overview", "", "| Parts | Number |", "|---|---|"]
     titles = {place: _title(place, registry) for place, registry in listed}
     for place, registry in listed:
         lines.append(f"| [{titles[place]}](#{markdown.anchor_of(titles[place])}) | {len(registry)} |")
     for place, registry in listed:
-        lines += ["", f"## {titles[place]}", "", f"Registry `{place}`.", "", *_table(registry)]
+        table = _fault_table(registry) if place.endswith(".FAULTS") else _table(registry)
+        lines += ["", f"## {titles[place]}", "", f"Registry `{place}`.", "", *table]
+    simulator = Path(edp.__path__[0]) / "sim"
+    for title, folder in (("Machines of the simulator", "machines"), ("Soils of the simulator", "materials")):
+        lines += ["", f"## {title}", "", f"Files of `edp/sim/{folder}`.", "", "| Name | What it is |", "|---|---|"]
+        for path in sorted((simulator / folder).glob("*.toml")):
+            # A soil has no description; the first comment of its file says what it is.
+            values = tomllib.loads(path.read_text(encoding="utf-8"))
+            comment = path.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ")
+            lines.append(f"| `{values.get('name', path.stem)}` | {_cell(values.get('description', comment))} |")
     return "\n".join(lines) + "\n"
 
 
@@ -63,11 +69,24 @@ def _table(registry: Registry[Any]) -> list[str]:
     texts = {name: first_sentence(part) for name, part in registry.items()}
     common = {text for text in texts.values() if list(texts.values()).count(text) > 1}  # of a class that all share
     for name, part in registry.items():
-        rows.append(f"| `{name}` | {_options(part)} | {'' if texts[name] in common else _cell(texts[name])} |")
+        rows.append(f"| `{name}` | {options(part)} | {'' if texts[name] in common else _cell(texts[name])} |")
     return rows
 
 
-def _options(part: Any) -> str:
+def _fault_table(registry: Registry[Any]) -> list[str]:
+    rows = ["| Name | Sites | Sizes of the ladder | Range | Part | What is wrong |", "|---|---|---|---|---|---|"]
+    for name, kind in registry.items():
+        ladder = ", ".join(f"{size:g}" for size in kind.ladder)
+        shown_range = f"{kind.bound.low:g} to {kind.bound.high:g} {kind.unit}" if kind.units else ""
+        part = "machine" if isinstance(kind, MachineFault) else "sensor"
+        sites = ", ".join(f"`{site}`" for site in kind.sites)
+        cells = (f"`{name}`", sites, f"{ladder} {kind.unit}".strip(), shown_range, part, _cell(kind.text))
+        rows.append(f"| {' | '.join(cells)} |")
+    return rows
+
+
+def options(part: Any) -> str:
+    """Return the options of a part with their defaults; empty for a part that is not a dataclass."""
     if not (inspect.isclass(part) and is_dataclass(part)):
         return ""
     return ", ".join(f"`{_escaped(f'{entry.name} = {_default(entry)}')}`" for entry in fields(part) if entry.init)
@@ -94,8 +113,8 @@ def _shown(value: Any) -> str:
 
 
 def first_sentence(part: Any) -> str:
-    """The first sentence of a part's docstring; of an object that of its class."""
-    own = part if inspect.isclass(part) or inspect.isroutine(part) else type(part)
+    """Return the first paragraph of the docstring of a part, or of its class if the part is an object."""
+    own = part if inspect.isclass(part) or inspect.isroutine(part) or inspect.ismodule(part) else type(part)
     text = " ".join((inspect.getdoc(own) or "").split("\n\n")[0].split()).replace("``", "`")
     return "" if text.startswith(f"{getattr(own, '__name__', '')}(") else text
 

@@ -37,9 +37,25 @@ _OPTIONS = {
     "rollout": {"--rollout-seconds": "--seconds"},
     "export": {"--format": "--to", "--formats": "--forms"},
     "parity": {"--format": "--form"},
+    "search": {"--out": "--study"},
+    "inspect": {"--max-hours": "--at-most"},
+    "screen": {"--max-hours": "--at-most"},
+    "evaluate": {"--max-hours": "--at-most"},
+    "forecast": {"--horizon": "--ahead"},
+    "control": {"--loops": "--seeds"},
+    "tune": {"--tuning-plant": "--on"},
 }
 """New names of options to the present ones, by present command; their values are times with a unit or plain words."""
-_SETTINGS = {"evaluation.warmup_samples": "judge.skip", "evaluation.": "judge."}
+_SETTINGS = {
+    "evaluation.duration_s": "judge.seconds",
+    "evaluation.warmup_samples": "judge.skip",
+    "evaluation.": "judge.",
+    "trials.random_sets": "trials.random",
+    "screen.measured": "screen.trusted",
+    "auto.time_budget_min": "auto.minutes",
+    "finetune.learning_rate": "finetune.rate",
+}
+"""New keys of settings to the present ones."""
 _MINUTES = {"s": 1 / 60, "min": 1.0, "h": 60.0}
 
 
@@ -57,13 +73,20 @@ def as_today(line: str) -> str:
     if re.match(r"edp train .*--focus simulation", text):
         text = re.sub(r" --focus simulation", "", text.replace("edp train", "edp twin", 1))
     for command, names in _OPTIONS.items():
-        if text.startswith(f"edp {command} "):
+        if text.startswith(f"edp {command} ") and not re.match(r"edp search (status|report|export) ", text):
             for new, old in names.items():
                 text = re.sub(rf"(?<= ){new}(?![\w-])", old, text)
             text = re.sub(r"(--minutes )([\d.]+)(s|min|h)\b", _in_minutes, text)
     for new, old in _SETTINGS.items():
         text = text.replace(f"--set {new}", f"--set {old}").replace(f"--set '{new}", f"--set '{old}")
     return text + mark + remark
+
+
+def code_as_today(source: str) -> str:
+    """Return Python code with the present keys of settings in its strings."""
+    for new, old in _SETTINGS.items():
+        source = source.replace(f'"{new}', f'"{old}')
+    return source
 
 
 def _in_minutes(match: re.Match[str]) -> str:
@@ -107,15 +130,11 @@ MOVED_PAGES = {
     "twin.md": "howto/train_plant_model.md",
 }
 """Deleted pages of docs/ to the pages that took their place; `relink` rewrites the links of all pages at the merge."""
-COMING = ("explanation/", "reference/")
-"""Folders of docs/ whose pages are written in parallel."""
 
 
 def is_pending(problem: str) -> bool:
-    """Return whether a broken link leads to a deleted page of docs/, or to a page that is written in parallel."""
-    target = problem.split(": ")[1].partition("#")[0]
-    name = target.rpartition("/")[2]
-    return name in MOVED_PAGES and not target.startswith("../howto") or any(f"{one}" in target for one in COMING)
+    """Return whether a broken link leads to a page of docs/ that another page replaced."""
+    return problem.split(": ")[1].partition("#")[0].rpartition("/")[2] in MOVED_PAGES
 
 
 def relink(root: Path) -> None:

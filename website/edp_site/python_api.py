@@ -9,6 +9,8 @@ from types import ModuleType
 from typing import Any
 
 import edp
+from edp_site import markdown
+from edp_site.parts import first_sentence
 
 _SECTION = re.compile(r"^(Args|Attributes|Returns|Yields|Raises|Example|Note):\s*$")
 _ENTRY = re.compile(r"^(\*{0,2}[\w`., |*]+?)(?: \([^)]*\))?: (.*)$")
@@ -17,16 +19,15 @@ _WIDTH = 88
 
 
 def python_page() -> str:
-    """Every name of ``edp.__all__`` and the public members of its classes."""
-    parts = [
-        "# Python",
-        "",
-        "Made from the code. [EDP from Python](../python.md) shows how the names go together; its examples are run by "
-        "a test. Names that are not on this page are private and may move.",
-    ]
-    for name in sorted(public_names(), key=lambda name: (name.lower(), name)):
-        parts += ["", *_entry(f"edp.{name}", getattr(edp, name), 2)]
-    return "\n".join(parts) + "\n"
+    """Describe every name of ``edp.__all__`` and the public members of its classes, below an overview."""
+    names = sorted(public_names(), key=lambda name: (name.lower(), name))
+    lines = ["## Public names", "", "| Name | What it is |", "|---|---|"]
+    for name in names:
+        text = first_sentence(getattr(edp, name)) if name != "__version__" else "Version of the package."
+        lines.append(f"| [`edp.{name}`](#{markdown.anchor_of(f'edp.{name}')}) | {text} |")
+    for name in names:
+        lines += ["", *_entry(f"edp.{name}", getattr(edp, name), 2)]
+    return "\n".join(lines) + "\n"
 
 
 def public_names() -> tuple[str, ...]:

@@ -9,7 +9,18 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from edp_site import commands, formats, gallery, markdown, notebooks, parts, python_api, repository_files, results
+from edp_site import (
+    commands,
+    formats,
+    gallery,
+    markdown,
+    notebooks,
+    parts,
+    python_api,
+    repository_files,
+    result_files,
+    results,
+)
 
 ROOT = Path(__file__).parents[2]
 _PROJECT_PAGES = {
@@ -41,8 +52,6 @@ def stage(out: Path, demo: Path | None = None, root: Path = ROOT, version: str |
     pages.mkdir(parents=True)
     for path in sorted((root / "website" / "pages").glob("*.md")):
         _write(pages / path.name, path.read_text(encoding="utf-8"))
-    for name, make in _made(root).items():
-        _write(pages / name, make())
     gallery.write_gallery(pages, demo)
     for path in sorted((root / "docs" / "tutorials").glob("*.ipynb")):
         folder = pages / "tutorials"
@@ -53,17 +62,19 @@ def stage(out: Path, demo: Path | None = None, root: Path = ROOT, version: str |
         script = pages / "theme" / "site.js"
         text = script.read_text(encoding="utf-8")
         script.write_text(f"window.edpVersion = {json.dumps(version)};\n{text}", encoding="utf-8")
-    _Copier(root, pages).copy()
+    _Copier(root, pages).copy(_made(root))
     (out / "mkdocs.yml").write_text(builder_settings(root / "mkdocs.yml", pages), encoding="utf-8")
     return sorted(pages.rglob("*.md"))
 
 
 def _made(root: Path) -> dict[str, Callable[[], str]]:
+    """Return the function for each generated page; a page of docs/ with the same place is its introduction."""
     return {
         "reference/commands.md": commands.commands_page,
         "reference/python.md": python_api.python_page,
         "reference/parts.md": parts.parts_page,
         "reference/formats.md": formats.formats_page,
+        "reference/files.md": result_files.files_page,
         "reference/c.md": formats.c_page,
         "leaderboard.md": lambda: results.results_page(
             root / "benchmarks" / "results",
@@ -92,11 +103,21 @@ def decisions_page(folder: Path) -> str:
 
 
 def builder_settings(path: Path, pages: Path) -> str:
-    """The settings of the builder for pages that lie beside them; entries of pages that are not there are left out."""
+    """Return the settings of the builder for a folder of pages.
+
+    Menu entries of missing pages are omitted. An entry such as ``- How-to: howto/*.md`` becomes a group of all pages of
+    that folder which have no entry of their own.
+    """
+    text = path.read_text(encoding="utf-8")
     lines = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        entry = re.fullmatch(r"\s+- (?:.+: )?([\w./-]+\.md)", line)
-        if entry and not (pages / entry[1]).exists():
+    for line in text.splitlines():
+        entry = re.fullmatch(r"(\s+)- (?:(.+): )?([\w./*-]+\.md)", line)
+        if entry and "*" in entry[3]:
+            names = sorted(place.relative_to(pages).as_posix() for place in pages.glob(entry[3]))
+            lines.append(f"{entry[1]}- {entry[2]}:")
+            lines += [f"{entry[1]}    - {name}" for name in names if name not in text]
+            continue
+        if entry and not (pages / entry[3]).exists():
             continue
         line = re.sub(r"^docs_dir:.*", "docs_dir: pages", line)
         lines.append(re.sub(r"^site_dir:.*", "site_dir: site", line))
@@ -110,15 +131,23 @@ class _Copier:
         self.root, self.pages = root.resolve(), pages
         self.shown: set[Path] = set()
 
-    def copy(self) -> None:
-        """All pages of docs/ and of the project."""
+    def copy(self, made: dict[str, Callable[[], str]]) -> None:
+        """Write all pages of docs/ and of the project, each followed by what is generated for its place.
+
+        Args:
+            made: function that generates a page, by place.
+        """
         sources = {path: Path(*path.relative_to(self.root / "docs").parts) for path in self.root.glob("docs/**/*.md")}
         sources |= {self.root / name: Path(place) for name, place in _PROJECT_PAGES.items()}
         for source, place in sources.items():
             text = source.read_text(encoding="utf-8")
             targets = {link.target for link in markdown.links(text) if not link.target.startswith(_OUTSIDE)}
             moved = {target: self._moved(source, place, target) for target in targets}
-            _write(self.pages / place, markdown.with_links(text, moved))
+            generated = made.get(place.as_posix())
+            _write(self.pages / place, markdown.with_links(text, moved) + (f"\n{generated()}" if generated else ""))
+        for name, make in made.items():
+            if Path(name) not in sources.values():
+                _write(self.pages / name, make())
 
     def _moved(self, source: Path, place: Path, target: str) -> str:
         """A link of `source`, which goes to `place`, as it must read there."""

@@ -20,7 +20,7 @@ FILE, SCHEMA = "study.json", 2
 STATES = ("running", "stopped", "killed", "finished")
 """Of a study; ``killed`` is one whose file says that it runs, and which no process holds."""
 MODES = ("sound", "thesis")
-"""Whose tests and rules decide: those of docs/statistics.md, or those of the thesis."""
+"""Whose tests and rules decide: those of docs/explanation/statistics.md, or those of the thesis."""
 TITLES = {
     "isolation": "isolation and variance",
     "calibration": "calibration",

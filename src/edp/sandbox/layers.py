@@ -19,7 +19,7 @@ from edp.errors import ConfigError, DataError
 VARIABLE = "EDP_SANDBOX"
 REQUIRE, ACCEPT = "require", "accept"
 _LONGEST_REASON = 200
-_PAGE = "docs/security.md"
+_PAGE = "docs/explanation/security.md"
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Contracts of EDP's parts as functions that third parties can call on their own parts.
 
 ``check_block(MyBlock)`` and its like raise `ContractError`, an `AssertionError`, with what is wrong; they need no test
-runner. A part is registered first, as docs/architecture.md tells. EDP's own tests call the same functions.
+runner. A part is registered first, as docs/reference/parts.md tells. EDP's own tests call the same functions.
 """
 
 from edp.testing.expectations import ContractError

@@ -214,7 +214,8 @@ class SearchSpec:
     """Settings of a search; the preset ``thesis`` holds the thesis's own numbers.
 
     Attributes:
-        mode: ``sound`` (docs/statistics.md) or ``thesis``, whose tests and rules are followed (docs/thesis_preset.md).
+        mode: ``sound`` (docs/explanation/statistics.md) or ``thesis`` (docs/explanation/thesis.md), which follows the
+            tests and rules of the thesis.
         seed: root of folds, seeds of trainings and questions.
         updates: training steps of every training but the final one, over all its epochs; 0 with several epochs makes
             each of them one pass over the data.
