@@ -19,7 +19,7 @@ from edp_site.stage import stage
 ROOT = Path(__file__).parents[2]
 BUILDER = ROOT / ".venv-docs" / "bin" / "zensical"
 NOTEBOOKS = sorted((ROOT / "docs" / "tutorials").glob("*.ipynb"))
-MOST_BYTES = 150_000
+MOST_BYTES = 200_000
 VISITED = (
     "index",
     "tutorials/index",

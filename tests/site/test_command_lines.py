@@ -41,7 +41,9 @@ LEFT_OUT = {
     ),
     "edp identify LOGS --out MACHINE.toml": "fits a machine; tests/unit/cli/test_cli_identify.py",
     "edp identify logs --out mine.toml --machine measured.toml": "fits a machine; tests/unit/cli/test_cli_identify.py",
-    "edp identify logs --out mine.toml --set twin.fit.starts=1": "fits a machine; tests/unit/cli/test_cli_identify.py",
+    "edp replay runs/first_adapted logs/monday --twin runs/grey": (
+        "needs a grey box of the network's velocities; tests/unit/test_adaptation.py runs it on one"
+    ),
     "edp identify logs --out mine.toml --run runs/grey": "fits a machine; tests/unit/cli/test_cli_identify.py",
     "edp twin logs --set twin.kind=greybox --set twin.linkage=mine.toml --out runs/grey": (
         "fits a grey box; tests/unit/twin/test_grey_linkage.py"

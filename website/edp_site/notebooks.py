@@ -26,7 +26,7 @@ from edp_site.pending import as_today, code_as_today
 Notebook = dict[str, Any]
 _NOTEBOOK_LINK = re.compile(r"(\]\([\w/.-]+)\.ipynb([#)])")
 PICTURE_DPI = 72
-"""Small pictures keep a notebook with five of them below 150 kB."""
+"""Small pictures keep a notebook with five of them below 200 kB."""
 
 
 def read_notebook(path: Path) -> Notebook:
