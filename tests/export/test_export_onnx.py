@@ -211,7 +211,7 @@ def test_corrections_reach_the_states_of_other_layers(bundle_of):
 
 
 def test_the_page_lists_the_operators(bundle_of):
-    page = (Path(__file__).parents[2] / "docs/onnx.md").read_text()
+    page = (Path(__file__).parents[2] / "docs/howto/deploy_onnx.md").read_text()
     listed = page.partition("## Operators")[2].partition("and no others")[0]
     assert set(re.findall(r"[A-Z]\w+", listed)) == ALLOWED
     used = set()

@@ -217,7 +217,7 @@ def test_the_page_says_what_the_planner_counts():
     asked = [phase.trainings(held) for phase in PHASES.values()]
     assert (
         f"{sum(asked):,}"
-        in re.search(r"^\| `thesis` \|.*$", (DOC.parents[1] / "search.md").read_text(), re.MULTILINE)[0]
+        in re.search(r"^\| `thesis` \|.*$", (DOC.parents[1] / "howto" / "run_search.md").read_text(), re.MULTILINE)[0]
     )
     assert f"**{sum(asked):,} trainings**" in DOC.read_text()
 

@@ -109,7 +109,7 @@ class Line(NamedTuple):
             if after:
                 named.append(after)
                 after = ""
-            elif word in options:
+            elif word.startswith("-") and word in options:
                 named.append("")
                 after = "" if getattr(options[word], "is_flag", False) else word
             else:
@@ -132,6 +132,8 @@ def lines_of(page: Path) -> Iterator[Line]:
         if named == ("search",) and words:
             named = ("search", "run")
         if not words or words[-1] == "--help" or "..." in words or hasattr(known[named].parsed, "commands"):
+            continue
+        if any(word.endswith("...") for word in words):
             continue
         words = [word.strip("[]") if word.isupper() else word for word in words]
         line = Line(page.name, number, " ".join(shlex.split(text, comments=True)), " ".join(named), tuple(words))
@@ -412,6 +414,7 @@ MAKERS: Mapping[str, Callable[[Ground, Path], None]] = {
     "store": _made_by("store", "build", "{logs}", "--out", "{out}", "--workers", "1"),
     "fleet": _made_by("store", "build", "{drives}", "--out", "{out}", "--workers", "1"),
     "base": _made_by("pretrain", "{drives}", "--out", "{out}", "--preset", "quick", *settings(MACHINES)),
+    "registry": _made_by("registry", "add", "{out}", "{base}", "--name", "base"),
     "deltas": _made_by("finetune", "{base}", "--fleet", "{fleet}", "--out", "{out}", "--workers", "1"),
 }
 """By kind."""
@@ -445,6 +448,8 @@ ROLES: Mapping[tuple[str, str], str] = {
     ("fleet network", "0"): "deltas",
     ("finetune", "--fleet"): "fleet",
     ("registry add", "1"): "run",
+    ("registry list", "0"): "registry",
+    ("registry show", "0"): "registry",
     ("store check", "0"): "store",
     **{(f"search {name}", "0"): "study" for name in ("status", "report", "export")},
     ("simulate", "--machine"): "machine",
@@ -494,7 +499,8 @@ SPECIAL: tuple[tuple[str, str, str], ...] = (
     (r"runs/twin --data", "logs/monday", "actuators"),
     (r"linkage=mine", "logs", "front"),
     (r"logs/healthy --map", "logs/healthy", "rig_csv"),
-    (r"logs/healthy --map", "map.toml", "rig_map"),
+    (r"(logs/healthy|logs/today) --map", "map.toml", "rig_map"),
+    (r"logs/today --map", "logs/today", "rig_csv"),
     (r"registry add .* fleet/base", "fleet/base", "base"),
     (r"runs/grey_loam --set task", "runs/grey_loam", "grounded"),
     (r"twin .*--start runs/twin", "runs/twin", "recurrent"),

@@ -43,17 +43,18 @@ SMALL = {
     "model.backbone": {"kind": "hybrid", "channels": [8], "kernel": 3, "units": 8},
 }
 SHORTER: Mapping[str, Mapping[str, str]] = {
-    "simulator": {
+    "simulate_recordings": {
         "duration_s=120.0": "duration_s=2.0",
         "minutes=60.0, recordings=30": "minutes=0.1, recordings=2",
         "workers=4": "workers=1",
         "simulation.run(2000)": "simulation.run(60)",
         "simulation.run(500)": "simulation.run(30)",
     },
-    "control": {"duration_s=30.0": "duration_s=30.0", "num_envs=64": "num_envs=2"},
-    "environment": {"num_envs=64": "num_envs=2"},
-    "compress": {'"C_u64_QAT"': '"A_u32"'},
-    "screening": {"ScreeningSpec(horizon=10)": "ScreeningSpec(horizon=1, max_lag=20, information_samples=200)"},
+    "reinforcement_learning": {"num_envs=64": "num_envs=2"},
+    "choose_channels": {
+        "ScreeningSpec(horizon=10)": "ScreeningSpec(horizon=1, max_lag=20, information_samples=200)",
+    },
+    "tune_training": {'"training.epochs": 20': '"training.epochs": 1'},
 }
 """Lengths of a page that a test cannot wait for, and what it runs instead."""
 
@@ -84,13 +85,13 @@ def lever_logs(folder: Path) -> None:
     Path("map.toml").write_text(text, encoding="utf-8")
 
 
-def adaptation(folder: Path, request: pytest.FixtureRequest) -> Names:
+def adapt_on_board(folder: Path, request: pytest.FixtureRequest) -> Names:
     model = trained(folder / "runs" / "first")
     adapt(folder / "runs" / "first", folder / "runs" / "first_adapted", AdaptationSpec(rank=1, noise=1.0))
     return {"inputs": lever_rig()[0].select(model.inputs)[0]}
 
 
-def compress(folder: Path, request: pytest.FixtureRequest) -> Names:
+def fit_budget(folder: Path, request: pytest.FixtureRequest) -> Names:
     tiny, training = (request.getfixturevalue(name) for name in ("tiny", "tiny_training"))
     backbone = HybridSpec(channels=(32, 16), kernel=2, units=32)
     teacher = build_model(tiny.task, ModelSpec(backbone=backbone, head=MlpHead(hidden=16), window=10), tiny.scaler(), 0)
@@ -99,7 +100,7 @@ def compress(folder: Path, request: pytest.FixtureRequest) -> Names:
     return {"data": tiny, "training": few, "network": teacher}
 
 
-def howto_watch(folder: Path, request: pytest.FixtureRequest) -> Names:
+def watch_machine(folder: Path, request: pytest.FixtureRequest) -> Names:
     sessions = rig_sessions(12, 2000, seed=1)
     save_monitor(fitted_monitor(sessions), folder / "monitors" / "rig")
     channels = sessions[0].channels
@@ -133,7 +134,7 @@ def exported(folder: Path, target: str) -> edp.Model:
     return model
 
 
-def mpc(folder: Path, request: pytest.FixtureRequest) -> Names:
+def deploy_casadi(folder: Path, request: pytest.FixtureRequest) -> Names:
     pytest.importorskip("casadi")
     if shutil.which("cc") is None:
         pytest.skip("no C compiler `cc`")
@@ -147,13 +148,13 @@ def mpc(folder: Path, request: pytest.FixtureRequest) -> Names:
     return {**names, "carry": carry, "feed": feed, "by": by}
 
 
-def onnx(folder: Path, request: pytest.FixtureRequest) -> Names:
+def deploy_onnx(folder: Path, request: pytest.FixtureRequest) -> Names:
     pytest.importorskip("onnxruntime")
     model = exported(folder, "onnx")
     return {"rows": lever_rig()[0].select(model.inputs)[:20].astype(np.float32)}
 
 
-def recordings(folder: Path, request: pytest.FixtureRequest) -> Names:
+def repair_logs(folder: Path, request: pytest.FixtureRequest) -> Names:
     from scipy.io import savemat
 
     rows = np.tile(lever_rig(1)[0].values, (150, 1))  # the page asks for the first 60,000 rows
@@ -162,7 +163,7 @@ def recordings(folder: Path, request: pytest.FixtureRequest) -> Names:
     return {"signal_map": load_signal_map(folder / "map.toml")}
 
 
-def screening(folder: Path, request: pytest.FixtureRequest) -> Names:
+def choose_channels(folder: Path, request: pytest.FixtureRequest) -> Names:
     (folder / "logs").mkdir()
     rng = np.random.default_rng(3)
     for number in range(6):
@@ -173,20 +174,46 @@ def screening(folder: Path, request: pytest.FixtureRequest) -> Names:
     return {}
 
 
-def store(folder: Path, request: pytest.FixtureRequest) -> Names:
+def large_stores(folder: Path, request: pytest.FixtureRequest) -> Names:
     rows = folder / "store" / "rows"
     rows.mkdir(parents=True)
     np.arange(120, dtype="<f4").tofile(rows / "KEY.f32")
     return {"np": np, "first": 20, "samples": 10, "channels": 4}
 
 
-def tutorial(folder: Path, request: pytest.FixtureRequest) -> Names:
-    trained(folder / "runs" / "small")
+def tune_training(folder: Path, request: pytest.FixtureRequest) -> Names:
     lever_logs(folder / "logs")
     return {}
 
 
-def twin(folder: Path, request: pytest.FixtureRequest) -> Names:
+def compare_runs(folder: Path, request: pytest.FixtureRequest) -> Names:
+    train, test = lever_rig().split()
+    for number, name in enumerate(("first", "second")):
+        settings = {**SMALL, "training.seed": number}
+        place = folder / "runs" / name
+        task = {"targets": ["speed"], "horizons": [1]}
+        model = edp.train(train, **task, test=test, out=place, preset="quick", settings=settings)
+        model.evaluate()
+    return {}
+
+
+def intervals(folder: Path, request: pytest.FixtureRequest) -> Names:
+    lever_logs(folder / "logs")
+    train, test = lever_rig().split()
+    quantiles = {"model.output.kind": "quantiles", "training.loss.kind": "quantile"}
+    task = {"targets": ["speed"], "horizons": [1]}
+    place = folder / "runs" / "intervals"
+    edp.train(train, **task, test=test, out=place, preset="quick", settings={**SMALL, **quantiles})
+    return {}
+
+
+def deploy_pytorch(folder: Path, request: pytest.FixtureRequest) -> Names:
+    trained(folder / "runs" / "first")
+    lever_logs(folder / "logs")
+    return mpc(folder, request)
+
+
+def mpc(folder: Path, request: pytest.FixtureRequest) -> Names:
     spec = next(iter(TWINS.values()))()
     made = sample_twin(spec, sample_actuators(600))[0]
     series = made.channels.task().series(sample_actuators(600))
@@ -203,8 +230,8 @@ def twin(folder: Path, request: pytest.FixtureRequest) -> Names:
 GROUNDS: Mapping[str, Ground] = {
     part.__name__: part
     for part in (
-        adaptation, compress, howto_watch, monitor, mpc, onnx, recordings, screening, store, tutorial, twin,
-        which_model,
+        adapt_on_board, choose_channels, compare_runs, deploy_casadi, deploy_onnx, deploy_pytorch, fit_budget,
+        intervals, large_stores, which_model, monitor, mpc, repair_logs, tune_training, watch_machine,
     )
 }  # fmt: skip
 """By the stem of the page."""

@@ -5,8 +5,10 @@ Lines of the same form, which differ in names only, run once. What cannot run is
 
 from __future__ import annotations
 
+import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -20,11 +22,15 @@ from line_grounds import SHORTER, WRITTEN, Ground, Line, edp, kind_of, lines_of,
 from rich.table import Table
 
 from edp.cli import console
-from edp_site import markdown
+from edp_site import commands, markdown, notebooks
 
 ROOT = Path(__file__).parents[2]
 HISTORY = ("CHANGELOG.md", "findings.md")
-FOLDERS = (ROOT, *(ROOT / "docs" / name for name in ("", "explanation", "reference")), ROOT / "website" / "pages")
+FOLDERS = (
+    ROOT,
+    *(ROOT / "docs" / name for name in ("", "explanation", "howto", "reference", "tutorials")),
+    ROOT / "website" / "pages",
+)
 PAGES = [page for folder in FOLDERS for page in sorted(folder.glob("*.md")) if page.name not in HISTORY]
 LEFT_OUT = {
     "edp live runs/m22 --ros2": "needs ROS 2; tests/unit/live/test_live_sources.py has a stand-in",
@@ -34,16 +40,16 @@ LEFT_OUT = {
         "needs a cluster; tests/unit/search/test_cluster.py"
     ),
     "edp identify LOGS --out MACHINE.toml": "fits a machine; tests/unit/cli/test_cli_identify.py",
-    "edp identify LOGS --out machine.toml": "fits a machine; tests/unit/cli/test_cli_identify.py",
     "edp identify logs --out mine.toml --machine measured.toml": "fits a machine; tests/unit/cli/test_cli_identify.py",
+    "edp replay runs/first_adapted logs/monday --twin runs/grey": (
+        "needs a grey box of the network's velocities; tests/unit/test_adaptation.py runs it on one"
+    ),
+    "edp identify logs --out mine.toml --run runs/grey": "fits a machine; tests/unit/cli/test_cli_identify.py",
     "edp twin logs --set twin.kind=greybox --set twin.linkage=mine.toml --out runs/grey": (
         "fits a grey box; tests/unit/twin/test_grey_linkage.py"
     ),
-    "edp twin data/m22 --set twin.kind=greybox --set twin.linkage=mine.toml --out runs/twin": (
+    "edp twin data/m22 --set twin.kind=greybox --set twin.linkage=mine.toml --out runs/grey": (
         "fits a grey box; tests/unit/twin/test_grey_linkage.py"
-    ),
-    "edp twin logs/loam --start runs/grey --set ground=drag --out runs/grey_loam": (
-        "learns the resistance of the ground; tests/unit/twin/test_ground_run.py"
     ),
     "edp export RUN --to follower --twin GREY --out DIR": (
         "needs a grey box of the network's velocities; tests/unit/test_adaptation.py runs it on one"
@@ -129,6 +135,36 @@ def tables(monkeypatch) -> list[list[str]]:
     monkeypatch.setattr(console.Terminal, "print", keeping)
     monkeypatch.setattr(console.out, "_width", 80)
     return printed
+
+
+def blocks_of(page: Path) -> str:
+    """Return the code blocks of a page, or the command cells of a notebook as blocks."""
+    text = page.read_text(encoding="utf-8")
+    if page.suffix == ".ipynb":
+        cells = [notebooks.command_lines(notebooks.source_of(cell)) for cell in json.loads(text)["cells"]]
+        return "\n".join(f"```sh\n{chr(10).join(lines)}\n```" for lines in cells if lines)
+    return "\n".join(f"```{one.language}\n{one.code}\n```" for one in markdown.fences(text))
+
+
+@pytest.mark.parametrize("page", [*PAGES, *sorted((ROOT / "docs" / "tutorials").glob("*.ipynb"))], ids=lambda p: p.stem)
+def test_every_command_line_of_a_block_is_parsed_by_the_command_line(page):
+    problems = []
+    for number, text in commands.command_lines(blocks_of(page)):
+        words = shlex.split(commands.ENDS.split(f"{text} ")[0], comments=True)[1:]
+        named: tuple[str, ...] = ()
+        while words and (*named, words[0]) in commands.commands():
+            named = (*named, words.pop(0))
+        named = ("search", "run") if named == ("search",) and words else named
+        parsed = commands.commands()[named].parsed
+        if hasattr(parsed, "commands"):
+            assert not words or words[0].startswith("-"), text
+            continue
+        try:
+            parsed.make_context(named[-1], list(words))
+        except Exception as error:  # of the parser's own library, whose classes are not public
+            if type(error).__name__ != "Exit":
+                problems.append(f"line {number}: {text}: {getattr(error, 'message', error)}")
+    assert problems == []
 
 
 @pytest.mark.long

@@ -6,7 +6,7 @@ from edp.logs.reference import reference_page
 from edp.logs.units import normalise_unit
 from edp.signals import KINDS, UNITS, VOCABULARY
 
-PAGE = Path(__file__).parents[2] / "docs" / "channels.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "channels.md"
 
 
 def test_page_is_that_of_the_code():

@@ -14,14 +14,14 @@ from page_grounds import SHORTER, ground_of
 from edp_site import commands, markdown
 
 ROOT = Path(__file__).parents[2]
-FOLDERS = (ROOT / "docs", ROOT / "docs" / "explanation", ROOT / "docs" / "reference")
+FOLDERS = tuple(ROOT / "docs" / name for name in ("", "explanation", "howto", "reference", "tutorials"))
 PAGES = [ROOT / "README.md", *(page for folder in FOLDERS for page in sorted(folder.glob("*.md")))]
 TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
-QUICK = ("files", "statistics", "store", "onnx", "recordings")
+QUICK = ("files", "statistics", "large_stores", "deploy_onnx", "repair_logs")
 """Pages whose blocks take seconds; those of the others run with the slow tests."""
 ELSEWHERE = ("README", "python")
 """Pages that tests/examples/test_python_page.py runs."""
-PROGRAMS = (".", "cmake", "export", "pip", "ray", "source")
+PROGRAMS = (".", ".venv/bin/jupyter", ".venv/bin/pip", "cmake", "colcon", "export", "pip", "ray", "ros2", "source")
 """Programs of others, and words of the shell, that a page may use; what they make of the rest is theirs."""
 LANGUAGES = {"python", "sh", "toml", "json", "c", "matlab", "text", ""}
 _NOT_RUN = re.compile(r"<!-- not run: (.{20,}) -->\s*$")
@@ -94,7 +94,7 @@ def test_every_line_of_a_shell_block_names_what_is_there():
                     assert commands.problems_of(line, commands.commands()) == [], problem
                 elif words[0] == "make":
                     assert {word for word in words[1:] if "=" not in word} <= targets, problem
-                elif words[0] not in PROGRAMS:
+                elif words[0] not in PROGRAMS and words[:2] != ["python", "-m"]:
                     script = words[1] if words[0] == "python" else words[0]
                     assert (ROOT / script).is_file(), problem
     assert {"edp", "make"} <= seen

@@ -13,9 +13,11 @@ import typer
 
 from edp.cli import app
 from edp_site import markdown
+from edp_site.pending import as_today
 
 _SHELLS = ("", "sh", "bash", "console", "shell")
-_ENDS = re.compile(r"\s(?:\||&&|;|>|2>)\s?")
+ENDS = re.compile(r"\s(?:\||&&|;|>|2>)\s?")
+"""What ends a command line in a shell: a pipe, another command or a redirection."""
 _PLACES = re.compile(r"^(\.\.\.|…|\[.*|.*\])$")
 
 
@@ -53,10 +55,10 @@ def command_lines(text: str) -> Iterator[tuple[int, str]]:
             for offset, line in enumerate(joined.splitlines()):
                 start = re.match(r"\s*(?:\$ )?(?:\.venv/bin/)?(edp\s.*)", line)
                 if start:
-                    yield fence.line + offset, start[1]
+                    yield fence.line + offset, as_today(start[1])
     for number, code in markdown.code_spans(text):
         if code.startswith("edp "):
-            yield number, code
+            yield number, as_today(code)
 
 
 def problems_of(line: str, known: dict[tuple[str, ...], Command]) -> list[str]:
@@ -67,7 +69,7 @@ def problems_of(line: str, known: dict[tuple[str, ...], Command]) -> list[str]:
         known: of `commands`.
     """
     try:
-        words = shlex.split(_ENDS.split(f"{line} ")[0], comments=True)[1:]
+        words = shlex.split(ENDS.split(f"{as_today(line)} ")[0], comments=True)[1:]
     except ValueError as error:
         return [f"'{line}' cannot be read: {error}"]
     named: tuple[str, ...] = ()
@@ -91,7 +93,7 @@ def problems_of(line: str, known: dict[tuple[str, ...], Command]) -> list[str]:
 
 def settings_of(line: str) -> tuple[tuple[str, ...], list[str]]:
     """The words of a command line without options, and the changes that its ``--set`` options name."""
-    words = shlex.split(_ENDS.split(f"{line} ")[0], comments=True)[1:]
+    words = shlex.split(ENDS.split(f"{line} ")[0], comments=True)[1:]
     changes = [after for word, after in pairwise(words) if word == "--set"]
     return tuple(words), changes
 

@@ -1,5 +1,7 @@
 """Notebooks: run cell by cell without a notebook server, and shown as Markdown pages.
 
+A cell of lines that begin with ``!`` holds command lines, as in Jupyter; ``!edp ...`` runs in a process of its own.
+
 ``python -m edp_site.notebooks FILE...`` runs notebooks and writes what their cells gave into them.
 """
 
@@ -11,15 +13,20 @@ import contextlib
 import io
 import json
 import os
+import re
+import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from edp_site.pending import as_today, code_as_today
+
 Notebook = dict[str, Any]
+_NOTEBOOK_LINK = re.compile(r"(\]\([\w/.-]+)\.ipynb([#)])")
 PICTURE_DPI = 72
-"""Three small pictures keep a notebook below 100 kB."""
+"""Small pictures keep a notebook with five of them below 200 kB."""
 
 
 def read_notebook(path: Path) -> Notebook:
@@ -72,11 +79,36 @@ def _inside(folder: Path) -> Iterator[None]:
         os.chdir(before)
 
 
+def command_lines(source: str) -> list[str]:
+    """Return the command lines of a shell cell; a cell of Python has none."""
+    lines = [line for line in source.splitlines() if line.strip()]
+    return [line[1:].strip() for line in lines] if all(line.startswith("!") for line in lines) else []
+
+
+def run_line(line: str) -> str:
+    """Run a command line and return what it prints; exit code 6 of a comparison with baselines is no failure.
+
+    Raises:
+        RuntimeError: the command failed.
+    """
+    today = as_today(line)
+    called = re.sub(r"^edp ", f"{sys.executable} -m edp ", today)
+    place = os.pathsep.join(part for part in sys.path if part)
+    environment = {**os.environ, "PYTHONPATH": place, "COLUMNS": "100", "TERM": "dumb"}
+    done = subprocess.run(called, shell=True, env=environment, capture_output=True, text=True, check=False)
+    allowed = {"edp evaluate": (0, 6), "edp twin": (0, 6), "edp monitor run": (0, 5), "edp inspect": (0, 3)}
+    if done.returncode not in next((codes for words, codes in allowed.items() if today.startswith(words)), (0,)):
+        raise RuntimeError(f"{line}: exit code {done.returncode}\n{(done.stdout + done.stderr)[-3000:]}")
+    return done.stdout.replace(f"{Path.cwd()}/", "").replace(str(Path.cwd()), ".")
+
+
 def _run_cell(source: str, space: dict[str, Any]) -> list[dict[str, Any]]:
+    if lines := command_lines(source):
+        return [{"output_type": "stream", "name": "stdout", "text": _lines("".join(map(run_line, lines)))}]
     import matplotlib
 
     matplotlib.use("agg")
-    tree = ast.parse(source)
+    tree = ast.parse(code_as_today(source))
     # As a notebook does: the value of an expression at the end of a cell is shown.
     last = (
         tree.body.pop()
@@ -134,12 +166,15 @@ def notebook_page(path: Path, pictures: Path) -> str:
     parts: list[str] = []
     for cell in read_notebook(path)["cells"]:
         if cell["cell_type"] == "markdown":
-            parts += [source_of(cell), ""]
+            parts += [_NOTEBOOK_LINK.sub(r"\1.md\2", source_of(cell)), ""]
             continue
-        parts += ["```python", source_of(cell).rstrip("\n"), "```", ""]
+        if lines := command_lines(source_of(cell)):
+            parts += ["```sh", *lines, "```", ""]
+        else:
+            parts += ["```python", source_of(cell).rstrip("\n"), "```", ""]
         for output in cell.get("outputs", []):
             parts += _shown(output, path.stem, pictures)
-    parts += [f"The notebook is `examples/notebooks/{path.name}`; `pip install jupyterlab` opens it.", ""]
+    parts += [f"This page is the notebook `docs/tutorials/{path.name}`; `pip install jupyterlab` opens it.", ""]
     return "\n".join(parts)
 
 

@@ -39,6 +39,7 @@ _TABLES: Mapping[str, type] = {
 _ROOTS: Mapping[str, tuple[type, ...]] = {
     "simulate": (ScenarioFile,),
     "twin": (TwinExperiment,),
+    "identify": (TwinExperiment,),
     "control": (ControlExperiment,),
     "tune": (ControlExperiment,),
     "monitor": (MonitorExperiment,),

@@ -54,8 +54,8 @@ def stage(out: Path, demo: Path | None = None, root: Path = ROOT, version: str |
     for path in sorted((root / "website" / "pages").glob("*.md")):
         _write(pages / path.name, path.read_text(encoding="utf-8"))
     gallery.write_gallery(pages, demo)
-    for path in sorted((root / "examples" / "notebooks").glob("*.ipynb")):
-        folder = pages / "notebooks"
+    for path in sorted((root / "docs" / "tutorials").glob("*.ipynb")):
+        folder = pages / "tutorials"
         _write(folder / f"{path.stem}.md", notebooks.notebook_page(path, folder / "pictures"))
     shutil.copytree(root / "docs" / "images", pages / "images")
     shutil.copytree(root / "website" / "theme", pages / "theme")
@@ -169,7 +169,8 @@ class _Copier:
         if name == Path("docs/decisions"):
             return Path("decisions/index.md")
         if name.parts[0] == "docs" and linked.is_file():
-            return Path(*name.parts[1:])
+            place = Path(*name.parts[1:])
+            return place.with_suffix(".md") if place.suffix == ".ipynb" else place
         return self._show(linked)
 
     def _show(self, linked: Path) -> Path:

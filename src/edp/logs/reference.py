@@ -1,4 +1,4 @@
-"""The reference page of channels, kinds and units: ``python -m edp.logs.reference > docs/channels.md``."""
+"""The reference page of channels, kinds and units: ``python -m edp.logs.reference > docs/reference/channels.md``."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def reference_page() -> str:
         [
             "# Channels, kinds and units",
             "",
-            "What a [signal map](recordings.md#signal-map) may name. This page is written by",
+            "What a [signal map](../howto/map_columns.md) may name. This page is written by",
             "`python -m edp.logs.reference` from `edp.signals`; a test holds it to the code.",
             "",
             "## Kinds",
@@ -76,7 +76,7 @@ def reference_page() -> str:
             "",
             *_table(("channel", "kind", "is"), _channels(EXTRA_CHANNELS.values())),
             "",
-            "Where a recording [swings and travels](simulator.md#machines), these come behind them:",
+            "Where a recording [swings and travels](../howto/simulate_recordings.md), these come behind them:",
             "",
             *_table(("channel", "kind", "is"), _channels(MOTOR_CHANNELS.values())),
             "",

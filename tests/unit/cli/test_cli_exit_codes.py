@@ -288,12 +288,12 @@ def test_exit_codes_of_the_docs_are_those_of_the_code():
 def test_pages_promise_the_exit_code_for_commands_that_judge():
     """Every paragraph of the docs with exit code 6 names a command that ends by the rule."""
     promised = []
-    for file in sorted((ROOT / "docs").glob("*.md")):
+    for file in sorted(page for page in (ROOT / "docs").rglob("*.md") if page.parent.name != "decisions"):
         for text in re.split(r"\n\s*\n", file.read_text(encoding="utf-8")):
-            if re.search(r"exit\s+code\s+6|\[exit code 6\]", text) and file.name not in ("results.md", "findings.md"):
+            if re.search(r"(?i)exit\s+code\s+6", text) and file.name not in ("results.md", "findings.md"):
                 named = set(re.findall(r"`edp ([a-z]+)", text))
                 promised.append(file.name)
                 assert not named or named & JUDGING, (file.name, text)
-    assert {"auto.md", "faq.md", "own_logs.md", "twin.md", "control.md", "adaptation.md"} <= set(promised)
+    assert {"troubleshooting.md", "train_plant_model.md", "close_the_loop.md", "adapt_on_board.md"} <= set(promised)
     evaluate = TREE["evaluate"].callback.__doc__
     assert f"exit code {BEATEN}" in evaluate
