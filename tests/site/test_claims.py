@@ -168,9 +168,8 @@ def test_an_archived_script_is_gone_and_its_parts_have_results():
 
 @pytest.mark.parametrize("path", sorted((ROOT / "docs").glob("*.md")), ids=lambda path: path.stem)
 def test_a_page_names_scripts_that_are_there_or_the_commit_that_has_them(path):
-    """Findings name many scripts of earlier versions; the page says once where they are."""
     text = path.read_text(encoding="utf-8")
-    parts = [text] if path.stem == "findings" else re.split(r"^(?=##)", text, flags=re.MULTILINE)
+    parts = re.split(r"^(?=##)", text, flags=re.MULTILINE)
     archived = {one.script: one.place for one in ARCHIVE if not one.parts}
     for part in parts:
         named = set(re.findall(r"(?<!:)benchmarks/(\w+)\.py", part))

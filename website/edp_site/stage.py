@@ -9,7 +9,18 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from edp_site import commands, formats, gallery, markdown, notebooks, parts, python_api, repository_files, results
+from edp_site import (
+    commands,
+    formats,
+    gallery,
+    journal,
+    markdown,
+    notebooks,
+    parts,
+    python_api,
+    repository_files,
+    results,
+)
 
 ROOT = Path(__file__).parents[2]
 _PROJECT_PAGES = {
@@ -70,25 +81,9 @@ def _made(root: Path) -> dict[str, Callable[[], str]]:
             results.read_goals(root / "benchmarks" / "goals.toml"),
             results.read_archive(root / "benchmarks" / "archive.toml"),
         ),
-        "decisions/index.md": lambda: decisions_page(root / "docs" / "decisions"),
+        "decisions/index.md": lambda: journal.decisions_page(root / "docs" / "decisions"),
+        "journal/index.md": lambda: journal.journal_page(journal.read_journal(root / "docs" / "journal")),
     }
-
-
-def decisions_page(folder: Path) -> str:
-    """A table of the decisions by number."""
-    lines = [
-        "# Decisions",
-        "",
-        "What was decided, why, and what was given up for it.",
-        "",
-        "| No. | Decision |",
-        "|---|---|",
-    ]
-    for path in sorted(folder.glob("*.md")):
-        first = markdown.headings(path.read_text(encoding="utf-8"))[0]
-        title = re.sub(r"^\d+[.:]?\s*", "", first.text)
-        lines.append(f"| {path.name[:4]} | [{title}]({path.name}) |")
-    return "\n".join(lines) + "\n"
 
 
 def builder_settings(path: Path, pages: Path) -> str:
@@ -133,8 +128,8 @@ class _Copier:
         name = linked.relative_to(self.root)
         if name.as_posix() in _PROJECT_PAGES:
             return Path(_PROJECT_PAGES[name.as_posix()])
-        if name == Path("docs/decisions"):
-            return Path("decisions/index.md")
+        if name in (Path("docs/decisions"), Path("docs/journal")):
+            return Path(name.name) / "index.md"
         if name.parts[0] == "docs" and linked.is_file():
             return Path(*name.parts[1:])
         return self._show(linked)
