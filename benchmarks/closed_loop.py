@@ -256,7 +256,7 @@ class Stopwatch:
 
 
 def solve_times(twin: Path, spec: ControllerSpec, lines: int) -> dict[str, float]:
-    """Processor time of a tick of the predictive controller on a twin, ms."""
+    """Processor time per sample of the predictive controller on a twin, ms."""
     experiment = ControlExperiment(task=TASKS["grade"](), controller=spec, machine=MACHINE, loops=lines)
     bench = ControlBench(experiment, ControlSources(twin=twin))
     ticks = max(task.reference.ticks for task in bench.tasks) + 1
@@ -267,7 +267,7 @@ def solve_times(twin: Path, spec: ControllerSpec, lines: int) -> dict[str, float
         run_loop(env, watches[-1], task, task.seed)  # type: ignore[arg-type]
     times = 1e3 * np.concatenate([watch.seconds for watch in watches])
     row = {"median": float(np.median(times)), "p99": float(np.percentile(times, 99.0)), "ticks": len(times)}
-    print(f"processor time of a tick of nmpc: {row['median']:.2f} ms, p99 {row['p99']:.2f} ms")
+    print(f"processor time per sample of nmpc: {row['median']:.2f} ms, p99 {row['p99']:.2f} ms")
     return row
 
 
@@ -295,9 +295,9 @@ def check(bench: Bench, rows: Mapping[str, Mapping[str, Any]]) -> None:
         ask(f"nmpc, position error, {name}, against pi", *position)
         pairs = zip(by_name["nmpc"]["path_rms_mm"], by_name["pi"]["path_rms_mm"], strict=True)
         worst = max(own / max(MIN_MM, rival) for own, rival in pairs)
-        ask(f"nmpc, path error over that of pi, {name}, on the line where it is largest", worst, 1.0, "1")
+        ask(f"nmpc, path error relative to pi, {name}, worst line", worst, 1.0, "1")
     violated = sum(row["violations"] for by_name in rows.values() for row in by_name.values())
-    ask("violated limits, all controllers and variants, plus one", violated + 1.0, 1.0, "1")
+    ask("limit violations of all controllers and variants, plus one", violated + 1.0, 1.0, "1")
 
 
 def mean(values: Sequence[float]) -> float:
@@ -337,10 +337,10 @@ def predictive(bench: Bench, models: Models, size: LoopSize, own: Path | None) -
     rows = loops(models, size, bench.seed, spec, own)
     times = solve_times(twin, spec, min(2, size.lines))
     check(bench, rows)
-    bench.check("nmpc, processor time of a tick, p99", times["p99"], 2.0, "<= 1", "ms")
+    bench.check("nmpc, processor time per sample, 99th percentile", times["p99"], 2.0, "<= 1", "ms")
     for ticks, goal in ((20, 2.0), (50, 4.0)):
         for part in ("all", "all, load estimated", "free air") if own else ("all",):
-            name = f"velocities {ticks} ticks ahead, told the commands, {part}"
+            name = f"velocities {ticks} samples ahead, commands known, {part}"
             bench.check(name, ahead[part][str(ticks)], goal, "<= 1", "mm/s")
     return {"ahead_mm_s": ahead, "loops": rows, "tick_ms": times, "size": asdict(size)}
 

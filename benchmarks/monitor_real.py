@@ -359,7 +359,7 @@ def show(bench: Bench, rig: dict[str, Any], sets: dict[str, Any]) -> None:
         for fault, goal in GOALS.items():
             # An area that healthy cycles of other times reach, too, shows the time of recording, not the fault.
             ours = min(lowest(rig["edp.monitor"][what], fault) for what in ("area", "control"))
-            name = f"rig, {fault}: lowest area of a grade, healthy cycles of the same and of other times"
+            name = f"rig, {fault}: lowest AUC of a severity, healthy cycles of equal and other times"
             bench.check(name, ours, goal, ">= 1", "area")
     for name, row in sets.items():
         detectors = [key for key in row if isinstance(row[key], dict)]

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from edp_site import (
@@ -70,20 +71,21 @@ def stage(out: Path, demo: Path | None = None, root: Path = ROOT, version: str |
 
 
 def _made(root: Path) -> dict[str, Callable[[], str]]:
-    return {
+    benchmarks = results.read_benchmarks(root)
+    made: dict[str, Callable[[], str]] = {
         "reference/commands.md": commands.commands_page,
         "reference/python.md": python_api.python_page,
         "reference/parts.md": parts.parts_page,
         "reference/formats.md": formats.formats_page,
         "reference/c.md": formats.c_page,
-        "leaderboard.md": lambda: results.results_page(
-            root / "benchmarks" / "results",
-            results.read_goals(root / "benchmarks" / "goals.toml"),
-            results.read_archive(root / "benchmarks" / "archive.toml"),
-        ),
+        "results.md": lambda: results.results_page(benchmarks),
+        "leaderboard.md": lambda: results.leaderboard_page(benchmarks),
         "decisions/index.md": lambda: journal.decisions_page(root / "docs" / "decisions"),
         "journal/index.md": lambda: journal.journal_page(journal.read_journal(root / "docs" / "journal")),
     }
+    for page in benchmarks.pages:
+        made[f"results/{page.script}.md"] = partial(results.benchmark_page, benchmarks, page)
+    return made
 
 
 def builder_settings(path: Path, pages: Path) -> str:
@@ -130,6 +132,10 @@ class _Copier:
             return Path(_PROJECT_PAGES[name.as_posix()])
         if name in (Path("docs/decisions"), Path("docs/journal")):
             return Path(name.name) / "index.md"
+        if name == Path("benchmarks/results"):
+            return Path("results.md")
+        if name.parent == Path("benchmarks/results"):
+            return Path("results") / f"{results.read_result(linked).script}.md"
         if name.parts[0] == "docs" and linked.is_file():
             return Path(*name.parts[1:])
         return self._show(linked)

@@ -113,7 +113,7 @@ RECURRENT_TICK = 70_000
 """Weights that a tick of the recurrent network passes through."""
 SETTING = "auto.foundation"
 MIN_UPDATES = 120
-"""Of a fine-tuning, where ten passes over the recordings are fewer: those of the measured ones (docs/results.md)."""
+"""Of a fine-tuning, where ten passes over the recordings are fewer: those of the measured ones (benchmarks/results)."""
 
 
 @dataclass(frozen=True)
