@@ -91,12 +91,14 @@ class ReferenceRule:
 
 @dataclass(frozen=True)
 class Headline:
-    """Verdict on the first page of results, with its task and metric in words."""
+    """Verdict on the first page of results, with its task, its metric and the reference that is shown."""
 
     result: str
     title: str
     task: str
     metric: str
+    reference_title: str = ""
+    published: str = ""
 
 
 @dataclass(frozen=True)

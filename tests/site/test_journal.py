@@ -40,7 +40,7 @@ def test_the_page_has_a_row_per_finding(tmp_path):
     (finding,) = read_journal(tmp_path)
     assert finding.tags == ("speed", "training")
     assert finding.words == 17
-    row = "| [A is faster than B](0001-a.md) | A is used. | speed, training | 2026-01-31 |"
+    row = "| [A is faster than B](0001-a.md) | A is used. | speed, training | <time>2026-01-31</time> |"
     assert row in journal_page([finding]).splitlines()
 
 

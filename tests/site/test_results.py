@@ -73,12 +73,12 @@ def test_a_script_has_one_page_with_short_notes_and_headlines_are_few():
 @pytest.mark.parametrize(
     ("changes", "is_met", "goal"),
     [
-        ({}, True, "≤ 0.6 × reference"),
-        ({"target": 0.4}, False, "≤ 0.4 × reference"),
-        ({"direction": "higher", "target": 0.5}, True, "≥ 0.5 × reference"),
-        ({"reference": None, "reference_name": "", "target": 3.0}, True, "≤ 3"),
-        ({"reference": None, "reference_name": "", "target": 0.0, "value": 0.0}, True, "≤ 0"),
-        ({"value": None}, False, "≤ 0.6 × reference"),
+        ({}, True, "≤ 0.6 ×"),
+        ({"target": 0.4}, False, "≤ 0.4 ×"),
+        ({"direction": "higher", "target": 0.5}, True, "≥ 0.5 ×"),
+        ({"reference": None, "reference_name": "", "target": 3.0}, True, "≤ 3 mm"),
+        ({"reference": None, "reference_name": "", "target": 0.0, "value": 0.0}, True, "≤ 0 mm"),
+        ({"value": None}, False, "≤ 0.6 ×"),
     ],
 )
 def test_a_verdict_is_met_by_its_figures(changes, is_met, goal):
@@ -123,8 +123,10 @@ def test_the_first_page_shows_every_headline_with_its_reference_and_outcome():
     for headline in ALL.headlines:
         one = ALL.verdict(headline)
         row = next(line for line in page.splitlines() if line.startswith(f"| [{headline.task}]("))
-        assert f"{results.figure(one.value)} " in row
+        assert f"| {results.figure(one.value)} " in row
+        assert f"| {ALL.reference(headline)} |" in row
         assert one.reference_name in row
+        assert not (headline.published or headline.reference_title) or ALL.reference(headline)
         assert ("**missed**" in row) == (not one.is_met)
 
 

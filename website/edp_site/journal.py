@@ -101,6 +101,10 @@ def read_journal(folder: Path) -> list[Finding]:
 def journal_page(findings: Sequence[Finding]) -> str:
     """Return the page that lists all findings, newest first; scripts of the site filter its rows by tag."""
     lines = [
+        "---",
+        "hide: [toc]",
+        "---",
+        "",
         "# Journal",
         "",
         f"{len(findings)} findings: what was tried, what came out, what followed from it. Failed attempts are included "
@@ -113,7 +117,7 @@ def journal_page(findings: Sequence[Finding]) -> str:
     ]
     for one in reversed(findings):
         title, conclusion = (text.replace("|", "\\|") for text in (one.title, one.conclusion))
-        lines.append(f"| [{title}]({one.name}) | {conclusion} | {', '.join(one.tags)} | {one.date[:10]} |")
+        lines.append(f"| [{title}]({one.name}) | {conclusion} | {', '.join(one.tags)} | <time>{one.date[:10]}</time> |")
     return "\n".join(lines) + "\n"
 
 
@@ -136,5 +140,5 @@ def decisions_page(folder: Path) -> str:
         )
         if state is None:
             raise ValueError(f"{path.name}: got no status line, expected 'Status: accepted. Date: 2026-01-31.'")
-        lines.append(f"| {path.name[:4]} | [{title}]({path.name}) | {state[1]} | {state[2]} |")
+        lines.append(f"| {path.name[:4]} | [{title}]({path.name}) | {state[1]} | <time>{state[2]}</time> |")
     return "\n".join(lines) + "\n"

@@ -11,6 +11,8 @@ from typing import Any
 
 MAX_HEADLINES, MAX_NOTE_WORDS = 20, 80
 DIRECTIONS = ("lower", "higher")
+SHOWN_UNITS = {"1": "", "ratio": "", "share": "", "mm/s recovered": "mm/s", "s of motion": "s"}
+"""Units as they are shown, where they differ from those of the results."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class Verdict:
     def goal(self) -> str:
         """Target in words."""
         sign = "≤" if self.direction == "lower" else "≥"
-        return f"{sign} {figure(self.target)}" + (" × reference" if self.reference_name else "")
+        return f"{sign} {figure(self.target)} ×" if self.reference_name else f"{sign} {_value(self.target, self.unit)}"
 
     @property
     def outcome(self) -> str:
@@ -166,12 +168,23 @@ class Page:
 
 @dataclass(frozen=True)
 class Headline:
-    """Verdict on the first page, with its task and metric in words."""
+    """Verdict on the first page.
+
+    Attributes:
+        result: name of the result file.
+        title: title of the verdict.
+        task: task in words.
+        metric: metric in words.
+        reference_title: another verdict of the result, whose reference is shown.
+        published: published model of ``examples/real/leagues.toml``, which is shown as reference.
+    """
 
     result: str
     title: str
     task: str
     metric: str
+    reference_title: str = ""
+    published: str = ""
 
 
 @dataclass(frozen=True)
@@ -185,6 +198,7 @@ class Benchmarks:
         goals: goals that were asked.
         archive: removed benchmarks.
         docs: folder of the hand-written pages; links to pages that it lacks are left out.
+        published: errors of published models by name.
     """
 
     results: tuple[Result, ...]
@@ -193,15 +207,22 @@ class Benchmarks:
     goals: tuple[Goal, ...]
     archive: tuple[Archived, ...]
     docs: Path
+    published: Mapping[str, float]
 
     def of_script(self, script: str) -> list[Result]:
         """Return the result files of a script."""
         return [result for result in self.results if result.script == script]
 
-    def verdict(self, headline: Headline) -> Verdict:
-        """Return the verdict of a headline."""
+    def verdict(self, headline: Headline, title: str = "") -> Verdict:
+        """Return the verdict of a headline, or another one of its result by title."""
         result = next(one for one in self.results if one.name == headline.result)
-        return next(one for one in result.verdicts if one.title == headline.title)
+        return next(one for one in result.verdicts if one.title == (title or headline.title))
+
+    def reference(self, headline: Headline) -> str:
+        """Return the best reference of a headline in words."""
+        if headline.published:
+            return f"{figure(self.published[headline.published])} ({headline.published})"
+        return reference_text(self.verdict(headline, headline.reference_title))
 
     def outcomes(self, goal: Goal) -> list[bool]:
         """Return which verdicts of a goal are met."""
@@ -213,6 +234,7 @@ def read_benchmarks(root: Path) -> Benchmarks:
     """Read results, catalogue, goals and archive of a repository."""
     folder = root / "benchmarks"
     catalogue = tomllib.loads((folder / "catalogue.toml").read_text(encoding="utf-8"))
+    leagues = tomllib.loads((root / "examples" / "real" / "leagues.toml").read_text(encoding="utf-8"))
     return Benchmarks(
         tuple(read_results(folder / "results")),
         tuple(Page(**row) for row in catalogue["page"]),
@@ -220,6 +242,7 @@ def read_benchmarks(root: Path) -> Benchmarks:
         tuple(read_goals(folder / "goals.toml")),
         tuple(read_archive(folder / "archive.toml")),
         root / "docs",
+        {name: value for league in leagues["leagues"] for name, value in league["published"].items()},
     )
 
 
@@ -233,10 +256,15 @@ def results_page(benchmarks: Benchmarks) -> str:
     shown = [benchmarks.verdict(headline) for headline in benchmarks.headlines]
     met = sum(verdict.is_met for verdict in shown)
     lines = [
+        "---",
+        "hide: [toc]",
+        "---",
+        "",
         "# Results",
         "",
         f"{len(shown)} headline figures, {met} targets met, {len(shown) - met} missed. Each task leads to its "
-        "benchmark: command, notes and all figures. A reference was measured in the same run unless it was published.",
+        "benchmark: command, notes and all figures. A reference was measured in the same run unless it was published. "
+        "A target with × is a multiple of the reference. MAE and RMSE are the mean absolute and the root mean square error.",
         "",
         "| Task | Metric | EDP | Best reference | Target | Outcome |",
         "|---|---|---:|---|---|---|",
@@ -245,7 +273,7 @@ def results_page(benchmarks: Benchmarks) -> str:
         place = place_of(next(one for one in benchmarks.results if one.name == headline.result))
         lines.append(
             f"| [{headline.task}]({place}) | {headline.metric} | {_value(verdict.value, verdict.unit)} "
-            f"| {_reference(verdict)} | {verdict.goal} | {verdict.outcome} |"
+            f"| {benchmarks.reference(headline)} | {verdict.goal} | {verdict.outcome} |"
         )
     lines += [
         "",
@@ -305,7 +333,8 @@ def leaderboard_page(benchmarks: Benchmarks) -> str:
         "# Leaderboard",
         "",
         f"{len(benchmarks.results)} result files, {len(verdicts)} verdicts, {met} targets met, {len(verdicts) - met} "
-        "missed. Files of one benchmark with other arguments repeat verdicts, so the count is no score.",
+        "missed. Files of one benchmark with other arguments repeat verdicts, so the count is no score. A target with × "
+        "is a multiple of the reference.",
         "",
         "## Headlines",
         "",
@@ -339,18 +368,19 @@ def _table(verdicts: Sequence[Verdict]) -> list[str]:
     rows = ["| Verdict | EDP | Reference | Target | Outcome |", "|---|---:|---|---|---|"]
     for one in verdicts:
         title = one.title.replace("|", "\\|")
-        rows.append(f"| {title} | {_value(one.value, one.unit)} | {_reference(one)} | {one.goal} | {one.outcome} |")
+        rows.append(f"| {title} | {_value(one.value, one.unit)} | {reference_text(one)} | {one.goal} | {one.outcome} |")
     return rows
 
 
-def _reference(verdict: Verdict) -> str:
+def reference_text(verdict: Verdict) -> str:
+    """Return the reference of a verdict with its name, or an empty text."""
     if not verdict.reference_name:
         return ""
     return f"{figure(verdict.reference)} ({verdict.reference_name})"
 
 
 def _value(value: float | None, unit: str) -> str:
-    return f"{figure(value)} {'' if unit in ('1', 'ratio') else unit}".rstrip()
+    return f"{figure(value)} {SHOWN_UNITS.get(unit, unit)}".rstrip()
 
 
 def figure(value: float | None) -> str:
