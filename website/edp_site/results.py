@@ -264,7 +264,7 @@ def results_page(benchmarks: Benchmarks) -> str:
         "",
         f"{len(shown)} headline figures, {met} targets met, {len(shown) - met} missed. Each task leads to its "
         "benchmark: command, notes and all figures. A reference was measured in the same run unless it was published. "
-        "A target with × is a multiple of the reference. MAE and RMSE are the mean absolute and the root mean square error.",
+        "A target with × is a multiple of the reference. MAE: mean absolute error; RMSE: root mean square error.",
         "",
         "| Task | Metric | EDP | Best reference | Target | Outcome |",
         "|---|---|---:|---|---|---|",
@@ -333,8 +333,8 @@ def leaderboard_page(benchmarks: Benchmarks) -> str:
         "# Leaderboard",
         "",
         f"{len(benchmarks.results)} result files, {len(verdicts)} verdicts, {met} targets met, {len(verdicts) - met} "
-        "missed. Files of one benchmark with other arguments repeat verdicts, so the count is no score. A target with × "
-        "is a multiple of the reference.",
+        "missed. Files of one benchmark with other arguments repeat verdicts, so the count is no score. A target with "
+        "× is a multiple of the reference.",
         "",
         "## Headlines",
         "",
