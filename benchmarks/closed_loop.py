@@ -1,8 +1,8 @@
 """How far is the bucket tip off in closed loop, under predictive control on a twin?
 
 Predictive control stands beside a PI loop that is tuned in the same run and an inversion of the twin, on three draws of
-six lines on which nothing was tuned: the machine as it was, then with oil at 65 degC, dead bands 3 points wider, noise
-of velocities and pressures five times as large, and in loam, all with the models of the plant as it was. The score is
+six lines on which nothing was tuned: the nominal machine, then with oil at 65 degC, dead bands 3 points wider, noise
+of velocities and pressures five times as large, and in loam, all with the models of the nominal plant. The score is
 the position error to the reference of the same time; the distance to the path stands beside it.
 
 Part nmpc does so on a well-trained recurrent twin of M22, and on C14 after 20 minutes of its logs. Part grey takes a
@@ -65,7 +65,7 @@ class LoopSize:
         draws: of lines.
         trials: of the tuning of the PI loop.
         tuned_lines: that it is tuned on.
-        variants: how many of them, the machine as it was among them.
+        variants: how many of them, the nominal machine among them.
     """
 
     lines: int
@@ -96,15 +96,15 @@ class Variant:
     other: bool = False
 
 
-AS_IT_WAS = ("as it was", Variant())
+NOMINAL = ("nominal machine", Variant())
 OTHER_NAME = "C14 after minutes of its logs"
 
 
 def variants(folder: Path) -> dict[str, Variant]:
-    """By name; the models of all but the last are those of the plant as it was."""
+    """By name; the models of all but the last are those of the nominal plant."""
     sensors = asdict(load_machine(MACHINE).sensors)
     return {
-        AS_IT_WAS[0]: AS_IT_WAS[1],
+        NOMINAL[0]: NOMINAL[1],
         "oil at 65 degC": Variant(options={"oil_temperature": 65.0}),
         "dead bands 3 points wider": Variant(machine=str(wider_dead_band(folder))),
         "noise five times as large": Variant(options={"sensors": {name: NOISE * sensors[name] for name in NOISY}}),
@@ -152,7 +152,7 @@ def loops(
     folder, rows = models.folder, {}
     named = list(variants(folder).items())[: 5 if own else 6]
     # The last ones: the other machine is always among them.
-    for name, variant in [AS_IT_WAS, *named[1:][1 - size.variants :]]:
+    for name, variant in [NOMINAL, *named[1:][1 - size.variants :]]:
         twin = models.other_twin() if variant.other else own or models.twin()
         rows[name] = on_variant(folder, (name, variant), size, seed, nmpc, twin)
     return rows
@@ -167,7 +167,7 @@ def on_variant(
     experiment = ControlExperiment(task=TASKS["grade"](), controller=nmpc, machine=machine, loops=1)
     known = ControlBench(experiment, ControlSources(twin=twin)).models
     contenders = {"pi": (tuned_pi(folder, machine, size, seed), known), "nmpc": (nmpc, known)}
-    if name == AS_IT_WAS[0]:
+    if name == NOMINAL[0]:
         contenders["inversion of the twin"] = (CONTROLLERS["inversion"](), ControlModels(twin=known.twin))
     row = {who: judged(folder, variant, size, *what) for who, what in contenders.items()}
     show(name, row)
@@ -277,8 +277,8 @@ def check(bench: Bench, rows: Mapping[str, Mapping[str, Any]]) -> None:
     def ask(name: str, ours: float, bound: float, unit: str = "mm") -> None:
         bench.check(name, ours, bound, "<= 1", unit)
 
-    if AS_IT_WAS[0] in rows:
-        first = rows[AS_IT_WAS[0]]
+    if NOMINAL[0] in rows:
+        first = rows[NOMINAL[0]]
         nmpc = first["nmpc"]
         ask("nmpc, path error, mean", mean(nmpc["path_rms_mm"]), 3.0)
         ask("nmpc, path error, worst line", max(nmpc["path_rms_mm"]), 5.0)
@@ -288,7 +288,7 @@ def check(bench: Bench, rows: Mapping[str, Mapping[str, Any]]) -> None:
     bounds = {"in loam": 7.0, OTHER_NAME: 4.0}
     for name, by_name in rows.items():
         ours = mean(by_name["nmpc"]["path_rms_mm"])
-        if name != "as it was":
+        if name != "nominal machine":
             ask(f"nmpc, path error, mean, {name}", ours, bounds.get(name, 1.5 * 3.0))
         ask(f"nmpc, path error, {name}, against pi", ours, max(MIN_MM, mean(by_name["pi"]["path_rms_mm"])))
         position = [mean(by_name[who]["position_rms_mm"]) for who in ("nmpc", "pi")]

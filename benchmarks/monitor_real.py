@@ -375,7 +375,7 @@ def show(bench: Bench, rig: dict[str, Any], sets: dict[str, Any]) -> None:
         # Where no rival keeps the rate: one case.
         best = max((row[d]["found"]["all"] for d in kept), default=1.0 / row["cases"])
         ours = row["edp.monitor"]
-        bench.check(f"{name}: found against the best rival", ours["found"]["all"], best, ">= 1", "share")
+        bench.check(f"{name}: faults found against the best detector", ours["found"]["all"], best, ">= 1", "share")
         bench.check(f"{name}: false alarms", float(ours["false_alarms"]), allowed, "<= 1", "alarms")
 
 

@@ -153,7 +153,7 @@ def show(found: dict[str, dict[str, Any]], quick: bool) -> list[Verdict]:
     print("\nerror of free runs over the static map's (share of diverged runs)" + (" (quick)" if quick else ""))
     table(["set", "chosen", "twin", *RIVALS, "promise", "processor s"], rows)
     mean = math.exp(sum(math.log(one.ratio) for one in verdicts) / len(verdicts))
-    verdicts.append(verdict("geometric mean over sets, twin against the best rival", mean, 1.0, "<= 0.9", "1"))
+    verdicts.append(verdict("geometric mean over sets, twin against the best baseline", mean, 1.0, "<= 0.9", "1"))
     return verdicts
 
 
