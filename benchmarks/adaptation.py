@@ -16,7 +16,7 @@ before the correction above, without and with a thermometer in the oil.
 Rivals on the same ticks: no adaptation; offset and gain of each predicted change, by recursive least squares; the whole
 last layer's features by recursive least squares with forgetting and no bounds, from the backbone's representation.
 
-Cost: instructions of a tick on an emulated Cortex-M4F, with and without `adapt`. Divergence: the C code for 24 h under
+Cost: instructions per sample on an emulated Cortex-M4F, with and without `adapt`. Divergence: the C code for 24 h under
 an adversary (tests/export/adversary.c), around a narrow network with weights as drawn, so that a day takes a minute: an
 adaptation sees inputs and predictions only, and those of such a network are worse.
 """
@@ -417,15 +417,15 @@ def retrained(
 def check_costs_and_attacks(bench: Bench, bundle: Bundle, bank_of: DataSource, ticks: int) -> dict[str, Any]:
     """Instructions of a tick, and what an adversary does to the correction; returns the latter."""
     without, with_ = instructions(bundle)
-    bench.check("instructions of a tick, with over without", with_, without, "<= 1.1", "1")
+    bench.check("instructions per sample, with adaptation against without", with_, without, "<= 1.1", "1")
     bank = bundle.task.series(bank_of.read()[0]).inputs
     names = ("corrected", "worst", "not_finite", "repairs", "beyond", "without", "with", "worst_turn", "taken_back")
     attack = dict(zip(names, attacked(narrow(bundle, bench.seed), bank, ticks), strict=True))
     print(f"adversary, {ticks / 360_000:g} h: {attack}")
     wrong = attack["not_finite"] + attack["repairs"] + attack["beyond"]
-    bench.check("faults under the adversary, against one", wrong, 1.0, "<= 0", "faults")
-    bench.check("largest correction over its limit", attack["worst"], 1.0, "<= 1.000001", "1")
-    name = "error under the adversary, with over without"
+    bench.check("faults under adversarial inputs", wrong, 1.0, "<= 0", "faults")
+    bench.check("largest correction relative to its limit", attack["worst"], 1.0, "<= 1.000001", "1")
+    name = "error under adversarial inputs, with adaptation against without"
     bench.check(name, attack["with"], attack["without"], "<= 1.05", "units")
     return attack | {"ticks": ticks}
 
@@ -438,10 +438,14 @@ def check_followers(bench: Bench, found: dict[str, dict[str, float]], attainable
             loss = ways["frozen"] - before["frozen"]
             for way in ("follower, adapted", "follower with thermometer, adapted"):
                 left = loss - (ways[way] - before[way])
-                bench.check(f"{name}: {way}: of the change alone", left, loss, ">= 0.5", "mm/s recovered")
+                bench.check(
+                    f"{name}: {way}: recovered loss of the change alone", left, loss, ">= 0.5", "mm/s recovered"
+                )
         elif name in attainable:
             won, wanted = ways["frozen"] - ways["follower, adapted"], ways["frozen"] - attainable[name]
-            bench.check("clay: follower, adapted: over what training wins", won, wanted, ">= 0.8", "mm/s recovered")
+            bench.check(
+                "clay: follower, adapted: gain relative to training in clay", won, wanted, ">= 0.8", "mm/s recovered"
+            )
 
 
 def check_recovered(bench: Bench, found: dict[str, dict[str, float]]) -> None:
@@ -457,7 +461,7 @@ def check_recovered(bench: Bench, found: dict[str, dict[str, float]]) -> None:
             rows.append([name, way, mae, *shares])
         if loss:
             gained = ways["frozen"] - ways["adapted"]
-            bench.check(f"{name}: recovered of the loss", gained, loss, ">= 0.5", "mm/s recovered")
+            bench.check(f"{name}: recovered loss, linear correction", gained, loss, ">= 0.5", "mm/s recovered")
     table(["scenario", "way", "MAE mm/s", "recovered", "of the change"], rows)
 
 

@@ -62,7 +62,7 @@ def on_board(folder: Path, sources: Sequence[object], *flags: str) -> list[str]:
 
 
 def instructions(folder: Path, *flags: str) -> int:
-    """Return the executed instructions of a tick on the M4, the mean over 200."""
+    """Return the executed instructions per sample on the M4, the mean over 200."""
     return int(on_board(folder, (*sources_of(folder), BOARD / "count.c"), *flags)[0])
 
 

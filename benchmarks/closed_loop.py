@@ -1,8 +1,8 @@
 """How far is the bucket tip off in closed loop, under predictive control on a twin?
 
 Predictive control stands beside a PI loop that is tuned in the same run and an inversion of the twin, on three draws of
-six lines on which nothing was tuned: the machine as it was, then with oil at 65 degC, dead bands 3 points wider, noise
-of velocities and pressures five times as large, and in loam, all with the models of the plant as it was. The score is
+six lines on which nothing was tuned: the nominal machine, then with oil at 65 degC, dead bands 3 points wider, noise
+of velocities and pressures five times as large, and in loam, all with the models of the nominal plant. The score is
 the position error to the reference of the same time; the distance to the path stands beside it.
 
 Part nmpc does so on a well-trained recurrent twin of M22, and on C14 after 20 minutes of its logs. Part grey takes a
@@ -65,7 +65,7 @@ class LoopSize:
         draws: of lines.
         trials: of the tuning of the PI loop.
         tuned_lines: that it is tuned on.
-        variants: how many of them, the machine as it was among them.
+        variants: how many of them, the nominal machine among them.
     """
 
     lines: int
@@ -96,15 +96,15 @@ class Variant:
     other: bool = False
 
 
-AS_IT_WAS = ("as it was", Variant())
+NOMINAL = ("nominal machine", Variant())
 OTHER_NAME = "C14 after minutes of its logs"
 
 
 def variants(folder: Path) -> dict[str, Variant]:
-    """By name; the models of all but the last are those of the plant as it was."""
+    """By name; the models of all but the last are those of the nominal plant."""
     sensors = asdict(load_machine(MACHINE).sensors)
     return {
-        AS_IT_WAS[0]: AS_IT_WAS[1],
+        NOMINAL[0]: NOMINAL[1],
         "oil at 65 degC": Variant(options={"oil_temperature": 65.0}),
         "dead bands 3 points wider": Variant(machine=str(wider_dead_band(folder))),
         "noise five times as large": Variant(options={"sensors": {name: NOISE * sensors[name] for name in NOISY}}),
@@ -152,7 +152,7 @@ def loops(
     folder, rows = models.folder, {}
     named = list(variants(folder).items())[: 5 if own else 6]
     # The last ones: the other machine is always among them.
-    for name, variant in [AS_IT_WAS, *named[1:][1 - size.variants :]]:
+    for name, variant in [NOMINAL, *named[1:][1 - size.variants :]]:
         twin = models.other_twin() if variant.other else own or models.twin()
         rows[name] = on_variant(folder, (name, variant), size, seed, nmpc, twin)
     return rows
@@ -167,7 +167,7 @@ def on_variant(
     experiment = ControlExperiment(task=TASKS["grade"](), controller=nmpc, machine=machine, loops=1)
     known = ControlBench(experiment, ControlSources(twin=twin)).models
     contenders = {"pi": (tuned_pi(folder, machine, size, seed), known), "nmpc": (nmpc, known)}
-    if name == AS_IT_WAS[0]:
+    if name == NOMINAL[0]:
         contenders["inversion of the twin"] = (CONTROLLERS["inversion"](), ControlModels(twin=known.twin))
     row = {who: judged(folder, variant, size, *what) for who, what in contenders.items()}
     show(name, row)
@@ -256,7 +256,7 @@ class Stopwatch:
 
 
 def solve_times(twin: Path, spec: ControllerSpec, lines: int) -> dict[str, float]:
-    """Processor time of a tick of the predictive controller on a twin, ms."""
+    """Processor time per sample of the predictive controller on a twin, ms."""
     experiment = ControlExperiment(task=TASKS["grade"](), controller=spec, machine=MACHINE, loops=lines)
     bench = ControlBench(experiment, ControlSources(twin=twin))
     ticks = max(task.reference.ticks for task in bench.tasks) + 1
@@ -267,7 +267,7 @@ def solve_times(twin: Path, spec: ControllerSpec, lines: int) -> dict[str, float
         run_loop(env, watches[-1], task, task.seed)  # type: ignore[arg-type]
     times = 1e3 * np.concatenate([watch.seconds for watch in watches])
     row = {"median": float(np.median(times)), "p99": float(np.percentile(times, 99.0)), "ticks": len(times)}
-    print(f"processor time of a tick of nmpc: {row['median']:.2f} ms, p99 {row['p99']:.2f} ms")
+    print(f"processor time per sample of nmpc: {row['median']:.2f} ms, p99 {row['p99']:.2f} ms")
     return row
 
 
@@ -277,8 +277,8 @@ def check(bench: Bench, rows: Mapping[str, Mapping[str, Any]]) -> None:
     def ask(name: str, ours: float, bound: float, unit: str = "mm") -> None:
         bench.check(name, ours, bound, "<= 1", unit)
 
-    if AS_IT_WAS[0] in rows:
-        first = rows[AS_IT_WAS[0]]
+    if NOMINAL[0] in rows:
+        first = rows[NOMINAL[0]]
         nmpc = first["nmpc"]
         ask("nmpc, path error, mean", mean(nmpc["path_rms_mm"]), 3.0)
         ask("nmpc, path error, worst line", max(nmpc["path_rms_mm"]), 5.0)
@@ -288,16 +288,16 @@ def check(bench: Bench, rows: Mapping[str, Mapping[str, Any]]) -> None:
     bounds = {"in loam": 7.0, OTHER_NAME: 4.0}
     for name, by_name in rows.items():
         ours = mean(by_name["nmpc"]["path_rms_mm"])
-        if name != "as it was":
+        if name != "nominal machine":
             ask(f"nmpc, path error, mean, {name}", ours, bounds.get(name, 1.5 * 3.0))
         ask(f"nmpc, path error, {name}, against pi", ours, max(MIN_MM, mean(by_name["pi"]["path_rms_mm"])))
         position = [mean(by_name[who]["position_rms_mm"]) for who in ("nmpc", "pi")]
         ask(f"nmpc, position error, {name}, against pi", *position)
         pairs = zip(by_name["nmpc"]["path_rms_mm"], by_name["pi"]["path_rms_mm"], strict=True)
         worst = max(own / max(MIN_MM, rival) for own, rival in pairs)
-        ask(f"nmpc, path error over that of pi, {name}, on the line where it is largest", worst, 1.0, "1")
+        ask(f"nmpc, path error relative to pi, {name}, worst line", worst, 1.0, "1")
     violated = sum(row["violations"] for by_name in rows.values() for row in by_name.values())
-    ask("violated limits, all controllers and variants, plus one", violated + 1.0, 1.0, "1")
+    ask("limit violations of all controllers and variants, plus one", violated + 1.0, 1.0, "1")
 
 
 def mean(values: Sequence[float]) -> float:
@@ -337,10 +337,10 @@ def predictive(bench: Bench, models: Models, size: LoopSize, own: Path | None) -
     rows = loops(models, size, bench.seed, spec, own)
     times = solve_times(twin, spec, min(2, size.lines))
     check(bench, rows)
-    bench.check("nmpc, processor time of a tick, p99", times["p99"], 2.0, "<= 1", "ms")
+    bench.check("nmpc, processor time per sample, 99th percentile", times["p99"], 2.0, "<= 1", "ms")
     for ticks, goal in ((20, 2.0), (50, 4.0)):
         for part in ("all", "all, load estimated", "free air") if own else ("all",):
-            name = f"velocities {ticks} ticks ahead, told the commands, {part}"
+            name = f"velocities {ticks} samples ahead, commands known, {part}"
             bench.check(name, ahead[part][str(ticks)], goal, "<= 1", "mm/s")
     return {"ahead_mm_s": ahead, "loops": rows, "tick_ms": times, "size": asdict(size)}
 

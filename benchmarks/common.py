@@ -32,6 +32,7 @@ import numpy as np
 from edp.progress import SilentProgress
 from edp.storage import make_folder, read_json, write_json
 from edp.storage.provenance import command_line, environment
+from verdicts import Verdict, stored_verdicts
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS, EXAMPLES = ROOT / "benchmarks" / "results", ROOT / "examples" / "real"
@@ -48,31 +49,6 @@ class Skipped(Exception):
     """Raised where a benchmark cannot run here; its text says what is missing."""
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """One question answered: ours against a rival measured in the same run.
-
-    Attributes:
-        name: the question.
-        ours: our figure.
-        rival: the rival's figure.
-        ratio: ours over rival.
-        goal: the bound on the ratio, such as ``<= 0.6`` or ``>= 15``.
-        met: whether the ratio keeps the bound.
-        unit: unit of ours and rival.
-        quick: whether this was the short form.
-    """
-
-    name: str
-    ours: float
-    rival: float
-    ratio: float
-    goal: str
-    met: bool
-    unit: str
-    quick: bool
-
-
 class PrintedProgress(SilentProgress):
     """Progress with a line per note and per step."""
 
@@ -85,18 +61,15 @@ class PrintedProgress(SilentProgress):
         print(done, *(f"{name} {value:.4f}" for name, value in values.items()), flush=True)
 
 
-def verdict(name: str, ours: float, rival: float, goal: str, unit: str, quick: bool) -> Verdict:
-    """Compare ``ours / rival`` with `goal`, for example ``<= 0.6``.
+def verdict(title: str, value: float, reference: float, goal: str, unit: str) -> Verdict:
+    """Compare ``value / reference`` with `goal`, for example ``<= 0.6``.
 
     Raises:
-        ValueError: the goal asks for more of a cost; then `ours` and `rival` are interchanged.
+        ValueError: the goal asks for more of a cost; then `value` and `reference` are interchanged.
     """
-    sign, bound = goal.split()
-    if unit in COSTS and sign == ">=":
-        raise ValueError(f"verdict {name!r}: got goal '{goal}', but less {unit} is better; interchange the figures")
-    ratio = ours / rival if rival else float("inf")
-    met = ratio <= float(bound) if sign == "<=" else ratio >= float(bound)
-    return Verdict(name, ours, rival, ratio, goal, met, unit, quick)
+    if unit in COSTS and goal.startswith(">="):
+        raise ValueError(f"verdict {title!r}: got goal '{goal}', but less {unit} is better; interchange the figures")
+    return Verdict(title, value, reference, goal, unit)
 
 
 @dataclass(frozen=True)
@@ -152,9 +125,9 @@ class Bench:
         """Folder of ``--data``, or one in the working folder."""
         return getattr(self.options, "data", None) or self.folder / "data"
 
-    def check(self, name: str, ours: float, rival: float, goal: str, unit: str) -> Verdict:
-        """Answer a question; see `verdict`."""
-        self.verdicts.append(verdict(name, ours, rival, goal, unit, self.quick))
+    def check(self, title: str, value: float, reference: float, goal: str, unit: str) -> Verdict:
+        """Add a verdict; see `verdict`. ``benchmarks/catalogue.toml`` names its reference."""
+        self.verdicts.append(verdict(title, value, reference, goal, unit))
         return self.verdicts[-1]
 
     def part(self, name: str, measure: Callable[[], Any]) -> Any:
@@ -165,10 +138,12 @@ class Bench:
         """Print the verdicts, keep the result, and print one line of JSON; the next result begins empty."""
         print()
         rows = [
-            [v.name, v.ours, v.rival, v.ratio, v.goal, "met" if v.met else "NOT MET", v.unit] for v in self.verdicts
+            [v.title, v.value, v.reference, v.ratio, v.goal, "met" if v.is_met else "NOT MET", v.unit]
+            for v in self.verdicts
         ]
-        table(["question", "ours", "rival", "ratio", "goal", "verdict", "unit"], rows)
-        plain = [finite(asdict(v)) for v in self.verdicts]
+        table(["verdict", "EDP", "reference", "ratio", "goal", "outcome", "unit"], rows)
+        script = command_line().split()[0].removesuffix(".py")
+        plain = [finite(asdict(v)) for v in stored_verdicts(self.verdicts, self.name, script)]
         if self.options.out or (self.keep and not self.quick):
             result = {
                 "command": command_line(),

@@ -230,7 +230,7 @@ def main(bench: Bench) -> object:
            "high estimate"], rows)  # fmt: skip
     for number_format, found in ratios.items():
         worst = max(found, key=lambda ratio: abs(np.log(ratio)))
-        name = f"{number_format}: largest ratio of estimate and counted cycles, either way"
+        name = f"{number_format}: largest ratio between estimated and counted cycles"
         bench.check(name, max(worst, 1 / worst), 1.0, "<= 1.15", "1")
         if bench.options.fit:
             macs, outputs, cycles = (np.array(column, float) for column in zip(*fits[number_format], strict=True))

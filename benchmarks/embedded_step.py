@@ -140,11 +140,11 @@ def main(bench: Bench) -> object:
         made = (size, graph.parameters, graph.macs, counted, counted / graph.macs, code)
         rows.append((*made, step, window, host, onnx_window, onnx_step, torch))
         for name, ours, rival, goal, unit in (
-            ("instructions of a tick, C against emx-onnx-cgen's step", counted, step, "<= 0.5", "instructions"),
-            ("instructions of a tick, C against emx-onnx-cgen's window", counted, window, "<= 0.0333", "instructions"),
-            ("instructions of a tick, W8A16 against emx-onnx-cgen's step", eight, step, "<= 0.5", "instructions"),
-            ("time of a tick, C against ONNX Runtime on the window", host, onnx_window, "<= 0.05", "us"),
-            ("time of a tick, C against PyTorch", host, torch, "<= 0.05", "us"),
+            ("instructions per sample, C against emx-onnx-cgen's step", counted, step, "<= 0.5", "instructions"),
+            ("instructions per sample, C against emx-onnx-cgen's window", counted, window, "<= 0.0333", "instructions"),
+            ("instructions per sample, W8A16 against emx-onnx-cgen's step", eight, step, "<= 0.5", "instructions"),
+            ("time per sample, C against ONNX Runtime on the window", host, onnx_window, "<= 0.05", "us"),
+            ("time per sample, C against PyTorch", host, torch, "<= 0.05", "us"),
         ):
             bench.check(f"{size}: {name}", ours, rival, goal, unit)
     table(HEADS, rows)

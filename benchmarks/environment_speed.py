@@ -174,13 +174,13 @@ def check(bench: Bench, middle: dict[str, float], errors: dict[str, list[float]]
         forms = ("side by side", "one by one", "naive loop", "plant alone by samples")
         many, one, rival, alone = (middle[f"{form}, {name}"] for form in forms)
         unit = "ticks / processor s"
-        bench.check(f"64 side by side against the goal, {name}", many, GOAL_BATCH, ">= 1", unit)
-        bench.check(f"one by one against the goal, {name}", one, GOAL_SINGLE, ">= 1", unit)
-        bench.check(f"one by one against the naive loop, {name}", one, rival, ">= 5", unit)
-        bench.check(f"one by one against the plant alone, {name}", one, alone, ">= 0.7", unit)
+        bench.check(f"64 environments in a batch, {name}", many, GOAL_BATCH, ">= 1", unit)
+        bench.check(f"single environments, {name}", one, GOAL_SINGLE, ">= 1", unit)
+        bench.check(f"single environments against a naive loop, {name}", one, rival, ">= 5", unit)
+        bench.check(f"single environments against the plant alone, {name}", one, alone, ">= 0.7", unit)
     worst = max(v[0] for k, v in errors.items() if k.endswith(f"{1e3 * OWN_STEP_S:g} ms"))
     noise = 1e3 * load_machine("M22").sensors.velocity
-    bench.check("error of the environment's step against M22's noise", worst, noise, "<= 0.5", "mm/s")
+    bench.check("error of the integration step against sensor noise", worst, noise, "<= 0.5", "mm/s")
 
 
 if __name__ == "__main__":

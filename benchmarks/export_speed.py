@@ -86,12 +86,12 @@ def main(bench: Bench) -> object:
         found |= {f"FMU w8a16, {name}": us for name, us in eight.items()}
         found |= {"ONNX Runtime, step": step_us, "ONNX Runtime, window": window_us}
         rows += [(name, size, us, tick_us / us) for name, us in found.items()]
-        text = f"{size}: a step of the FMU against ONNX Runtime on the window, neither with its importer"
+        text = f"{size}: FMU step against ONNX Runtime on the window, without importers"
         bench.check(text, ours["step alone"], window_us, "<= 0.1", "us")
         for name in ("FMI 2.0", "FMI 3.0"):
-            text = f"{size}: a tick of the FMU, {name} through FMPy, against ONNX Runtime on the window"
+            text = f"{size}: FMU step, {name} through FMPy, against ONNX Runtime on the window"
             bench.check(text, ours[name], window_us, "<= 0.1", "us")
-            text = f"{size}: processor time of a step of the FMU against its sample time, {name} through FMPy"
+            text = f"{size}: FMU step against its sample time, {name} through FMPy"
             bench.check(text, ours[name], tick_us, "<= 0.005", "us")
     table(HEADS, rows)
     print()

@@ -263,11 +263,11 @@ def main(bench: Bench) -> object:
     most = max(one["commands"] for one in results.values())
     longest = max(person_seconds(one)["deciding"] for one in results.values())
     finished = sum(bool(one["report_bytes"]) and not one["stuck"] for one in results.values())
-    bench.check("channels mapped right, worst set (against 90 %)", least, 0.9, ">= 1", "share")
-    bench.check("columns silently wrong and one (against one)", silent + 1, 1, "<= 1", "columns")
-    bench.check("commands to the report, worst set (against 5)", most, MAX_COMMANDS, "<= 1", "commands")
-    bench.check("person's time by a model, worst set (against 3 min)", longest, MAX_PERSON_S, "<= 1", "s")
-    bench.check("sets with a report (against all)", finished, len(results), ">= 1", "sets")
+    bench.check("correctly mapped channels, worst set", least, 0.9, ">= 1", "share")
+    bench.check("silently wrong columns, plus one", silent + 1, 1, "<= 1", "columns")
+    bench.check("commands until the report, worst set", most, MAX_COMMANDS, "<= 1", "commands")
+    bench.check("estimated user time, worst set", longest, MAX_PERSON_S, "<= 1", "s")
+    bench.check("sets with a report", finished, len(results), ">= 1", "sets")
     bench.keep = not bench.options.names
     return {name: shown_of(one) for name, one in results.items()}
 

@@ -160,19 +160,19 @@ def check(bench: Bench, details: dict[str, Any]) -> None:
         told = [row for row in rows if row["told"]]
         if group in GOALS and told:
             share = float(np.mean([abs(row["error"]) <= NEAR for row in told]))
-            bench.check(f"{group}: told numbers within 10 %", share, 1.0, ">= 1", "share")
+            bench.check(f"{group}: identifiable parameters within 10 %", share, 1.0, ">= 1", "share")
     every = [row for entry in details.values() for row in entry["numbers"]]
     told = [abs(row["error"]) <= NEAR for row in every if row["told"]]
     moved = [row["inside"] for row in every if row["excited"]]
     if told:
-        bench.check("all told numbers within 10 %", float(np.mean(told)), 0.9, ">= 1", "share")
-    bench.check("intervals that hold the truth", float(np.mean(moved)), 0.9, ">= 1", "share")
+        bench.check("all identifiable parameters within 10 %", float(np.mean(told)), 0.9, ">= 1", "share")
+    bench.check("intervals that contain the true value", float(np.mean(moved)), 0.9, ">= 1", "share")
     for what in ("inertia", "gravity"):
         worst = max(joint[what] for entry in details.values() for joint in entry["joints"])
         bench.check(f"{what} of a joint over poses: largest error", worst, NEAR, "<= 1", "share")
     for name, entry in details.items():
         ours, rivals = (entry["models"][key]["velocity_mae"]["mean"] for key in ("identified machine", "machine M22"))
-        bench.check(f"{name}: velocity MAE against the guess", ours, rivals, "<= 1", "mm/s")
+        bench.check(f"{name}: velocity MAE against the initial guess", ours, rivals, "<= 1", "mm/s")
 
 
 def show(name: str, entry: dict[str, Any]) -> None:

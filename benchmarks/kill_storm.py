@@ -146,10 +146,10 @@ def main(bench: Bench) -> object:
     print()
     table(["", "count"], list(found.items()))
     again, finished = (1 + found[f"starts of {what}"] for what in ("what had a record", "the finished study"))
-    bench.check("trainings with a record, of all", found["records"], trainings, ">= 1", "trainings")
-    bench.check("starts of what had a record, plus one, against one", again, 1, "<= 1", "starts")
-    bench.check("starts of a finished study, plus one, against one", finished, 1, "<= 1", "starts")
-    bench.check("same hash as in peace", float(found["same hash"]), 1, ">= 1", "yes")
+    bench.check("trainings with a record", found["records"], trainings, ">= 1", "trainings")
+    bench.check("restarts of recorded trainings, plus one", again, 1, "<= 1", "starts")
+    bench.check("starts in a finished study, plus one", finished, 1, "<= 1", "starts")
+    bench.check("same hash as an undisturbed study", float(found["same hash"]), 1, ">= 1", "yes")
     return found
 
 

@@ -310,22 +310,26 @@ def check(bench: Bench, found: dict[str, Any], hours: float) -> None:
     rate, allowed = found["healthy"]["in_8_h"], 8.0 / hours
     bench.check("false alarms in 8 h, healthy sessions", rate, allowed, "<= 1", "alarms")
     bench.check("faults found, all kinds and sizes", ours["found"], goals["found"], ">= 1", "share")
-    bench.check("of the two largest sizes", ours["found_large"], goals["found_large"], ">= 1", "share")
-    bench.check("median delay", ours["delay_s"], goals["delay_s"], "<= 1", "s of motion")
-    bench.check("of the largest size", ours["delay_largest_s"], goals["delay_largest_s"], "<= 1", "s of motion")
+    bench.check("faults found, two largest sizes", ours["found_large"], goals["found_large"], ">= 1", "share")
+    bench.check("median detection delay", ours["delay_s"], goals["delay_s"], "<= 1", "s of motion")
+    bench.check(
+        "median detection delay, largest size", ours["delay_largest_s"], goals["delay_largest_s"], "<= 1", "s of motion"
+    )
     if best is not None:
-        bench.check("found, over the best rival", ours["found"], best, f">= {goals['over_rival']:g}", "share")
+        bench.check(
+            "faults found against the best detector", ours["found"], best, f">= {goals['over_rival']:g}", "share"
+        )
     for group, row in found["nuisance"].items():
         bench.check(f"{group}: false alarms in 8 h", row["in_8_h"], allowed, "<= 2", "alarms")
     named = found["naming"]
     if not named:
         print("no alarm names a cause: this monitor has no diagnosis")
     for key in ("component", "top_three", "place") if named else ():
-        bench.check(f"named right: {key}", named[key], goals[key], ">= 1", "share")
+        bench.check(f"correct diagnosis: {key}", named[key], goals[key], ">= 1", "share")
     fits = found["promise"]
     if fits["of"]:
         wanted = goals["fits"] * fits["of"] / FITS
-        bench.check("fits whose interval holds the rate", float(fits["within"]), wanted, ">= 1", "fits")
+        bench.check("fits whose interval contains the false-alarm rate", float(fits["within"]), wanted, ">= 1", "fits")
 
 
 @benchmark(

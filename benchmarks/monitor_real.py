@@ -359,7 +359,7 @@ def show(bench: Bench, rig: dict[str, Any], sets: dict[str, Any]) -> None:
         for fault, goal in GOALS.items():
             # An area that healthy cycles of other times reach, too, shows the time of recording, not the fault.
             ours = min(lowest(rig["edp.monitor"][what], fault) for what in ("area", "control"))
-            name = f"rig, {fault}: lowest area of a grade, healthy cycles of the same and of other times"
+            name = f"rig, {fault}: lowest AUC of a severity, healthy cycles of equal and other times"
             bench.check(name, ours, goal, ">= 1", "area")
     for name, row in sets.items():
         detectors = [key for key in row if isinstance(row[key], dict)]
@@ -375,7 +375,7 @@ def show(bench: Bench, rig: dict[str, Any], sets: dict[str, Any]) -> None:
         # Where no rival keeps the rate: one case.
         best = max((row[d]["found"]["all"] for d in kept), default=1.0 / row["cases"])
         ours = row["edp.monitor"]
-        bench.check(f"{name}: found against the best rival", ours["found"]["all"], best, ">= 1", "share")
+        bench.check(f"{name}: faults found against the best detector", ours["found"]["all"], best, ">= 1", "share")
         bench.check(f"{name}: false alarms", float(ours["false_alarms"]), allowed, "<= 1", "alarms")
 
 

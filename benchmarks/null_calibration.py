@@ -314,7 +314,13 @@ def main(bench: Bench) -> object:
         print(f"{world}: any false module, sound {ways[SOUND].any_false:.3f}, thesis {ways[THESIS].any_false:.3f}")
     print("the last world breaks what every test of these splits assumes; its rates are shown, not judged")
     for world in worlds:
-        bench.check(f"any false module of 14, {world.name}", found[world.name][BARE].any_false, ALPHA, "<= 1", "share")
+        bench.check(
+            f"studies with a false module of 14, {world.name}",
+            found[world.name][BARE].any_false,
+            ALPHA,
+            "<= 1",
+            "share",
+        )
     plain = {world: {name: vars(one) for name, one in ways.items()} for world, ways in found.items()}
     return {"null": plain, "power": curve}
 

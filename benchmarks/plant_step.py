@@ -71,7 +71,7 @@ def main(bench: Bench) -> object:
         rows.append((name, *found[name].values(), found[name]["instructions"] / graph.macs))
     table(["", "instructions a tick", "MACs", "parameters", "instructions by MAC"], rows)
     ours, theirs = (float(found[name]["instructions"]) for name in ("twin", "predictor"))
-    name = "a tick of the exported twin against the look-ahead predictor of the same size"
+    name = "time step of the exported twin against a predictor of the same size"
     bench.check(name, ours, theirs, "<= 1.3", "instructions")
     return found
 

@@ -213,8 +213,8 @@ def main(bench: Bench) -> object:
         print(", ".join(f"{value:.3f}" for value in each))
     different = sum(row[1] != row[2] for row in rows)
     worst = max(max(row[5], 1 / row[5]) for row in rows)
-    bench.check("networks whose constants are not those stated", different, 1.0, "<= 0.0", "networks")
-    bench.check("largest ratio of estimated and linked program, either way", worst, 1.0, "<= 1.02", "1")
+    bench.check("networks with a wrong size of constants", different, 1.0, "<= 0.0", "networks")
+    bench.check("largest ratio between estimated and linked program size", worst, 1.0, "<= 1.02", "1")
     heads = ("network", "constants", "stated", "program", "estimate", "ratio")
     return [dict(zip(heads, row, strict=True)) for row in rows]
 

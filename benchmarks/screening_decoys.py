@@ -19,7 +19,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from common import DATA_AND_PARTS, Bench, Verdict, benchmark, option, table, verdict
+from common import DATA_AND_PARTS, Bench, benchmark, option, table, verdict
 from decoys import FAMILIES, Decoy, lay_decoys
 from edp.config.experiment import FeatureSettings, load_experiment
 from edp.data.screening import FlagKind, ScreeningResult, ScreeningSpec, screen
@@ -34,6 +34,7 @@ from edp.workflows.feature_selection.trials import TrialSpec, add_differences, t
 from edp.workflows.train_evaluate import channel_importance
 from m22_truth import Cause, causes
 from screening_thesis import TARGETS, only_table_a1
+from verdicts import Verdict
 
 
 def judged(found: ScreeningResult, decoys: Sequence[Decoy], truth: Sequence[Cause]) -> dict[str, Any]:
@@ -73,17 +74,17 @@ def show_screening(found: dict[str, Any], decoys: Sequence[Decoy], truth: Sequen
             print(f"{title}: {name} ({text})")
 
 
-def goals(found: dict[str, Any], decoys: Sequence[Decoy], truth: Sequence[Cause], quick: bool) -> list[Verdict]:
+def goals(found: dict[str, Any], decoys: Sequence[Decoy], truth: Sequence[Cause]) -> list[Verdict]:
     """Return the verdicts for the issue's targets."""
     needed = sum(c.needed for c in truth)
     leaks = sum(decoy.family == "leak" for decoy in decoys)
     return [
-        verdict("needed causes of FG1 kept", needed - len(found["needed lost"]), needed, ">= 1", "channels", quick),
-        verdict("decoys dropped", len(decoys) - len(found["decoys kept"]), len(decoys), ">= 0.95", "channels", quick),
-        verdict("leaks flagged by name", leaks - len(found["leaks not flagged"]), leaks, ">= 1", "channels", quick),
-        verdict("channels of Table A.1 free of leak flags",
+        verdict("needed channels of FG1 retained", needed - len(found["needed lost"]), needed, ">= 1", "channels"),
+        verdict("decoys dropped", len(decoys) - len(found["decoys kept"]), len(decoys), ">= 0.95", "channels"),
+        verdict("leaks flagged by name", leaks - len(found["leaks not flagged"]), leaks, ">= 1", "channels"),
+        verdict("channels of Table A.1 without a leak flag",
                 len(TABLE_A1) - sum("Table" in text for text in found["leak flags on others"].values()),
-                len(TABLE_A1), ">= 1", "channels", quick),
+                len(TABLE_A1), ">= 1", "channels"),
     ]  # fmt: skip
 
 
@@ -189,7 +190,7 @@ def main(bench: Bench) -> object:
         found = judged(screening, decoys, truth)
         show_screening(found, decoys, truth)
         details["draws"].append(found | {"decoys": [asdict(decoy) for decoy in decoys]})
-        bench.verdicts += [replace(v, name=f"{v.name}, draw {draw + 1}") for v in goals(found, decoys, truth, quick)]
+        bench.verdicts += [replace(v, title=f"{v.title}, draw {draw + 1}") for v in goals(found, decoys, truth)]
         if draw == 0:
             first, first_screening = laid, screening
     folder = bench.folder

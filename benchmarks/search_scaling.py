@@ -117,8 +117,8 @@ def main(bench: Bench) -> object:
     one, two = (median(row["trainings an hour"] for row in rows if row["workers"] == n) for n in (1, 2))
     share = max(row["coordinator's share of a core"] for row in rows)
     bound = OPEN_S * count / 10_000
-    bench.check(f"opening {count:,} records, of {bound:g} s", min(wall), bound, "<= 1", "s")
-    bench.check("coordinator's share of a core, of 2 %", share, SHARE, "<= 1", "core")
+    bench.check(f"opening {count:,} records", min(wall), bound, "<= 1", "s")
+    bench.check("coordinator, fraction of a core", share, SHARE, "<= 1", "core")
     bench.check("trainings an hour, two workers against one", two, one, f">= {SPEEDUP}", "1/h")
     return {"opening_s": wall, "opening_processor_s": processor, "pools": rows}
 

@@ -212,7 +212,7 @@ def conclude(bench: Bench, rows: list[Row], base: float, most: float, same: bool
     )
     update = figures["train", most][4]
     bench.check("processor time of building, an hour of logs", build[2] / base, GOAL_S_AN_HOUR, "<= 1", "s")
-    bench.check("memory of training, store over logs", stored[3], in_memory[3], "<= 0.5", "MB")
+    bench.check("memory of training, store against logs", stored[3], in_memory[3], "<= 0.5", "MB")
     bench.check("trainings with the same weights", float(same), 1.0, ">= 1", "")
     bench.check(f"an update on {most:g} h, over one in memory", update, in_memory[4], "<= 1.05", "s")
     for (name, hours), row in figures.items():

@@ -101,7 +101,7 @@ def main(bench: Bench) -> object:
     check_goals(bench, scores, [name for name in FITTED if name in only], experiment.judge.coverage)
     if "recurrent" in only:
         compiled, plain = (update_ms(experiment, parts, how) for how in (TwinNetwork.forward, plain_steps))
-        name = "forward and backward, 100 ticks of 64 lanes: compiled loop against autograd"
+        name = "forward and backward pass, 100 samples, batch of 64: compiled loop against autograd"
         bench.check(name, compiled, plain, "<= 0.5", "ms")
     if arguments.specialist:
         check_specialist(bench, scores)
@@ -180,7 +180,7 @@ def check_goals(bench: Bench, scores: dict[str, dict[str, Any]], named: list[str
     bench.check("pressure NRMSE over 60 s", ours["pressure_nrmse"]["mean"], 0.15, "<= 1", "1")
     bench.check("diverged runs", ours["diverged"], 1e-3, "<= 1", "share")
     bench.check("processor time of the training", ours["training_s"], 1200.0, "<= 1", "s")
-    bench.check("intervals at 0.1, 1, 10, 60 s: furthest from 90 %", worst, 0.05, "<= 1", "share")
+    bench.check("intervals at 0.1, 1, 10, 60 s: largest deviation from 90 %", worst, 0.05, "<= 1", "share")
 
 
 def diverged_of_many(twin: Twin, test: Any, least: int) -> dict[str, Any]:
@@ -194,8 +194,10 @@ def check_specialist(bench: Bench, scores: dict[str, Any]) -> None:
     """One set of weights for all modes against one that was made for each."""
     free, special = (scores[name]["velocity_mae"]["mean"] for name in ("recurrent", FREE_ONLY))
     ahead, other = (scores[name]["ahead"]["velocity_mae"]["mean"] for name in ("recurrent", AHEAD_ONLY))
-    bench.check("one set of weights in free mode against the free specialist", free, special, "<= 1.05", "mm/s")
-    name = f"one set of weights, {AHEAD} ticks ahead of measured ports, against a specialist for that"
+    bench.check(
+        "one network for all modes, free-run simulation, against a specialist", free, special, "<= 1.05", "mm/s"
+    )
+    name = f"one network for all modes, {AHEAD} samples ahead, against a specialist"
     bench.check(name, ahead, other, "<= 1.05", "mm/s")
 
 

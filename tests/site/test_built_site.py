@@ -27,10 +27,10 @@ VISITED = (
     "explanation/which_model",
     "howto/troubleshooting",
     "settings",
-    "leaderboard",
     "reference/commands",
     "gallery",
 )
+RESULTS = ("results", "results/monitor", "leaderboard", "journal/index", "decisions/index")
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def site(tmp_path_factory) -> Path:
 
 
 def pages_of(site: Path) -> list[str]:
-    return [f"{name}.html" for name in VISITED] + [f"tutorials/{path.stem}.html" for path in NOTEBOOKS[:1]]
+    return [f"{name}.html" for name in VISITED + RESULTS] + [f"tutorials/{path.stem}.html" for path in NOTEBOOKS[:1]]
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +72,25 @@ def test_pages_are_accessible_load_nothing_from_elsewhere_and_fit_the_window(sit
     assert [finding for visit in visits for finding in visit.serious()] == []
     assert [(visit.page, visit.elsewhere) for visit in visits if visit.elsewhere] == []
     assert [(visit.page, visit.wide) for visit in visits if visit.wide > 0] == []
+
+
+@pytest.mark.slow
+def test_the_journal_is_filtered_by_tag(site):
+    executable = chromium()
+    if executable is None:
+        pytest.skip("no Chromium; `make system-packages` installs it")
+    script = """
+      const choice = document.querySelector(".edp-filter select");
+      choice.value = "fleet";
+      choice.dispatchEvent(new Event("change"));
+      const tagged = (row) => row.cells[2].textContent.split(", ").includes("fleet");
+      [...document.querySelectorAll("tbody tr")].map((row) => [tagged(row), row.hidden]);
+    """
+    with opened(executable) as page:
+        page.open(site / "journal" / "index.html")
+        rows = page.run(script)
+    assert {hidden for _, hidden in rows} == {True, False}
+    assert all(tagged != hidden for tagged, hidden in rows)
 
 
 @pytest.mark.slow

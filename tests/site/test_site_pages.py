@@ -16,7 +16,7 @@ import yaml
 
 import edp
 import edp_site.commands as site_commands
-from edp_site import diagrams, markdown, notebooks, parts, python_api, result_files, results, settings_keys
+from edp_site import diagrams, journal, markdown, notebooks, parts, python_api, result_files, settings_keys
 from edp_site.built import problems_of, seal
 from edp_site.links import broken_links
 from edp_site.stage import builder_settings, stage
@@ -26,9 +26,11 @@ HAND_WRITTEN = sorted(
     [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "website" / "pages").glob("*.md")],
     key=lambda page: page.as_posix(),
 )
-HISTORY = ("CHANGELOG.md", "findings.md")
-"""Pages that tell of commands as they were then; decisions are others."""
-PRESENT = [page for page in HAND_WRITTEN if page.name not in HISTORY and page.parent.name != "decisions"]
+HISTORY = ("decisions", "journal")
+"""Folders of pages that keep commands as they were at their date."""
+PRESENT = [page for page in HAND_WRITTEN if page.name != "CHANGELOG.md" and page.parent.name not in HISTORY]
+RUN_ELSEWHERE = {"README.md", "python.md"}
+"""Their Python is run by tests/examples/test_python_page.py."""
 
 
 def name_of(page: Path) -> str:
@@ -71,16 +73,23 @@ def test_every_page_is_in_the_navigation_and_every_entry_is_a_page(staged):
     shown = navigation(builder_settings(ROOT / "mkdocs.yml", staged))
     assert len(shown) == len(set(shown))
     pages = {page.relative_to(staged).as_posix() for page in staged.rglob("*.md")}
-    listed_elsewhere = {page for page in pages if page.startswith(("decisions/0", "files/"))}
+    listed_elsewhere = {page for page in pages if page.startswith(("decisions/0", "files/", "journal/", "results/"))}
     missing = pages - set(shown) - listed_elsewhere
     assert not missing, f"add to nav of mkdocs.yml: {sorted(missing)}"
     assert {page for page in written if "*" not in page} <= pages
 
 
-def test_every_decision_is_listed(staged):
-    text = (staged / "decisions" / "index.md").read_text(encoding="utf-8")
-    for path in (ROOT / "docs" / "decisions").glob("*.md"):
+@pytest.mark.parametrize("folder", ["decisions", "journal"])
+def test_every_decision_and_every_finding_is_listed(staged, folder):
+    text = (staged / folder / "index.md").read_text(encoding="utf-8")
+    for path in (ROOT / "docs" / folder).glob("*.md"):
         assert f"({path.name})" in text
+
+
+def test_a_decision_without_a_status_is_refused(tmp_path):
+    (tmp_path / "0001-a.md").write_text("# 0001. A\n\n## Context\n", encoding="utf-8")
+    with pytest.raises(ValueError, match=r"0001-a\.md: got no status line"):
+        journal.decisions_page(tmp_path)
 
 
 def test_entries_of_pages_that_are_not_there_are_left_out(tmp_path):
@@ -200,24 +209,6 @@ def test_messages_of_the_page_on_troubleshooting_are_those_of_the_code():
     source = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "src" / "edp").rglob("*.py"))
     assert len(rows) > 10
     assert [row for row in rows if row not in source] == []
-
-
-def test_the_leaderboard_has_every_question_of_every_result(staged):
-    text = (staged / "leaderboard.md").read_text(encoding="utf-8")
-    for path in (ROOT / "benchmarks" / "results").glob("*.json"):
-        result = json.loads(path.read_text(encoding="utf-8"))
-        section = text.split(f"## {path.stem} {{")[1].split("\n## ")[0]
-        assert result["date"] in section
-        for verdict in result["verdicts"]:
-            figures = f"| {results.figure(verdict['ours'])} | {results.figure(verdict['rival'])} |"
-            assert figures in section
-    assert "/tmp/" not in text
-
-
-def test_a_result_that_lacks_something_is_refused(tmp_path):
-    (tmp_path / "a.json").write_text('{"command": "a.py", "date": "2026-01-01", "seed": 0}', encoding="utf-8")
-    with pytest.raises(ValueError, match=r"a\.json has no 'verdicts'"):
-        results.results_page(tmp_path, [])
 
 
 def test_links_that_lead_nowhere_are_told(tmp_path):

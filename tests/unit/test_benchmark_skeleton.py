@@ -31,8 +31,8 @@ def printed(capsys):
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
 def test_a_script_has_the_shared_skeleton(path):
     text = path.read_text(encoding="utf-8")
-    # The sessions of the monitor's benchmark are data, and measure nothing.
-    assert "\n@benchmark(" in text or path.stem == "monitor_sessions"
+    # The sessions of the monitor's benchmark are data, and the verdicts are names of results: both measure nothing.
+    assert "\n@benchmark(" in text or path.stem in ("monitor_sessions", "verdicts")
     assert text.count('if __name__ == "__main__":') == 1
 
 
@@ -67,13 +67,13 @@ def test_the_short_form_is_written_only_where_it_is_asked_for(common, tmp_path, 
 
     main(["--quick"])
     assert not (tmp_path / "results").exists()
-    assert printed(capsys)["met"] is True
+    assert printed(capsys)["target"] == 1.0
     main(["--quick", "--seed", "3", "--out", str(tmp_path / "out")])
     main([])
     for folder, quick in (("out", True), ("results", False)):
         result = json.loads((tmp_path / folder / f"{Path(__file__).stem}.json").read_text())
         assert result["details"] == {"quick": quick}
-        assert [one["name"] for one in result["verdicts"]] == ["half of it"]
+        assert [one["title"] for one in result["verdicts"]] == ["half of it"]
         assert result["seed"] == (3 if quick else 0)
 
 
@@ -91,7 +91,7 @@ def test_figures_that_are_no_numbers_are_kept_as_null(common, tmp_path):
     main(["--out", str(tmp_path), "--work", str(tmp_path)])
     result = json.loads((tmp_path / f"{Path(__file__).stem}.json").read_text())
     assert result["details"] == {"rows": [[0.5, None, "text"]], "part": 3}
-    assert result["verdicts"][0]["ratio"] is None
+    assert result["verdicts"][0]["reference"] is None
 
 
 def test_a_part_is_read_from_the_working_folder_of_an_earlier_run(common, tmp_path):
@@ -123,7 +123,7 @@ def test_several_results_of_one_run_do_not_mix(common, tmp_path):
     main(["--out", str(tmp_path)])
     for name in ("first", "second"):
         result = json.loads((tmp_path / f"{name}.json").read_text())
-        assert [one["name"] for one in result["verdicts"]] == [name]
+        assert [one["title"] for one in result["verdicts"]] == [name]
 
 
 @pytest.mark.parametrize("missing", ["program", "recordings", "anything"])

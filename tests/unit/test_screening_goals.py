@@ -56,8 +56,8 @@ def test_decoys_are_seen_through(plan, recordings, laid, found, bench):
     assert result["leaks not flagged"] == {}
     assert not [text for text in result["leak flags on others"].values() if "Table A.1" in text]
     assert len(result["decoys kept"]) <= 2
-    names = [verdict.name for verdict in league.goals(result, laid[1], truth, True)]
-    assert names[:3] == ["needed causes of FG1 kept", "decoys dropped", "leaks flagged by name"]
+    names = [verdict.title for verdict in league.goals(result, laid[1], truth)]
+    assert names[:3] == ["needed channels of FG1 retained", "decoys dropped", "leaks flagged by name"]
 
 
 def test_lags_stand_beside_table_4_2(found, bench):

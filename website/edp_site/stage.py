@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from edp_site import (
@@ -14,6 +15,7 @@ from edp_site import (
     errors,
     formats,
     gallery,
+    journal,
     markdown,
     notebooks,
     parts,
@@ -70,7 +72,8 @@ def stage(out: Path, demo: Path | None = None, root: Path = ROOT, version: str |
 
 def _made(root: Path) -> dict[str, Callable[[], str]]:
     """Return the function for each generated page; a page of docs/ with the same place is its introduction."""
-    return {
+    benchmarks = results.read_benchmarks(root)
+    made: dict[str, Callable[[], str]] = {
         "reference/commands.md": commands.commands_page,
         "reference/python.md": python_api.python_page,
         "reference/parts.md": parts.parts_page,
@@ -78,30 +81,14 @@ def _made(root: Path) -> dict[str, Callable[[], str]]:
         "reference/formats.md": formats.formats_page,
         "reference/files.md": result_files.files_page,
         "reference/c.md": formats.c_page,
-        "leaderboard.md": lambda: results.results_page(
-            root / "benchmarks" / "results",
-            results.read_goals(root / "benchmarks" / "goals.toml"),
-            results.read_archive(root / "benchmarks" / "archive.toml"),
-        ),
-        "decisions/index.md": lambda: decisions_page(root / "docs" / "decisions"),
+        "results.md": lambda: results.results_page(benchmarks),
+        "leaderboard.md": lambda: results.leaderboard_page(benchmarks),
+        "decisions/index.md": lambda: journal.decisions_page(root / "docs" / "decisions"),
+        "journal/index.md": lambda: journal.journal_page(journal.read_journal(root / "docs" / "journal")),
     }
-
-
-def decisions_page(folder: Path) -> str:
-    """A table of the decisions by number."""
-    lines = [
-        "# Decisions",
-        "",
-        "What was decided, why, and what was given up for it.",
-        "",
-        "| No. | Decision |",
-        "|---|---|",
-    ]
-    for path in sorted(folder.glob("*.md")):
-        first = markdown.headings(path.read_text(encoding="utf-8"))[0]
-        title = re.sub(r"^\d+[.:]?\s*", "", first.text)
-        lines.append(f"| {path.name[:4]} | [{title}]({path.name}) |")
-    return "\n".join(lines) + "\n"
+    for page in benchmarks.pages:
+        made[f"results/{page.script}.md"] = partial(results.benchmark_page, benchmarks, page)
+    return made
 
 
 def builder_settings(path: Path, pages: Path) -> str:
@@ -166,8 +153,12 @@ class _Copier:
         name = linked.relative_to(self.root)
         if name.as_posix() in _PROJECT_PAGES:
             return Path(_PROJECT_PAGES[name.as_posix()])
-        if name == Path("docs/decisions"):
-            return Path("decisions/index.md")
+        if name in (Path("docs/decisions"), Path("docs/journal")):
+            return Path(name.name) / "index.md"
+        if name == Path("benchmarks/results"):
+            return Path("results.md")
+        if name.parent == Path("benchmarks/results"):
+            return Path("results") / f"{results.read_result(linked).script}.md"
         if name.parts[0] == "docs" and linked.is_file():
             place = Path(*name.parts[1:])
             return place.with_suffix(".md") if place.suffix == ".ipynb" else place

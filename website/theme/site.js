@@ -10,6 +10,26 @@ window.addEventListener("load", () => {
   });
 });
 
+// A table with a column of tags can be filtered by tag.
+window.addEventListener("load", () => {
+  for (const table of document.querySelectorAll(".md-typeset table")) {
+    const column = [...table.querySelectorAll("th")].findIndex((head) => head.textContent.trim() === "Tags");
+    if (column < 0) continue;
+    const rows = [...table.querySelectorAll("tbody tr")].map((row) => ({ row, tags: row.cells[column].textContent.trim().split(", ") }));
+    const label = document.createElement("label"), choice = document.createElement("select"), count = document.createElement("output");
+    label.className = "edp-filter";
+    for (const tag of ["all", ...[...new Set(rows.flatMap((one) => one.tags))].sort()]) choice.add(new Option(tag));
+    const show = () => {
+      for (const { row, tags } of rows) row.hidden = choice.value !== "all" && !tags.includes(choice.value);
+      count.textContent = `${rows.filter((one) => !one.row.hidden).length} of ${rows.length} rows`;
+    };
+    choice.addEventListener("change", show);
+    label.append("Tag ", choice, " ", count);
+    (table.closest(".md-typeset__scrollwrap") || table).before(label);
+    show();
+  }
+});
+
 // Versions beside this one, where the site was built with them: a script lists them, which files can load, too.
 (() => {
   const own = window.edpVersion, script = document.currentScript;

@@ -17,7 +17,7 @@ from edp.settings.bounds import SEED
 from edp.storage.paths import full_path
 from edp.wording import figure
 
-# 180 min in 60 recordings: with 75 min the network's lead over ridge ARX was smaller (docs/findings.md).
+# 180 min in 60 recordings: with 75 min the network's lead over ridge ARX was smaller (docs/journal).
 MINUTES = 180.0
 RECORDINGS = 60
 

@@ -16,7 +16,7 @@ from edp.networks.running import stream_predictions
 from edp.signals import KINDS, Kind
 from edp.wording import figure
 
-# From shorter than a move of the operator to longer than any memory found (docs/findings.md, carried for a minute).
+# From shorter than a move of the operator to longer than any memory found (docs/journal, carried for a minute).
 CONTEXTS_S = (0.5, 2.0, 5.0, 10.0, 30.0, 60.0)
 BLOCK_S, EVERY_S = 0.5, 5.0
 LANES = 64

@@ -33,7 +33,7 @@ from edp.storage.provenance import environment
 NAMESPACE = "edp"
 # An hour: nodes may be busy with a training before they answer.
 HOUR_S = 3600.0
-# Five seconds: Ray itself tries for minutes where nothing answers (docs/findings.md).
+# Five seconds: Ray itself tries for minutes where nothing answers (docs/journal).
 PROBE_S = 5.0
 _pool: dict[int, LocalPool] = {}
 """Pool of a Ray process, which runs one training after the other. Its worker stays warm between them."""

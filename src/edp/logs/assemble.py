@@ -21,7 +21,7 @@ from edp.storage.memory import check_memory
 from edp.wording import typed
 
 _CACHED_ROWS = 4096
-"""Rows written at a time: blocks of 1,000 to 4,000 are fastest, 500 or 8,000 take 1.5 to 2 times as long (findings)."""
+"""Rows written at a time: blocks of 1,000 to 4,000 are fastest, 500 or 8,000 take 1.5 to 2 times as long (journal)."""
 _MAX_EMPTY = 0.5
 """Maximum fraction of a log that is omitted because a channel has no value yet."""
 _TICK_BYTES = 25

@@ -39,7 +39,7 @@ refusal."""
 WORK_PER_S = 2e6
 VALUES_PER_S = 1e6
 PART_S = 0.01
-"""Time allowance per object of a file. An object of MAT v7.3 takes about 1.3 ms on a busy machine (findings)."""
+"""Time allowance per object of a file. An object of MAT v7.3 takes about 1.3 ms on a busy machine (journal)."""
 WALL = 12
 """Longest time by the clock, in allowed processor times: a process may also wait for ever."""
 MAX_S = 1e6

@@ -89,7 +89,7 @@ class FreeRunSpec:
     lanes: int = 64
     lengths_s: tuple[float, ...] = (0.1, 0.3, 1.0, 3.0)
     updates: tuple[int, ...] = (1500, 2000, 3000, 500)
-    # More of them cost accuracy in free runs, and gave none where ports are measured (docs/findings.md).
+    # More of them cost accuracy in free runs, and gave none where ports are measured (docs/journal).
     measured_share: float = 0.05
     mixed_share: float = 0.1
     stroke_weight: float = 10.0

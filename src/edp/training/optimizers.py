@@ -143,7 +143,7 @@ class Soap:
     """Adam in the eigenbasis of Shampoo's preconditioner (Vyas et al. 2024, arXiv 2409.11321).
 
     On networks of this size a step costs little more than AdamW's and the error falls several times faster per
-    processor second; see docs/findings.md.
+    processor second; see docs/journal.
 
     Attributes:
         learning_rate: base rate.
@@ -153,7 +153,7 @@ class Soap:
         refresh: updates between refreshes of the eigenbasis.
     """
 
-    # 6e-3 and 0.95: least validation error of the settings tried (docs/findings.md, SOAP for 3,000 updates).
+    # 6e-3 and 0.95: least validation error of the settings tried (docs/journal, SOAP for 3,000 updates).
     learning_rate: float = 6e-3
     weight_decay: float = 1e-4
     beta1: float = 0.95

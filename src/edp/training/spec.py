@@ -94,7 +94,7 @@ class TrainingSpec:
     # Recurrent networks have rare steep gradients; the norm of 1 bounds the step that these cause.
     clip_norm: float = 1.0
     seed: int = 0
-    # One thread: two were slower on small steps of a busy machine (docs/findings.md, two threads).
+    # One thread: two were slower on small steps of a busy machine (docs/journal, two threads).
     threads: int = 1
     device: str = "auto"
 

@@ -47,7 +47,7 @@ MIN_ANSWER, GOOD_ANSWER = 0.1, 0.5
 """Shares of a speed that must be there where a plan ends, and that better are: short of them it sees no effect."""
 ATTITUDE_M, LOADED_ATTITUDE_M = 1.0, 2.0
 """Of most twins, and of those that are told of forces: on lines that were not evaluated 2 held the attitude in loam
-better on grey boxes of M22 and C14, and made both errors of a poor network larger (docs/findings.md)."""
+better on grey boxes of M22 and C14, and made both errors of a poor network larger (docs/journal)."""
 FAST_TIP_M_S = 0.02
 """Reference speed above which a tip error has a direction along the path and one across."""
 

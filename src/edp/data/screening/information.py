@@ -64,7 +64,7 @@ def _radius(x: Array, y: Array, row: int, nearest: Array) -> tuple[float, int]:
     n, last = len(x), len(nearest) - 1
     x_here, y_here = x[row], y[row]
     nearest[:] = np.inf
-    # 24 points give a first radius, with which one side after the other needs half the steps (findings).
+    # 24 points give a first radius, with which one side after the other needs half the steps (journal).
     left, right = max(row - 12, 0), min(row + 12, n - 1)
     for other in range(left, right + 1):
         distance = max(abs(x_here - x[other]), abs(y[other] - y_here))

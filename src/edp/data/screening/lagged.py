@@ -157,7 +157,7 @@ def _product(left: NDArray[np.complex64], right: NDArray[np.complex64]) -> NDArr
     total = np.zeros((left.shape[0], left.shape[2], right.shape[2]), dtype=np.complex64)
     for start in range(0, left.shape[1], _SEGMENTS):
         part = slice(start, start + _SEGMENTS)
-        # Laid out in order: many small products take a third of the time so (findings).
+        # Laid out in order: many small products take a third of the time so (journal).
         total += np.matmul(np.ascontiguousarray(left[:, part].transpose(0, 2, 1)), right[:, part].conj())
     return total
 

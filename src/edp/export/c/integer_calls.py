@@ -160,7 +160,7 @@ def _reorder_weights(matrix: NDArray[Any]) -> NDArray[Any]:
     out, into = matrix.shape
     rows, columns = out - out % 4, into - into % 4
     # Pairs of products: the order in which the Cortex-M4's SIMD instruction reads bytes after widening
-    # (docs/findings.md).
+    # (docs/journal).
     groups = matrix[:rows, :columns].reshape(rows // 4, 4, columns // 4, 4)[..., [0, 2, 1, 3]]
     parts = []
     for block, group in enumerate(groups):

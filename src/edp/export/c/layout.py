@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from edp.ir import Layer
 from edp.ir.layers import GroupedDense
 
-# Sixteen rows: measured on a Cortex-M4F, 165,833 instead of 193,784 instructions a tick (docs/findings.md).
+# Sixteen rows: measured on a Cortex-M4F, 165,833 instead of 193,784 instructions a tick (docs/journal).
 PANEL = 16
 """Rows that a product computes side by side: `EDP_PANEL` of the runtime."""
 

@@ -19,7 +19,7 @@ IN_REGISTERS = 4
 """Arguments of a call that are handed over in registers; those behind them go over the stack."""
 CALL = re.compile(r"\b(edp_\w+)\(([^()]*)\)")
 FLOAT = re.compile(r"-?[0-9.][0-9.e+-]*f")
-# A linear fit; docs/findings.md has its error, 1.3 % at most over 187 networks.
+# A linear fit; docs/journal has its error, 1.3 % at most over 187 networks.
 OWN, EACH_CALL, ON_STACK, WIDE = 593.0, 14.6, 5.4, 9.7
 """Bytes of Thumb-2 code (GCC 12, -O2): of every model, a call, an argument on the stack, a number above 255."""
 MAX_COPIED = 64

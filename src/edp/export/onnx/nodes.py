@@ -253,7 +253,7 @@ class Nodes:
                 read_values |= set(node.input)
                 if node.op_type in OPTIONAL:
                     _leave_out(node, read_values)
-        # ONNX Runtime up to 1.18 lays unread outputs over values that are still needed (docs/findings.md).
+        # ONNX Runtime up to 1.18 lays unread outputs over values that are still needed (docs/journal).
         self._nodes = read_nodes[::-1]
         self._tensors = [tensor for tensor in self._tensors if tensor.name in read_values]
 

@@ -33,7 +33,7 @@ _BUSY_REPEATS = 0.05
 _BUSY_HELD = 0.2
 _BUSY_NOISE = 2e-4
 _STEADY = 0.65
-"""Noise of sensors gave 0.59 to 0.91, channels without it less than 0.64 (findings)."""
+"""Noise of sensors gave 0.59 to 0.91, channels without it less than 0.64 (journal)."""
 
 
 @dataclass(frozen=True)

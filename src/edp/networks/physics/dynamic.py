@@ -43,7 +43,7 @@ class DynamicSpec(PhysicsSpec):
 
     space: ClassVar[dict[str, object]] = {"load": LOADS, "fade_s": (0.0, 0.2)}
     load: str = "all"
-    # 0.03 s: measured compromise between boom and bucket at k = 10 (docs/findings.md, fading acceleration).
+    # 0.03 s: measured compromise between boom and bucket at k = 10 (docs/journal, fading acceleration).
     fade_s: float = 0.03
 
     def __post_init__(self) -> None:

@@ -30,7 +30,7 @@ class Aprbs(Excitation):
     CHIRP_HZ = (0.05, 5.0)
     CHIRP_S = (12.0, 25.0)
     CHIRP_SHARE = 0.35
-    """Fraction of the time with chirps; more of it made the commands no flatter (findings)."""
+    """Fraction of the time with chirps; more of it made the commands no flatter (journal)."""
     PIECE_S = 0.1
     """A chirp is given in such segments, since its sign must turn soon after a cylinder nears an end."""
     TURN = (0.22, 0.78)

@@ -23,7 +23,7 @@ class Grading(Tracked):
     works_ground = True
     PROPORTIONAL, INTEGRAL = 4.0, 2.0
     """Controller gains per second and per second squared: of gains 2 to 5 /s, 4 has the least errors; at 5 the levers
-    change sign twice as often (findings)."""
+    change sign twice as often (journal)."""
     SPEED = (0.1, 0.5)
     LENGTH_M = (1.0, 4.5)
     SLOPE = 0.15

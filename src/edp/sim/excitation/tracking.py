@@ -30,7 +30,7 @@ class Tracked(Excitation):
     """
 
     CONTROL_HZ = 20.0
-    """Rate of control steps; each takes 33 us of Python (findings), so a higher one slows the simulation."""
+    """Rate of control steps; each takes 33 us of Python (journal), so a higher one slows the simulation."""
     RAMP_S = 0.5
     """Time to speed up and to slow down on a leg."""
     LEAD_S = 0.2

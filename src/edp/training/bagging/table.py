@@ -27,10 +27,10 @@ FLOAT, DOUBLE = 4, 8
 PRESENT_BEYOND, CHANGE_BEYOND = 1.0, 10.0
 """How far beyond what trained a column may go, in ranges of it. A position or temperature that leaves its range by more
 than all of it says little by a linear map; larger changes than recorded ones are often real, as in quicker motion
-(findings: Sjoberg's arm, and an arm of which an axis moved for the first time)."""
+(journal: Sjoberg's arm, and an arm of which an axis moved for the first time)."""
 FEW_LEVELS = 16
 """Levels of a channel up to which it and its changes are held at their range: an encoder of an axis that rests shows a
-few steps of noise or drift; a line through them says nothing of the axis in motion (findings: one axis a log)."""
+few steps of noise or drift; a line through them says nothing of the axis in motion (journal: one axis a log)."""
 
 
 @dataclass(frozen=True, eq=False)

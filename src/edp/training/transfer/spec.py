@@ -56,7 +56,7 @@ class FinetuneSpec:
     head_rate: float = 3e-4
     backbone_rate: float = 1e-5
     depth_decay: float = 1.0
-    # Ten rounds at 3e-3: rates hardly matter here, and the best epoch comes early (docs/findings.md, fine-tuning to
+    # Ten rounds at 3e-3: rates hardly matter here, and the best epoch comes early (docs/journal, fine-tuning to
     # C14).
     rounds: int = 10
     rate: float = 3e-3
@@ -70,7 +70,7 @@ class FinetuneSpec:
     reversal: float = 0.1
     inner_rate: float = 0.0
     inner_steps: int = 30
-    # The mean error after a nearly linear loss is worth removing (docs/findings.md, `center`).
+    # The mean error after a nearly linear loss is worth removing (docs/journal, `center`).
     center: bool = True
     check_signs: bool = True
 

@@ -68,7 +68,7 @@ TREE_MODELS = {3: 60, 2: MIN_ROUNDS}
 one is worth its time where it leaves so many rounds: left-out errors of five measured sets fall by 0.5 to 6 %."""
 TREE_ROWS = (60_000, 30_000, 15_000, 8_000, 4_000)
 """Rows that a tree is grown on: the most that leave time for `MIN_ROUNDS`. On left-out logs of three measured sets
-rows are worth more than rounds (findings)."""
+rows are worth more than rounds (journal)."""
 TREE_FOLDS = {5: 0.8, 3: 0.6, 2: 0.4}
 """Parts that trees leave out in turn, each at the cost of a growth; and the share of rows beside the largest."""
 ALIKE_ROWS = 0.8
@@ -113,7 +113,7 @@ RECURRENT_TICK = 70_000
 """Weights that a tick of the recurrent network passes through."""
 SETTING = "auto.foundation"
 MIN_UPDATES = 120
-"""Of a fine-tuning, where ten passes over the recordings are fewer: those of the measured ones (docs/results.md)."""
+"""Of a fine-tuning, where ten passes over the recordings are fewer: those of the measured ones (benchmarks/results)."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ At a depth d below ground that the edge has not cut yet, and a velocity w of the
 A has numbers of its own inwards, outwards, downwards and upwards, none below zero; c acts inwards only. The first part
 is the edge, which meets the same strength wherever it is, the others are what is cut loose (the earthmoving equation is
 quadratic in the depth). |w| is smoothed over `CREEP`. The ground is level before it is cut: a mean over uneven heights
-explained forces a little better, but began softly, and loops hunted on it that the machine damps (docs/findings.md).
+explained forces a little better, but began softly, and loops hunted on it that the machine damps (docs/journal).
 """
 
 from __future__ import annotations
