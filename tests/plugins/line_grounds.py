@@ -348,7 +348,7 @@ def _judged(ground: Ground, path: Path) -> None:
 
 
 def _machine(ground: Ground, path: Path) -> None:
-    """A machine of one's own, as docs/simulator.md has it: a copy of one that comes with EDP."""
+    """A machine of one's own, as docs/explanation/simulator.md has it: a copy of one that comes with EDP."""
     text = resources.files("edp.sim.machines").joinpath("m22.toml").read_text(encoding="utf-8")
     path.write_text(text, encoding="utf-8")
 

@@ -101,7 +101,7 @@ class Visit:
 
 
 def browser() -> str | None:
-    """The path of a Chromium; None where there is none."""
+    """Return the path of a Chromium; None without one."""
     return next((found for name in BROWSERS if (found := shutil.which(name))), None)
 
 

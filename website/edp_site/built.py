@@ -88,7 +88,7 @@ class _Reader(HTMLParser):
 
 
 def read_page(path: Path) -> Page:
-    """What the checks need of a page."""
+    """Return the parts of a page that the checks need."""
     reader = _Reader()
     reader.feed(path.read_text(encoding="utf-8", errors="replace"))
     problems = list(reader.problems)

@@ -43,7 +43,7 @@ class Link(NamedTuple):
 
 
 def fences(text: str) -> Iterator[Fence]:
-    """The fenced blocks of a page."""
+    """Return the fenced blocks of a page."""
     lines = text.splitlines()
     for first, last, language in _fence_spans(lines):
         yield Fence(language, first + 2, "\n".join(lines[first + 1 : last]) + "\n")
@@ -64,7 +64,7 @@ def _fence_spans(lines: list[str]) -> Iterator[tuple[int, int, str]]:
 
 
 def prose(text: str) -> list[str]:
-    """The lines of a page with those of fenced blocks left empty."""
+    """Return the lines of a page, with empty lines in place of fenced blocks."""
     lines = text.splitlines()
     for first, last, _ in list(_fence_spans(lines)):
         lines[first : last + 1] = [""] * len(lines[first : last + 1])
@@ -72,14 +72,14 @@ def prose(text: str) -> list[str]:
 
 
 def anchor_of(title: str) -> str:
-    """The anchor that GitHub makes of the text of a heading."""
+    """Return the anchor that GitHub gives a heading with this text."""
     plain = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", title)
     plain = plain.replace("`", "").replace("*", "").strip().lower()
     return re.sub(r"[^\w\- ]", "", plain).replace(" ", "-")
 
 
 def headings(text: str) -> list[Heading]:
-    """The headings of a page; of those with one text the second gets the anchor ``text-1``, and so on."""
+    """Return the headings of a page; the second heading with the same text has the anchor ``text-1``, and so on."""
     found: list[Heading] = []
     seen: Counter[str] = Counter()
     for number, line in enumerate(prose(text), 1):
@@ -100,7 +100,7 @@ def anchors(text: str) -> set[str]:
 
 
 def links(text: str) -> list[Link]:
-    """The links and pictures of a page, those within code left out."""
+    """Return the links and pictures of a page outside of code."""
     found = []
     for number, line in enumerate(prose(text), 1):
         plain = _CODE.sub(lambda match: match[0] if "](" in match[0] and "[" not in match[0] else "code", line)
@@ -117,7 +117,7 @@ def code_spans(text: str) -> Iterator[tuple[int, str]]:
 
 
 def with_links(text: str, replace: dict[str, str]) -> str:
-    """A page whose link targets are replaced; code stays as it is."""
+    """Return a page with replaced link targets; code is unchanged."""
     lines, shown = text.splitlines(), prose(text)
 
     def renamed(match: re.Match[str]) -> str:

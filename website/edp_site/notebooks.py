@@ -30,7 +30,7 @@ PICTURE_DPI = 72
 
 
 def read_notebook(path: Path) -> Notebook:
-    """A notebook of format 4.
+    """Read a notebook of format 4.
 
     Raises:
         ValueError: it is none.
@@ -157,7 +157,7 @@ def _lines(text: str) -> list[str]:
 
 
 def notebook_page(path: Path, pictures: Path) -> str:
-    """A notebook as Markdown: cells, and what they gave when they were last run.
+    """Return a notebook as Markdown: cells with the outputs of their last run.
 
     Args:
         path: of the notebook.

@@ -14,7 +14,7 @@ _HIDDEN = "---\nsearch:\n  exclude: true\n---\n\n"
 
 
 def file_page(path: Path, name: str) -> str:
-    """A page that shows a file.
+    """Return a page that shows a file.
 
     Args:
         path: the file.
@@ -32,7 +32,7 @@ def file_page(path: Path, name: str) -> str:
 
 
 def folder_page(folder: Path, name: str, linked: dict[str, str]) -> str:
-    """A page that lists a folder.
+    """Return a page that lists a folder.
 
     Args:
         folder: the folder.

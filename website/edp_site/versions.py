@@ -30,7 +30,7 @@ _FIRST_PAGE = """<!doctype html>
 
 
 def checked_name(name: str) -> str:
-    """The name of a version, which is that of its folder.
+    """Return the name of a version, which is the name of its folder.
 
     Raises:
         ValueError: it is none.
@@ -41,7 +41,7 @@ def checked_name(name: str) -> str:
 
 
 def order_of(name: str) -> tuple[tuple[int, int, str], ...]:
-    """A key that sorts 0.10 behind 0.9, and 1.0rc1 before 1.0."""
+    """Return a key that sorts 0.10 after 0.9, and 1.0rc1 before 1.0."""
     parts = re.findall(r"\d+|[A-Za-z]+", name)
     return (*((1, int(part), "") if part.isdigit() else (-1, 0, part) for part in parts), (0, 0, ""))
 

@@ -26,7 +26,7 @@ situation."""
 FAST = 0.5
 """Fraction of the maximum speed above which an axis is fast."""
 NEAR_STOP = 0.05
-"""Fraction of a stroke: distance from its ends within which cushions act (docs/simulator.md: 4 to 6 %)."""
+"""Fraction of a stroke: distance from its ends within which cushions act (docs/explanation/simulator.md: 4 to 6 %)."""
 DEAD_BAND = 0.15
 """Fraction of the largest command: spools open at 12 to 17 % in the machine files, and slowly at first."""
 FASTEST = 0.995

@@ -76,7 +76,7 @@ class StreamTick:
 class Stream:
     """Predictor run sample by sample, as on the machine: one row of SI inputs gives predictions, intervals and flags.
 
-    The rules are those of the exported C (docs/export.md): inputs with a NaN, an infinite value or one beyond a
+    The rules are those of the exported C (docs/howto/deploy_c.md): inputs with a NaN, an infinite value or one beyond a
     million standard widths are rejected as a whole, counted, and the tick is held: the last accepted inputs are fed
     again. After `HOLD_TICKS` held ticks in a row the memory is cleared, and the next accepted inputs start it again.
 

@@ -31,7 +31,7 @@ fmpy = pytest.importorskip("fmpy")
 BUILD = ("-std=c99", "-O1", "-ffp-contract=off", "-fvisibility=hidden", "-fPIC", "-shared")
 LINE = {"length_m": (0.4, 0.5), "hold_s": 0.2, "lead_s": 0.2}
 TOLERANCE_MM = 0.01
-"""Between position errors of a loop on a twin and on its FMU, as docs/control.md writes it."""
+"""Between position errors of a loop on a twin and on its FMU."""
 
 
 def packed(folder, file):

@@ -163,7 +163,7 @@ class TrainedPredictor:
             target: ``c``, ``onnx``, ``simulink``, ``fmu``, ``casadi`` or ``ros2``.
             folder: output folder, which is created.
             name: name of the network in the exported files.
-            options: options of the target (docs/export.md).
+            options: options of the target (docs/howto/deploy_c.md).
 
         Returns:
             The files, the one to read first in front.

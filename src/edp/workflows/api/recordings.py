@@ -272,7 +272,7 @@ def read(
     """Read recordings from logs and folders of logs, from a data-set file, or from a store.
 
     Args:
-        path: source of the recordings (docs/recordings.md): one path, or a sequence of logs and folders.
+        path: source of the recordings (docs/howto/map_columns.md): one path, or a sequence of logs and folders.
         map: assignment of columns to channels: a map file, or its content as a mapping. Without a map each numeric
             column becomes a channel of the same name, whose kind follows from the vocabulary or the unit in the file.
         repair: allowed repairs, by default none: ``nan`` (``hold``, ``keep``), ``gaps`` (``hold``, ``cut``, ``keep``),
