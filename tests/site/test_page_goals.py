@@ -13,7 +13,7 @@ from edp_site.links import broken_links
 
 ROOT = Path(__file__).parents[2]
 OLD_PAGES = {
-    *("commands", "settings", "results"),
+    *("commands", "settings"),
 }
 """Pages of docs/ that other pages replace, without ``.md``; delete a name here together with its page."""
 OUTSIDE = ("findings", "decisions", "journal")
