@@ -3,7 +3,7 @@
 `edp train` with no settings but the task, on each set of ``examples/real``: its root-mean-square error on the test part
 beside the stated linear floor, beside the best of all baselines fitted in the same run, and beside the error that
 left-out data promised. Nothing is chosen per set, and the test part is opened once a seed. The full form also distils
-each committee (`edp distil --units 64`) and holds its student against it.
+each committee (`edp compress distil --units 64`) and holds its student against it.
 
 The recordings are no part of the repository: their folder is given by --shared or EDP_SHARED_DATA.
 """

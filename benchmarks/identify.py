@@ -1,4 +1,4 @@
-"""Does `edp identify` find a machine again whose numbers were drawn anew?
+"""Does `edp calibrate` find a machine again whose numbers were drawn anew?
 
 Machines of the simulator's family: geometry and bores are told, as a tape measure tells them; every other guess is
 M22's, which for a machine of another size is far off. Of each number that the logs tell: the error against the truth;

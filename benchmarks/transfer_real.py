@@ -1,7 +1,7 @@
 """Fine-tuning on recordings made by others: from one regime of a plant to another, beside rivals on the same ticks.
 
 Each set has two recordings: the first and the second part of a run (time-shifted), or two kinds of excitation. The
-network of the first is trained on with the second by what ``edp finetune`` does; its rivals are direct transfer,
+network of the first is trained on with the second by what ``edp train finetune`` does; its rivals are direct transfer,
 training from scratch and ridge ARX on the second alone. No machine changes in these sets, so what they show is that
 the command works on logs of other makes and rates, and how much a few tens of seconds of a changed regime bring; not
 what a transfer between machines brings.

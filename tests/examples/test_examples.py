@@ -278,7 +278,7 @@ def test_own_logs_as_the_readme_tells(tmp_path, monkeypatch, capsys):
     log, run = tmp_path / "drive.csv", tmp_path / "run"
     rig_log(log)
     mapped = ("--map", EXAMPLES / "map.toml")
-    assert edp("inspect", log, *mapped) == 3  # a missing value
+    assert edp("data", "check", log, *mapped) == 3  # a missing value
     options = [word for change in SMALL for word in ("--set", change)]
     train = ("train", log, *mapped, "--config", EXAMPLES / "rig.toml", "--preset", "quick", *options, "--out", run)
     assert edp(*train) == 1

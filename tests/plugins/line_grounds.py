@@ -336,7 +336,7 @@ def _fmu(ground: Ground, path: Path, version: str) -> None:
 def _tuned(ground: Ground, path: Path) -> None:
     made = ground.folder / "tuning"
     words = ("--on", ground.of("front_twin"), "--trials", "2", "--loops", "1", "--seeds", "1", *settings(LOOP))
-    assert edp("tune", made, "--controller", "pi", *words) == 0
+    assert edp("loop", "tune", made, "--controller", "pi", *words) == 0
     shutil.copy(made / "tuned.toml", path)
 
 

@@ -258,9 +258,9 @@ def test_empty_paths_are_refused(option, form, edp):
 
 
 def test_empty_arguments_are_refused_and_empty_texts_are_not(edp):
-    code, err, _ = edp("inspect", "")
+    code, err, _ = edp("data", "check", "")
     assert code == 1
     assert "an argument is empty" in err
-    code, err, _ = edp("screen", "missing", "--out", "x", "--targets", "")
+    code, err, _ = edp("data", "screen", "missing", "--out", "x", "--targets", "")
     assert "missing" in err
     assert code == 1

@@ -202,7 +202,7 @@ def test_links_that_lead_nowhere_are_told(tmp_path):
     ("line", "problem"),
     [
         ("edp train logs --out run", None),
-        ("edp search logs --study dir", None),
+        ("edp search logs --out dir", None),
         ("edp monitor fit logs --out dir  # a remark --none", None),
         ("edp train logs --out run && other --none", None),
         ("edp trian logs", "there is no command 'trian'"),

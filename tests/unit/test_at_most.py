@@ -77,7 +77,7 @@ def test_hours_that_are_none_are_refused(store, hours):
 def test_logs_are_refused_with_the_command_that_stores_them(store):
     logs = DataSource(store.parent / "logs", at_most_h=1.0)
     for look in (logs.read, logs.inspect):
-        with pytest.raises(ConfigError, match=r"no store.*edp store build"):
+        with pytest.raises(ConfigError, match=r"no store.*edp data store build"):
             look()
 
 

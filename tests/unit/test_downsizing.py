@@ -132,10 +132,12 @@ def test_other_recordings_can_be_learned_on(run, lever_sessions, tmp_path):
 
 
 def test_the_command_makes_a_run_and_says_what_it_is(run, tmp_path):
-    told = CliRunner().invoke(app, ["distil", str(run), "--units", "4", "--out", str(tmp_path / "small"), "--json"])
+    told = CliRunner().invoke(
+        app, ["compress", "distil", str(run), "--units", "4", "--out", str(tmp_path / "small"), "--json"]
+    )
     assert told.exit_code == 0, told.output
     facts = json.loads(told.stdout)
     assert facts["student"]["parameters"] < facts["teacher"]["parameters"]
     assert load_bundle(tmp_path / "small").predictor.spec.backbone.units == 4
-    shown = CliRunner().invoke(app, ["distil", str(run), "--units", "4", "--out", str(tmp_path / "small")])
+    shown = CliRunner().invoke(app, ["compress", "distil", str(run), "--units", "4", "--out", str(tmp_path / "small")])
     assert "next: edp evaluate" in shown.output

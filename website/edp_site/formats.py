@@ -40,7 +40,7 @@ def formats_page() -> str:
     for name, log_format in FORMATS.items():
         endings = ", ".join(f"`{suffix}`" for suffix in log_format.suffixes)
         lines.append(f"| `{name}` | {endings} | {log_format.content} |")
-    lines += ["", "## Exported forms", "", "For `edp export --to NAME`.", "", "| Name | What it is |", "|---|---|"]
+    lines += ["", "## Exported forms", "", "For `edp export --format NAME`.", "", "| Name | What it is |", "|---|---|"]
     lines += [f"| `{name}` | {first_sentence(target)} |" for name, target in TARGETS.items()]
     return "\n".join(lines) + "\n"
 

@@ -46,7 +46,7 @@ _ROOTS: Mapping[str, tuple[type, ...]] = {
 """What keys begin in, by the first word of a command; an experiment and the tables of commands for all others."""
 _TREES = (SETTINGS, TWIN_SETTINGS, CONTROL_SETTINGS, MONITOR_SETTINGS)
 _CONTROLLER_OPTIONS = frozenset(("iterations", "newton"))
-"""Of `edp export --to controller`, whose options are no dataclass."""
+"""Of `edp export --format controller`, whose options are no dataclass."""
 
 
 def unknown_keys(words: tuple[str, ...], changes: list[str]) -> list[str]:

@@ -75,6 +75,7 @@ plain_tree = SETTINGS.plain
 PRESETS = ("quick", "small", "committee", "standard", "thesis", "pressures", "positions")
 AUTO = "auto"
 """The preset that leaves network and training to `edp.workflows.auto`; it is no experiment by itself."""
+PRESET_NAMES = (AUTO, *PRESETS)
 
 
 @dataclass(frozen=True, kw_only=True)

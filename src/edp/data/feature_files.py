@@ -1,4 +1,4 @@
-"""Feature sets as TOML files, written by `edp screen` or by the user and read by `task.features`."""
+"""Feature sets as TOML files, written by `edp data screen` or by the user and read by `task.features`."""
 
 from __future__ import annotations
 

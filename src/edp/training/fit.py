@@ -207,7 +207,7 @@ class Loop:
         }
         return Diverged(
             f"{what} is {value} at update {progress.updates} (epoch {facts['epoch']}): the training diverged; {saved}. "
-            "Lower the learning rate or clip_norm, or look for outliers with edp inspect",
+            "Lower the learning rate or clip_norm, or look for outliers with edp data check",
             self._make_result() if math.isfinite(progress.best_score) else None,
             facts,
         )

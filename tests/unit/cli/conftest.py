@@ -51,7 +51,7 @@ class Ended:
 
 @pytest.fixture
 def edp(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Ended]:
-    """Run a command line: ``edp("inspect", folder)``."""
+    """Run a command line: ``edp("data", "check", folder)``."""
     monkeypatch.setenv("TERM", "dumb")
 
     def run(*args: object) -> Ended:

@@ -24,7 +24,7 @@ def test_train_says_what_it_chose_and_why(edp, logs, tmp_path):
     assert facts["minutes"] == 0.01
     again = edp("train", logs, "--out", run, *SETTINGS, "--json")
     assert again.json["sentence"] == facts["sentence"]
-    chunks = edp("distil", run, "--units", "4", "--out", tmp_path / "small", "--set", "training.epochs=3")
+    chunks = edp("compress", "distil", run, "--units", "4", "--out", tmp_path / "small", "--set", "training.epochs=3")
     assert chunks.code == 1
     reasons = {"linear": "has no width", "committee": "training.epochs: the student of a committee learns on rows"}
     assert reasons[facts["chosen"]] in chunks.err

@@ -356,7 +356,7 @@ def test_several_logs_another_rate_and_no_twin_are_refused(edp, logs, trained, t
     write_recording(replace(recording, rate_hz=25.0), slow)
     assert "has 25 Hz, the task 50 Hz" in " ".join(edp("rollout", trained, slow).err.split())
     assert "is not a twin: it has no twin.json" in " ".join(edp("rollout", logs, logs / "log_1.parquet").err.split())
-    assert "holds a twin, not a network" in " ".join(edp("footprint", trained).err.split())
+    assert "holds a twin, not a network" in " ".join(edp("compress", "estimate", trained).err.split())
 
 
 def test_a_log_of_positions_alone_of_two_kinds_has_a_table_an_actuator(edp, tmp_path):

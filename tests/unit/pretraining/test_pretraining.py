@@ -96,7 +96,7 @@ def test_the_report_shows_the_machines_that_were_never_seen(made, tmp_path):
     for row in found.unseen.contexts:
         assert f"<td>{number(row.mae)}</td>" in page
     (copied / "foundation.json").write_text('{"label": "Joint"}')
-    with pytest.raises(StorageError, match="edp pretrain"):
+    with pytest.raises(StorageError, match="edp train pretrain"):
         build_report(copied)
     (copied / "foundation.json").unlink()
     assert '<section id="unseen">' not in build_report(copied).read_text()

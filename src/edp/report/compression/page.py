@@ -12,7 +12,8 @@ from edp.storage.paths import full_path
 
 
 def write_compression_page(folder: str | Path, pictures: bool = True) -> Path:
-    """Write ``report.html``, ``tables/*.csv``, ``tables/*.md`` and ``pictures/*`` into the folder of `edp compress`.
+    """Write ``report.html``, ``tables/*.csv``, ``tables/*.md`` and ``pictures/*`` into the folder of `edp compress
+    search`.
 
     Returns:
         The page.

@@ -88,7 +88,7 @@ class PerceptronLearner:
             facts = {"epoch": len(self.work.history) + 1, "update": step + 1, "kept_epoch": None}
             raise Diverged(
                 f"the training loss is {value} at update {step + 1}: the training diverged; nothing is kept. Lower "
-                "training.bagging.learning_rate, or look for outliers with edp inspect",
+                "training.bagging.learning_rate, or look for outliers with edp data check",
                 None,
                 facts,
             )

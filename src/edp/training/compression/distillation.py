@@ -179,7 +179,7 @@ class Distillation:
         if not np.isfinite(mean).all():
             raise DataError(
                 f"distillation: a teacher's prediction for '{part.name}' is not finite; look at the recording with "
-                "edp inspect"
+                "edp data check"
             )
         columns = [np.full((part.samples, 1), truth), mean]
         if self.components is not None:

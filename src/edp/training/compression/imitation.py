@@ -239,7 +239,7 @@ class _Perceptrons:
             facts = {"epoch": None, "update": stop, "kept_epoch": None}
             raise Diverged(
                 f"the loss of the student is {mean} by update {stop}: the training diverged; nothing is kept. Look for "
-                "outliers with edp inspect",
+                "outliers with edp data check",
                 None,
                 facts,
             )

@@ -123,7 +123,7 @@ def check_moving(data: Prepared) -> None:
         if still:
             raise DataError(
                 f"{'; '.join(still)} in the {part} part of the logs: nothing can be learned or judged of a target "
-                "that does not move. Look for a frozen sensor or a wrong column with edp inspect, or give logs in "
+                "that does not move. Look for a frozen sensor or a wrong column with edp data check, or give logs in "
                 "which every target moves"
             )
 

@@ -206,7 +206,7 @@ class Foundation:
         return NetworkPlan(self.source.predictor.spec, training)
 
     def _training(self, updates: int, threads: int) -> TrainingSpec:
-        """Return the training of `edp finetune --method full` with this number of updates per epoch."""
+        """Return the training of `edp train finetune --method full` with this number of updates per epoch."""
         own = tuned(self.source.experiment.training, FinetuneSpec())
         return replace(own, updates=updates, threads=threads, bagging=None)
 
@@ -228,7 +228,7 @@ def read_foundation(path: str) -> Foundation | None:
     if isinstance(foundation.source.predictor.spec.backbone, CommitteeSpec):
         raise ConfigError(
             f"{SETTING}: '{path}' is a committee, which the preset makes of the recordings itself; give a network that "
-            "was trained by gradient, such as a run of edp pretrain, or leave the setting out"
+            "was trained by gradient, such as a run of edp train pretrain, or leave the setting out"
         )
     return foundation
 

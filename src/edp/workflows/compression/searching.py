@@ -311,7 +311,7 @@ class _Comparison:
         pair = {TEACHER: self.teacher, "chosen": best}
         # Weights and format are the key of an opening: the same pair may be evaluated again without a second look.
         keys = [f"{weights_digest(self._networks[row.name])} {row.number_format}" for row in pair.values()]
-        why = "the network chosen by edp compress, and its teacher"
+        why = "the network chosen by edp compress search, and its teacher"
         openings: list[Opening] = []
         # The ledger of the search comes first: it knows of openings from other folders.
         for ledger_folder in [*([held_out.study / "ledger"] if held_out.study else []), folder.file("ledger")]:

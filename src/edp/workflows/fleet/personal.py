@@ -1,4 +1,4 @@
-"""`edp finetune --fleet`: one network, and a delta of kilobytes for each machine of a store."""
+"""`edp train finetune --fleet`: one network, and a delta of kilobytes for each machine of a store."""
 
 from __future__ import annotations
 

@@ -461,7 +461,7 @@ def _description(base: Machine) -> str:
 def _head(base: Machine, rows: Sequence[IdentifiedNumber], notes: Sequence[str]) -> list[str]:
     told_count, rough_count = sum(row.is_told for row in rows), sum(row.excited and not row.is_told for row in rows)
     return [
-        f"Identified from logs by edp identify: {told_count} of {len(rows)} numbers are told, {rough_count} roughly.",
+        f"Identified from logs by edp calibrate: {told_count} of {len(rows)} numbers are told, {rough_count} roughly.",
         "Behind a number: an approximate 95 % interval, from how far parts of the logs and runs of other lengths",
         f"differ ('roughly' where it is wider than {percent(TOLD)}), or that the number is kept. Numbers without a",
         f"comment are those of machine {base.name}, bodies but for their lengths excepted.",

@@ -43,7 +43,7 @@ from edp.workflows.transfer.source import SourceModel, read_source, target_exper
 KIND, SHOWN = "transfer", "transfer_predictions.safetensors"
 BEFORE = "direct"
 RENAMED = {"replay": "rehearsal", "replay_distilled": "rehearsal_distilled"}
-"""Methods by their former names; ``edp replay`` judges a log with an adapted network and mixes no data."""
+"""Methods by their former names; ``edp adapt replay`` judges a log with an adapted network and mixes no data."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,7 +194,7 @@ def _able(source: SourceModel, order: FinetuneRequest) -> tuple[list[str], list[
         elif METHODS[name].needs_code and not code_names(source.predictor):
             lacking[name] = (
                 "needs a network that reads the code of a machine, which that of the source does not; give one of "
-                "edp pretrain --method codes"
+                "edp train pretrain --method codes"
             )
     if order.method in lacking:
         raise ConfigError(f"method '{order.method}' {lacking[order.method]}")
