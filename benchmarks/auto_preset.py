@@ -32,7 +32,7 @@ from edp.workflows.train_evaluate import DataSource, evaluate
 
 KEPT = 0.1
 """How far the test error may lie from the promise."""
-QUICK_SETS, QUICK = ("sjoberg.toml", "tanks.toml"), ("auto.minutes=0.05",)
+QUICK_SETS, QUICK = ("sjoberg.toml", "tanks.toml"), ("auto.time_budget_min=0.05",)
 STUDENT_UNITS, STUDENT_LOSS = 64, 0.02
 """Width of a student's two perceptrons, and how much more error than its committee it may have."""
 

@@ -30,7 +30,7 @@ OWN_NETWORK = "small"
 OURS, NONE = "full", "direct"
 RIVALS = (NONE, "scratch", "ridge_arx", "rehearsal")
 RATES = (3e-3, 1e-2, 3e-2)  # the validation part chooses
-SPEC = FinetuneSpec(batch=8, rounds=20)  # seconds of logs do not hold more lanes
+SPEC = FinetuneSpec(batch=8, single_phase_epochs=20)  # seconds of logs do not hold more lanes
 CHANGES = ('split={kind="time"}', "training.refit=none")
 
 
@@ -67,7 +67,7 @@ def transferred(regimes: Regimes, work: Path, quick: bool, seed: int) -> dict[st
     changes = [f"training.seed={seed}", "training.threads=1", *CHANGES, *(["training.epochs=2"] if quick else [])]
     experiment = load_experiment(EXAMPLES / regimes.settings, OWN_NETWORK, changes)
     train(DataSource.of(work / "source"), experiment, work / "run")
-    specs = [replace(SPEC, rounds=2)] if quick else [replace(SPEC, rate=rate) for rate in RATES]
+    specs = [replace(SPEC, single_phase_epochs=2)] if quick else [replace(SPEC, rate=rate) for rate in RATES]
     logs = DataSource.of(work / "target")
     tried = {work / f"tuned_{number}": FinetuneRequest(spec=spec, method=OURS) for number, spec in enumerate(specs)}
     for folder, order in tried.items():

@@ -41,8 +41,8 @@ SETTINGS = (
     "model.head.hidden=4",
     "model.blocks=[]",
     "model.window=10",
-    "judge.history=4",
-    'judge.baselines=["persistence"]',
+    "evaluation.history=4",
+    'evaluation.baselines=["persistence"]',
 )
 SPEC = AdaptationSpec(rank=1, noise=1.0)
 

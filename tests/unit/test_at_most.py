@@ -23,7 +23,7 @@ pytestmark = pytest.mark.processes
 HZ = 2.0
 """A stretch of two minutes has 240 rows."""
 LENGTHS = (1500, 900, 120, 2000)
-HALVED = (*SMALL, "training.updates=2", 'split={kind="time",validation_share=0.2,test_share=0.4}')
+HALVED = (*SMALL, "training.updates=2", 'split={kind="time",validation_fraction=0.2,test_fraction=0.4}')
 
 
 @pytest.fixture(scope="module")

@@ -52,7 +52,7 @@ SETTINGS = (
     "model.head.hidden=8",
     "model.blocks=[]",
     "model.window=10",
-    'judge.baselines=["persistence"]',
+    'evaluation.baselines=["persistence"]',
 )
 
 

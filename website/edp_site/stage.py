@@ -9,7 +9,18 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from edp_site import commands, formats, gallery, markdown, notebooks, parts, python_api, repository_files, results
+from edp_site import (
+    commands,
+    formats,
+    gallery,
+    markdown,
+    notebooks,
+    parts,
+    python_api,
+    repository_files,
+    results,
+    settings_reference,
+)
 
 ROOT = Path(__file__).parents[2]
 _PROJECT_PAGES = {
@@ -61,6 +72,7 @@ def stage(out: Path, demo: Path | None = None, root: Path = ROOT, version: str |
 def _made(root: Path) -> dict[str, Callable[[], str]]:
     return {
         "reference/commands.md": commands.commands_page,
+        "reference/settings.md": settings_reference.settings_page,
         "reference/python.md": python_api.python_page,
         "reference/parts.md": parts.parts_page,
         "reference/formats.md": formats.formats_page,

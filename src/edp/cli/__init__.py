@@ -43,7 +43,7 @@ from edp.cli import (
 )
 from edp.cli.console import err, run_app
 from edp.cli.groups import Root
-from edp.cli.notices import tell_of_missing_layers, tell_of_slow_logs, tell_of_unsealed_files
+from edp.cli.notices import tell_of_earlier_keys, tell_of_missing_layers, tell_of_slow_logs, tell_of_unsealed_files
 from edp.cli.process import stop_on_request, use_one_blas_thread
 from edp.workflows import load_plugins
 
@@ -133,5 +133,6 @@ def main() -> None:
     tell_of_slow_logs()
     tell_of_missing_layers()
     code = run_app(app)
+    tell_of_earlier_keys()
     tell_of_unsealed_files()
     sys.exit(code)

@@ -19,4 +19,4 @@ EXIT_CODES: Mapping[str, str] = {
     "143": "Stopped by a request to end (SIGTERM); the same command continues.",
 }
 """Meaning of each exit code."""
-EXIT_CODES_AT = "Exit codes: see docs/commands.md, section Exit codes."
+EXIT_CODES_AT = "Exit codes: 0 done, 1 a mistake; all of them: docs/commands.md, section Exit codes."

@@ -45,7 +45,8 @@ def finetune(
     ] = "ridge_arx",
     config: SettingsOption = None,
     changes: Annotated[
-        list[str], typer.Option("--set", help="One setting, for example finetune.rate=1e-3 or training.updates=100.")
+        list[str],
+        typer.Option("--set", help="One setting, for example finetune.learning_rate=1e-3 or training.updates=100."),
     ] = [],  # noqa: B006
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
@@ -68,7 +69,8 @@ def finetune(
 
     Example: `edp train finetune runs/m22 logs/c14 --out runs/c14 --baselines all`
 
-    Example: `edp train finetune runs/m22 logs/c14 --out runs/c14 --set finetune.rounds=20 --set finetune.batch=16`
+    Example: `edp train finetune runs/m22 logs/c14 --out runs/c14 --set finetune.single_phase_epochs=20 --set
+    finetune.batch=16`
 
     With --fleet a store of many machines is taken, and what comes out is a delta of kilobytes for each of them.
 

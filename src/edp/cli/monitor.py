@@ -95,7 +95,7 @@ def fit(
     from edp.workflows.monitor.fit_monitor import holds_model
 
     options: dict[str, object] = {} if hours is None else {"hours_per_false_alarm": hours}
-    options |= {} if time_budget is None else {"minutes": time_budget}
+    options |= {} if time_budget is None else {"time_budget_min": time_budget}
     options |= {} if machine is None else {"dictionary": {"machine": machine}}
     experiment = load_monitor_experiment(config, changes, options)
     check_effects(context, {"time_budget": trains_networks(experiment)})

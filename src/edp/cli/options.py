@@ -12,6 +12,7 @@ import typer
 
 from edp.errors import ConfigError
 from edp.settings.bounds import Bound, shown
+from edp.settings.earlier_keys import KEYS
 
 if TYPE_CHECKING:
     from edp.jobs import Workers
@@ -87,11 +88,11 @@ EXCLUDED: Mapping[tuple[str, str], tuple[str, ...]] = {
     ("runs", "as_json"): ("max_runs",),
 }
 """Parameters by command ("*": every command), each with parameters that have no effect beside it."""
-TRIAL_TABLES = ("trials", "task", "split", "model", "training", "judge")
+TRIAL_TABLES = ("trials", "task", "split", "model", "training", "evaluation")
 """Settings of the trials of edp data screen: their own table and those of an experiment."""
 DEPENDENT: Mapping[tuple[str, str], str] = {
     ("data animate", "horizon"): "a run before the log",
-    ("evaluate", "baselines"): "the run of a network (judge.floors are those of a twin)",
+    ("evaluate", "baselines"): "the run of a network (evaluation.baselines are those of a twin)",
     ("evaluate", "time_budget"): "the run of a network, baselines, and one process",
     ("evaluate", "max_hours"): "the run of a network",
     ("evaluate", "channel_importance"): "the run of a network",
@@ -137,23 +138,26 @@ _SAME = {
     "train pretrain": "inner_rate inner_steps shots",
     "data screen": "trusted",
 }
+_KEYS = {**KEYS["FinetuneSpec"], **KEYS["MetaSpec"]}
 FORMER = {
-    (command, name): f"{_TABLES[command]}.{name}=VALUE" for command, names in _SAME.items() for name in names.split()
+    (command, name): f"{_TABLES[command]}.{_KEYS.get(name, name)}=VALUE"
+    for command, names in _SAME.items()
+    for name in names.split()
 } | {
     ("train finetune", "no_center"): "finetune.center=false",
     ("train finetune", "any_sign"): "finetune.check_signs=false",
     ("adapt run", "rest"): "adapt.dead_zone=VALUE",
     ("adapt run", "forgetting"): "adapt.forgetting_s=VALUE",
-    ("adapt run", "judged"): "adapt.judged_s=VALUE",
+    ("adapt run", "judged"): "adapt.evaluation_s=VALUE",
     ("compress distil", "pruned"): "distil.pruned=true",
-    ("compress distil", "truth"): "distil.objective.truth=VALUE",
-    ("compress distil", "hint"): "distil.objective.hint=VALUE",
+    ("compress distil", "truth"): "distil.objective.target_weight=VALUE",
+    ("compress distil", "hint"): "distil.objective.hint_weight=VALUE",
     ("compress search", "format"): "compress.formats=[VALUE]",
     ("compress search", "thesis"): "compress.thesis=true",
     ("compress search", "units"): "compress.units=[VALUE]",
     ("train pretrain", "head_only"): "pretrain.head_only=true",
-    ("data screen", "trusted"): "screen.trusted=[VALUE]",
-    ("data screen", "random"): "trials.random=VALUE",
+    ("data screen", "trusted"): "screen.measured=[VALUE]",
+    ("data screen", "random"): "trials.random_sets=VALUE",
     ("search run", "mode"): "search.mode=VALUE",
     ("simulate", "masses"): "masses=[LOW, HIGH]",
     ("simulate", "scatter"): "scatter=VALUE",

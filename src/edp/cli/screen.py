@@ -60,7 +60,7 @@ def screen(
     exclude: Annotated[str, typer.Option(help="Channels to leave out of the candidates: a,b.")] = "",
     truth: Annotated[bool, typer.Option(help="Accept channels that exist only in a simulation as candidates.")] = False,
     changes: Annotated[
-        list[str], typer.Option("--set", help='One setting, such as screen.max_lag=200 or screen.trusted=["lever"].')
+        list[str], typer.Option("--set", help='One setting, such as screen.max_lag=200 or screen.measured=["lever"].')
     ] = [],  # noqa: B006
     pictures: Annotated[bool, typer.Option(help="Write the pictures as SVG and PNG too.")] = True,
     trials: Annotated[
@@ -86,7 +86,7 @@ def screen(
 
     Example: `edp data screen logs/ --out screen --targets v_boom,v_arm --horizon 10`
 
-    Example: `edp data screen logs/ --out screen --set 'screen.trusted=["lever"]' --set screen.forest.trees=60`
+    Example: `edp data screen logs/ --out screen --set 'screen.measured=["lever"]' --set screen.forest.trees=60`
 
     Example: `edp train logs/ --config screen/settings.toml --out runs/first`
     """

@@ -85,7 +85,7 @@ def run(
     # JSON quotes the path as TOML wants it.
     changes = [*changes, f"search.compression.budget={json.dumps(str(budget))}"] if budget is not None else changes
     plan = load_plan(config, preset, changes)
-    check_effects(context, {"budget": plan.spec.compression.on})
+    check_effects(context, {"budget": plan.spec.compression.enabled})
     resources = Resources(
         count=workers,
         threads=threads,

@@ -76,7 +76,7 @@ def train(
         str | None,
         typer.Option(
             autocompletion=complete_from("edp.config.experiment", "PRESET_NAMES"),
-            help="auto tries several models and keeps the best; quick, small, committee, standard, thesis, "
+            help="auto tries several models and keeps the best; quick, small, ensemble, standard, thesis, "
             "pressures, positions. "
             "Default: auto, or standard where the settings name a network or how to train it.",
         ),
@@ -113,7 +113,7 @@ def train(
     preset = preset or usual_preset(config, changes)
     check_effects(context, dict.fromkeys(("time_budget", "workers", "cluster"), preset == AUTO))
     if preset == AUTO:
-        own = [] if time_budget is None else [f"auto.minutes={time_budget!r}"]
+        own = [] if time_budget is None else [f"auto.time_budget_min={time_budget!r}"]
         divided = workers_of(workers, cluster, open_cluster, usual=0)
         _train_auto(source, folder, config, [*changes, *own], divided, as_json)
         return
@@ -143,7 +143,7 @@ def _train_auto(
 
     settings = load_auto(config, changes)
     if not quiet:
-        limit = f"{figure(settings.auto.minutes)} min"
+        limit = f"{figure(settings.auto.time_budget_min)} min"
         err.print(f"train: reads the logs, then trains for at most about {limit} of processor time (--time-budget)")
     with show_progress("train", quiet) as progress:
         result = train_auto(source, settings, folder, progress, workers)

@@ -31,7 +31,7 @@ SMALL = (
     'model.backbone={kind="hybrid",channels=[6],kernel=3,units=6}',
     "model.head.hidden=6",
     "model.window=12",
-    "judge.history=5",
+    "evaluation.history=5",
 )
 
 

@@ -112,7 +112,7 @@ def test_one_recording_is_divided_by_time(edp, tmp_path):
     ended = edp("train", *log(tmp_path, 900), "--out", tmp_path / "run", "--set", "task.horizons=[2]")
     assert ended.code == 0, ended.err
     split = tomllib.loads((tmp_path / "run" / "config.toml").read_text())["split"]
-    assert split == {"kind": "time", "validation_share": 0.15, "test_share": 0.2, "whole_short": False}
+    assert split == {"kind": "time", "validation_fraction": 0.15, "test_fraction": 0.2, "train_short_recordings": False}
 
 
 @pytest.mark.parametrize(

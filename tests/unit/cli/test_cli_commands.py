@@ -175,7 +175,7 @@ def test_report_refuses_a_file_that_is_no_budget(edp, trained, tmp_path, content
 def test_demo_runs_its_four_steps(edp, tmp_path, monkeypatch, small):
     monkeypatch.setattr(demo, "MINUTES", 0.8)
     monkeypatch.setattr(demo, "RECORDINGS", 4)
-    whole, fewer = train_command.run, 'judge.baselines=["persistence", "ridge_arx"]'
+    whole, fewer = train_command.run, 'evaluation.baselines=["persistence", "ridge_arx"]'
 
     def shorter(data, run, *, preset, changes, quiet):
         return whole(data, run, preset=preset, changes=[*changes, *small[3::2], fewer], quiet=quiet)

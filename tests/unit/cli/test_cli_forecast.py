@@ -26,7 +26,7 @@ def logs(tmp_path_factory):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, logs):
     folder = tmp_path_factory.mktemp("twins") / "run"
-    settings = ("twin.kind=arx", "judge.seconds=4", "judge.starts=2", "judge.at_s=[1, 4]")
+    settings = ("twin.kind=arx", "evaluation.duration_s=4", "evaluation.starts=2", "evaluation.at_s=[1, 4]")
     train_twin(DataSource.of(logs), load_twin_experiment(None, settings), folder)
     return folder
 

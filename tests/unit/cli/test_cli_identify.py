@@ -25,11 +25,11 @@ SMALL = (
     *("twin.fit.final_rounds=1", "twin.fit.final_ticks=600"),
     *("twin.fit.validation_s=1", "twin.fit.validation_runs=2", "twin.inertia_degree=1"),
     *(
-        "judge.seconds=2",
-        "judge.starts=3",
-        "judge.at_s=[1, 2]",
-        "judge.calibration_starts=2",
-        'judge.floors=["static"]',
+        "evaluation.duration_s=2",
+        "evaluation.starts=3",
+        "evaluation.at_s=[1, 2]",
+        "evaluation.calibration_starts=2",
+        'evaluation.baselines=["static"]',
     ),
 )
 WORDS = [word for change in SMALL for word in ("--set", change)]
@@ -132,7 +132,7 @@ def test_logs_and_machines_that_do_not_fit_are_refused_and_nothing_is_written(ed
         ("twin.kind=residual", "twin.kind = 'residual' came"),
         ('twin.motors=[{name="swing", velocity="rate"}]', "the grey box has motors; a machine of the simulator has"),
         ("twin.linkage=c14", "the linkage is that of --machine (M22): leave twin.linkage out"),
-        ('twin.without=["play"]', "twin.without = ['play'] leaves out numbers that a machine file has"),
+        ('twin.omit=["play"]', "twin.omit = ['play'] leaves out numbers that a machine file has"),
     ],
 )
 def test_what_is_no_whole_grey_box_is_refused_before_any_fit(edp, logs, tmp_path, change, message):

@@ -29,23 +29,28 @@ pytestmark = [pytest.mark.long, pytest.mark.processes]
 LINE = ("--set", "task.length_m=[0.4,0.5]", "--set", "task.hold_s=0.2")
 RIG = ("BmUp", "CylVels_1", "CylStroke_1", "CylPressures_1", "CylPressures_5")
 TRIALS = (
-    *("trials.random=1", "training.epochs=1", "training.updates=2", "screen.max_lag=20", "screen.pieces=4"),
-    *("screen.information_samples=200", "screen.rank_samples=200", "screen.piece_samples=100"),
-    *("screen.forest.trees=5", "screen.forest.samples=200", "screen.forest.tests=100", "screen.forest.repeats=2"),
+    *("trials.random_sets=1", "training.epochs=1", "training.updates=2", "screen.max_lag=20", "screen.min_segments=4"),
+    *("screen.information_samples=200", "screen.rank_samples=200", "screen.segment_samples=100"),
+    *(
+        "screen.forest.trees=5",
+        "screen.forest.samples=200",
+        "screen.forest.test_samples=100",
+        "screen.forest.repeats=2",
+    ),
 )
 TWIN = (
-    *("twin.kind=recurrent", "twin.units=6", "twin.members=3", "twin.prefix_ticks=20", "training.lanes=4"),
-    *("training.lengths_s=[0.2]", "training.updates=[6]", "training.validate_every=3", "judge.seconds=4"),
-    *("judge.starts=2", "judge.at_s=[1, 4]"),
+    *("twin.kind=recurrent", "twin.units=6", "twin.members=3", "twin.prefix_ticks=20", "training.batch=4"),
+    *("training.lengths_s=[0.2]", "training.updates=[6]", "training.validate_every=3", "evaluation.duration_s=4"),
+    *("evaluation.starts=2", "evaluation.at_s=[1, 4]"),
 )
 AUTO = (
     "auto.candidates=['linear','recurrent']",
     "task.targets=['CylVels_1']",
     "task.horizons=[5]",
-    "judge.baselines=[]",
+    "evaluation.baselines=[]",
 )
 LIMIT = ("limit.moments=4", "limit.branches=4")
-FLEET = ("finetune.rounds=2", "finetune.batch=4", "finetune.check_signs=false")
+FLEET = ("finetune.single_phase_epochs=2", "finetune.batch=4", "finetune.check_signs=false")
 
 
 def settings(values):

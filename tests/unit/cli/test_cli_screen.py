@@ -21,7 +21,7 @@ QUICK = [
         "pieces=6",
         "information_samples=400",
         "rank_samples=800",
-        "piece_samples=200",
+        "segment_samples=200",
         "forest.trees=5",
         "forest.samples=800",
         "forest.tests=400",
@@ -59,7 +59,7 @@ def logs(tmp_path_factory):
 
 def test_screen_proposes_and_a_training_uses_it(edp, logs, tmp_path, small):
     out = tmp_path / "screen"
-    options = ["--horizon", "5", "--set", "screen.trusted=['lever']", "--no-pictures"]
+    options = ["--horizon", "5", "--set", "screen.measured=['lever']", "--no-pictures"]
     ended = edp("data", "screen", logs, "--out", out, *options, *QUICK)
     assert ended.code == 0, ended.err
     assert "read: log 1 of 4, drive_0.csv" in ended.err
@@ -105,15 +105,15 @@ def test_screen_tries_the_sets_and_draws(edp, logs, tmp_path, monkeypatch):
     (tmp_path / "tiny.toml").write_text(
         "[training]\nepochs = 1\nupdates = 3\n"
         '[training.chunks]\nregime = "chunk"\nlength = 32\nbatch = 4\nburn_in = 10\n'
-        '[model.backbone]\nkind = "lstm"\nunits = 4\n[judge]\nhistory = 5\n'
+        '[model.backbone]\nkind = "lstm"\nunits = 4\n[evaluation]\nhistory = 5\n'
     )
     out = tmp_path / "screen"
     trials = [
         "--set",
-        "screen.trusted=['lever']",
+        "screen.measured=['lever']",
         "--trials",
         "--set",
-        "trials.random=1",
+        "trials.random_sets=1",
         "--config",
         tmp_path / "tiny.toml",
         "--features",

@@ -29,8 +29,14 @@ from edp.training.bundle import make_bundle, save_bundle
 from edp.training.twin_bundle import load_twin
 
 SMALL = (
-    *("twin.kind=recurrent", "twin.units=6", "twin.prefix_ticks=20", "training.lanes=4", "training.lengths_s=[0.2]"),
-    *("training.updates=[6]", "training.validate_every=3", "judge.seconds=4", "judge.starts=2", "judge.at_s=[1, 4]"),
+    *("twin.kind=recurrent", "twin.units=6", "twin.prefix_ticks=20", "training.batch=4", "training.lengths_s=[0.2]"),
+    *(
+        "training.updates=[6]",
+        "training.validate_every=3",
+        "evaluation.duration_s=4",
+        "evaluation.starts=2",
+        "evaluation.at_s=[1, 4]",
+    ),
 )
 WORDS = [word for change in SMALL for word in ("--set", change)]
 

@@ -79,7 +79,7 @@ class CandidateTraining:
     @property
     def on_folds(self) -> bool:
         """Test whether it is trained on folds; networks trained by gradient descent on chunks are not."""
-        return self.experiment.training.bagging is not None
+        return self.experiment.training.ensemble is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,7 @@ def _train_by_gradient(job: CandidateTraining, on_event: OnEvent | None) -> Trai
     experiment, begun = job.experiment, {}
     if job.foundation is not None:
         begun = {"foundation": job.foundation.facts}
-    settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
+    settings = {part: values for part, values in plain_tree(experiment).items() if part != "evaluation"}
     key = run_key(settings | begun, job.data.digest)
     with Run.create(job.folder, "network", key, experiment_toml(experiment)) as run:
         strategy = None if job.foundation is None else job.foundation.strategy()

@@ -119,7 +119,7 @@ def parts_of(
         lever_high=np.array(limits.lever_high),
         slew=np.array(limits.slew_per_s) / plant.rate_hz,
         sides=[_sides(valves, axis) for axis in range(AXES)],
-        gains=(loop.proportional, loop.integral, loop.rest_m_s, MAX_SUM),
+        gains=(loop.proportional, loop.integral, loop.standstill_m_s, MAX_SUM),
         lead=round(loop.lead_s * plant.rate_hz),
         plan=plan,
         golden=None,

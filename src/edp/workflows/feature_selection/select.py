@@ -317,9 +317,11 @@ def _try_sets(
     experiment = replace(order.experiment, task=trial_task(order.experiment.task, screening))
     asked: dict[str, str | FeatureSettings] = {**sets, **order.sets}
     leaks = {flag.channel for flag in screening.flags if flag.kind is FlagKind.LEAK}
-    barred = tuple(sorted(leaks | set(order.trials.barred)))  # a random set with a leak would look best of all
+    barred = tuple(
+        sorted(leaks | set(order.trials.excluded_channels))
+    )  # a random set with a leak would look best of all
     return try_feature_sets(
-        source, experiment, asked, folder / "trials", replace(order.trials, barred=barred), on_trial, workers
+        source, experiment, asked, folder / "trials", replace(order.trials, excluded_channels=barred), on_trial, workers
     )
 
 

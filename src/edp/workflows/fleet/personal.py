@@ -228,7 +228,7 @@ def tune_machine(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithSt
 
 def _errors(network: Predictor, data: Prepared) -> float:
     """Mean absolute error over the outputs at the first horizon, on the ends of the recordings, in report units."""
-    skip = max(network.spec.window, data.task.features.starting_ticks)
+    skip = max(network.spec.window, data.task.features.init_samples)
     scores = score_predictions(stream_predictions(network, data.test), data, skip)
     return metric(scores.overall[str(data.task.horizons[0])][MEAN], "mae")
 

@@ -231,7 +231,7 @@ def _result(
 ) -> tuple[TransferFile, dict[str, NDArray[np.float32]]]:
     """Scores of all methods in both domains, and the predictions before and after that pictures show."""
     # The longest start-up of all methods, so that all are scored on the same ticks.
-    skip = max(source.predictor.spec.window, experiment.judge.history, data.task.features.starting_ticks)
+    skip = max(source.predictor.spec.window, experiment.evaluation.history, data.task.features.init_samples)
     predictions = {name: one.predict(data) for name, one in results.items()}
     errors = {name: errors_of(values, data, skip) for name, values in predictions.items()}
     domains = {"target": {name: measure(values, data, skip) for name, values in predictions.items()}}
