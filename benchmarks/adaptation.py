@@ -10,7 +10,7 @@ A change makes the future harder to know for any predictor: how much is shown by
 
 The options' defaults were chosen on other recordings of these scenarios (seed 50) than those that count here (seed 90).
 
-A grey box of the machine as it was follows the machine, too (the C code of `edp export --to follower`), alone and
+A grey box of the machine as it was follows the machine, too (the C code of `edp export --format follower`), alone and
 before the correction above, without and with a thermometer in the oil.
 
 Rivals on the same ticks: no adaptation; offset and gain of each predicted change, by recursive least squares; the whole

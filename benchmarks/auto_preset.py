@@ -3,7 +3,7 @@
 `edp train` with no settings but the task, on each set of ``examples/real``: its root-mean-square error on the test part
 beside the stated linear floor, beside the best of all baselines fitted in the same run, and beside the error that
 left-out data promised. Nothing is chosen per set, and the test part is opened once a seed. The full form also distils
-each committee (`edp distil --units 64`) and holds its student against it.
+each committee (`edp compress distil --units 64`) and holds its student against it.
 
 The recordings are no part of the repository: their folder is given by --shared or EDP_SHARED_DATA.
 """
@@ -32,7 +32,7 @@ from edp.workflows.train_evaluate import DataSource, evaluate
 
 KEPT = 0.1
 """How far the test error may lie from the promise."""
-QUICK_SETS, QUICK = ("sjoberg.toml", "tanks.toml"), ("auto.minutes=0.05",)
+QUICK_SETS, QUICK = ("sjoberg.toml", "tanks.toml"), ("auto.time_budget_min=0.05",)
 STUDENT_UNITS, STUDENT_LOSS = 64, 0.02
 """Width of a student's two perceptrons, and how much more error than its committee it may have."""
 

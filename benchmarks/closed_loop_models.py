@@ -35,8 +35,13 @@ MIX: Mapping[str, float] = {
 SOILS: Mapping[str, float] = {"air": 0.5, "dry_sand": 0.15, "sandy_loam": 0.2, "clay": 0.15}
 """Of the recordings that work the ground; all others move in free air."""
 JUDGED = (
-    *("judge.seconds=20", "judge.at_s=[1.0,5.0,10.0]", "judge.covered_at_s=[0.1,1.0,10.0]", "judge.floors=[]"),
-    *("judge.ahead_ticks=20", "training.patience=0"),
+    *(
+        "evaluation.duration_s=20",
+        "evaluation.at_s=[1.0,5.0,10.0]",
+        "evaluation.coverage_at_s=[0.1,1.0,10.0]",
+        "evaluation.baselines=[]",
+    ),
+    *("evaluation.horizon=20", "training.patience=0"),
 )
 AHEAD = (1, 5, 10, 20, 50)
 """Ticks ahead of measured ports at which the twin is judged, told the commands."""
@@ -59,7 +64,7 @@ class GreySize:
 
 
 # Without what takes fits longer and nearer: the kept results are of this grey box.
-SHORT = ("twin.stretches=5", "twin.fit.final_rounds=0", "twin.fit.starts=1")
+SHORT = ("twin.curve_segments=5", "twin.fit.final_rounds=0", "twin.fit.starts=1")
 GREY = GreySize(45.0, 15, ("twin.fit.ticks=8000", *SHORT))
 QUICK_GREY = GreySize(
     *(6.0, 6, ("twin.fit.ticks=1000", "twin.fit.lengths_s=[0.1,0.3]", "twin.fit.rounds=[1,1]", *SHORT))

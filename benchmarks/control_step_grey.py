@@ -1,9 +1,10 @@
 """What does a tick of a predictive controller on a grey box cost in C, and does it fit into 10 ms of a Cortex-M7?
 
 The grey box of M22 of `closed_loop.py --part grey` (fitted where --data has none; under a processor minute with
---quick, on fewer logs), and a controller `nmpc` on it, written by `edp export --to controller`. A line on the simulator
-is graded by the controller in Python; its observations are fed to the compiled one, whose levers are compared tick by
-tick from the same memory. Then the compiled one grades the 18 lines of `closed_loop.py` in free air and in loam.
+--quick, on fewer logs), and a controller `nmpc` on it, written by `edp export --format controller`. A line on the
+simulator is graded by the controller in Python; its observations are fed to the compiled one, whose levers are
+compared tick by tick from the same memory. Then the compiled one grades the 18 lines of `closed_loop.py` in free air
+and in loam.
 
 Time is processor time on this computer, one thread, a tick at a time. Instructions are counted by Callgrind here, and
 by QEMU on a Cortex-M7 with double precision, the mean over ticks behind the first 25. Ticks of a small plan are traced

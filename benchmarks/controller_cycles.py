@@ -1,4 +1,4 @@
-"""Are the cycles that `edp footprint` estimates those of the code that `edp export` writes?
+"""Are the cycles that `edp compress estimate` estimates those of the code that `edp export` writes?
 
 Instructions of a tick, once a whole window was seen, are counted on an emulated Cortex-M4F. Some ticks are traced, and
 each instruction is given its cycles by the Cortex-M4 Technical Reference Manual (ARM DDI 0439, table of instruction set

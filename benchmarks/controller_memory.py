@@ -1,4 +1,4 @@
-"""Is the memory that `edp footprint` estimates that of the code that `edp export` writes?
+"""Is the memory that `edp compress estimate` estimates that of the code that `edp export` writes?
 
 The exported model is linked for a Cortex-M4F (``-O2``, unused functions left out) and run on an emulated one. Its state
 is what ``sizeof`` says. Its stack is what a tick overwrites of a filled stack, behind a whole window, where every layer

@@ -4,7 +4,7 @@ Networks as in the thesis's setting (30 features, 3 targets, window of 50, four 
 weights as drawn: costs do not depend on them. Times are of the processor, one thread, the best of three. A tick of an
 FMU is what an importer written in Python does with FMPy: inputs set, a step, outputs read. The rival is what a block
 that evaluates the window at every tick cannot do without: ONNX Runtime on our graph of the window, and none of the
-costs of the block. Then every form that `edp parity` can run here, by the clock, with its difference from PyTorch.
+costs of the block. Then every form that `edp verify` can run here, by the clock, with its difference from PyTorch.
 """
 
 from __future__ import annotations

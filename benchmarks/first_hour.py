@@ -178,9 +178,9 @@ def person_seconds(result: dict[str, Any]) -> dict[str, float]:
     """Estimate a person's time in seconds, without waiting for the computer.
 
     Returns:
-        ``deciding``: the first command is typed and the printed ones are copied; all that `edp init` and `edp inspect`
-        print is read, since it asks for decisions, and of the others the last line. ``reading_all``: every command is
-        typed and every printed word is read, progress apart, which is rewritten in place.
+        ``deciding``: the first command is typed and the printed ones are copied; all that `edp init` and `edp data
+        check` print is read, since it asks for decisions, and of the others the last line. ``reading_all``: every
+        command is typed and every printed word is read, progress apart, which is rewritten in place.
     """
     steps = result["steps"]
     fixed = PREPARED_S * len(steps) + QUESTION_S * result["questions"]

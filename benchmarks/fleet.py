@@ -326,7 +326,7 @@ def deltas(fleet: Fleet) -> dict[str, Any]:
     store = fleet.work / "unseen_store"
     DataSource.from_path(fleet.logs("unseen", orders["unseen"])).store(store)
     found: dict[str, Any] = {"parameters": sum(p.numel() for p in load_bundle(base).predictor.parameters())}
-    spec = FinetuneSpec(rounds=3 if fleet.quick else 10)
+    spec = FinetuneSpec(single_phase_epochs=3 if fleet.quick else 10)
     content = finetune_fleet(Workers(), base, store, PersonalOrder(method="full", spec=spec), fleet.work / "own")
     rows = [(name, error.before, error.full, error.delta) for name, error in content.errors.items()]
     found["full"] = {

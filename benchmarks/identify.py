@@ -1,4 +1,4 @@
-"""Does `edp identify` find a machine again whose numbers were drawn anew?
+"""Does `edp calibrate` find a machine again whose numbers were drawn anew?
 
 Machines of the simulator's family: geometry and bores are told, as a tape measure tells them; every other guess is
 M22's, which for a machine of another size is far off. Of each number that the logs tell: the error against the truth;
@@ -40,7 +40,7 @@ JOINTS = ("boom", "arm", "bucket")
 QUICK = (
     *("twin.fit.lengths_s=[0.1, 0.3]", "twin.fit.rounds=[3, 2]", "twin.fit.starts=1", "twin.fit.ticks=1500"),
     *("twin.fit.final_rounds=1", "twin.fit.final_ticks=1500"),
-    *("twin.fit.validation_runs=8", "judge.seconds=10", "judge.starts=2", "judge.at_s=[1, 10]"),
+    *("twin.fit.validation_runs=8", "evaluation.duration_s=10", "evaluation.starts=2", "evaluation.at_s=[1, 10]"),
 )
 
 
@@ -79,7 +79,7 @@ def one_machine(given: Any, name: str) -> dict[str, Any]:
     quick, seed = given.quick, given.seed
     minutes, recordings = (4.0, 8) if quick else (given.minutes, 8 if given.short else 16)
     fit = f"twin.fit.ticks={given.ticks}", f"twin.fit.starts={given.starts}"
-    changes = QUICK if quick else (*QUICK, *fit) if given.short else (*fit, "judge.at_s=[1, 10, 60]")
+    changes = QUICK if quick else (*QUICK, *fit) if given.short else (*fit, "evaluation.at_s=[1, 10, 60]")
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         source = (given.data or folder) / name

@@ -1,4 +1,4 @@
-"""What does a tick of an exported monitor cost beside its predictor, and are its cycles those of `edp footprint`?
+"""What does a sample of an exported monitor cost, and does `edp compress estimate` predict its cycles?
 
 Chains of several sizes with drawn numbers run on an emulated Cortex-M4F, which has no double precision in hardware: the
 instructions of every tick of a block are counted, and those of some ticks traced and given their cycles as in

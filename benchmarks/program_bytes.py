@@ -1,4 +1,4 @@
-"""Are the bytes that `edp footprint` states those of the program that `edp export` writes?
+"""Are the bytes that `edp compress estimate` states those of the program that `edp export` writes?
 
 Networks are exported, compiled for a Cortex-M4F (``-O2``) and linked without a C library's start-up code, unused
 functions left out. Constants: the read-only data of the model's object, each constant up to the next word, must be

@@ -103,7 +103,7 @@ def tried(
 ) -> Trials:
     """Train and judge the network on every set."""
     quick, seed = given.quick, given.seed
-    changes = [f"training.seed={seed}", f"split.seed={seed}", "split.test_share=0.25"]
+    changes = [f"training.seed={seed}", f"split.seed={seed}", "split.test_fraction=0.25"]
     changes += ["training.epochs=2", "training.updates=15"] if quick else ["training.epochs=6", "training.updates=250"]
     flagged = {flag.channel for flag in found.flags if flag.kind is FlagKind.LEAK}
     proposed = FeatureSettings(name="proposed", channels=found.proposal.kept)
@@ -129,7 +129,7 @@ def tried(
             print(f"training {done + 1}/{total}: {name}", flush=True)
 
     drawn = given.random if given.random is not None else 1 if quick else 3
-    spec = TrialSpec(random=drawn, draw=seed, barred=tuple(sorted(flagged)), seeds=(seed,))
+    spec = TrialSpec(random_sets=drawn, random_seed=seed, excluded_channels=tuple(sorted(flagged)), seeds=(seed,))
     return try_feature_sets(source, load_experiment(None, "quick", changes), sets, folder, spec, tell)
 
 

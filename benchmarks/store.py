@@ -121,7 +121,7 @@ def of_a_part(bench: Bench, base: float, hours: float, at_most: float) -> object
     folder, quick = bench.folder, bench.quick
     store, data = folder / "store", folder / f"store_{hours:g}"
     write_logs(folder / "logs", base, 20, bench.seed)
-    run(["store", "build", str(folder / "logs"), "--out", str(store), "--workers", "1"])
+    run(["data", "store", "build", str(folder / "logs"), "--out", str(store), "--workers", "1"])
     repeated(store, data, max(1, round(hours / base)))
     run(training(store, folder / "trained", 2 if quick else UPDATES[0], 1))
     part = ["--at-most", f"{at_most:g}"]
@@ -178,7 +178,9 @@ def main(bench: Bench) -> object:
     sizes, commands = ([0.4], ["evaluate", "inspect"]) if bench.quick else (bench.options.hours, bench.options.commands)
     folder = bench.folder
     write_logs(folder / "logs", base, 20, bench.seed)
-    build_s, build_mb = run(["store", "build", str(folder / "logs"), "--out", str(folder / "store"), "--workers", "1"])
+    build_s, build_mb = run(
+        ["data", "store", "build", str(folder / "logs"), "--out", str(folder / "store"), "--workers", "1"]
+    )
     logs_s, logs_mb = run(training(folder / "logs", folder / "from_logs", updates))
     store_s, store_mb = run(training(folder / "store", folder / "from_store", updates))
     weights = [load_file(next((folder / name).rglob("*.safetensors"))) for name in ("from_logs", "from_store")]

@@ -1,7 +1,7 @@
 """Fine-tuning on recordings made by others: from one regime of a plant to another, beside rivals on the same ticks.
 
 Each set has two recordings: the first and the second part of a run (time-shifted), or two kinds of excitation. The
-network of the first is trained on with the second by what ``edp finetune`` does; its rivals are direct transfer,
+network of the first is trained on with the second by what ``edp train finetune`` does; its rivals are direct transfer,
 training from scratch and ridge ARX on the second alone. No machine changes in these sets, so what they show is that
 the command works on logs of other makes and rates, and how much a few tens of seconds of a changed regime bring; not
 what a transfer between machines brings.
@@ -31,7 +31,7 @@ OWN_NETWORK = "small"
 OURS, NONE = "full", "direct"
 RIVALS = (NONE, "scratch", "ridge_arx", "rehearsal")
 RATES = (3e-3, 1e-2, 3e-2)  # the validation part chooses
-SPEC = FinetuneSpec(batch=8, rounds=20)  # seconds of logs do not hold more lanes
+SPEC = FinetuneSpec(batch=8, single_phase_epochs=20)  # seconds of logs do not hold more lanes
 CHANGES = ('split={kind="time"}', "training.refit=none")
 
 
@@ -68,7 +68,7 @@ def transferred(regimes: Regimes, work: Path, quick: bool, seed: int) -> dict[st
     changes = [f"training.seed={seed}", "training.threads=1", *CHANGES, *(["training.epochs=2"] if quick else [])]
     experiment = load_experiment(EXAMPLES / regimes.settings, OWN_NETWORK, changes)
     train(DataSource.from_path(work / "source"), experiment, work / "run")
-    specs = [replace(SPEC, rounds=2)] if quick else [replace(SPEC, rate=rate) for rate in RATES]
+    specs = [replace(SPEC, single_phase_epochs=2)] if quick else [replace(SPEC, rate=rate) for rate in RATES]
     logs = DataSource.from_path(work / "target")
     tried = {work / f"tuned_{number}": FinetuneRequest(spec=spec, method=OURS) for number, spec in enumerate(specs)}
     for folder, order in tried.items():

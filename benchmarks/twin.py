@@ -87,7 +87,7 @@ def main(bench: Bench) -> object:
     channels, data = prepare_twin(DataSource.from_path(bench.data), experiment)
     parts = channels, fit_scales(channels, data.train), data
     whole = set(only) == set(FITTED)
-    closed = (*experiment.judge.floors, "n4sid") if whole else ("static",) if not arguments.many else ()
+    closed = (*experiment.evaluation.floors, "n4sid") if whole else ("static",) if not arguments.many else ()
     models = floors(closed, parts, bench.seed) | fitted_models(arguments, experiment, parts)
     if arguments.many:
         least = 60 if quick else MANY
@@ -98,7 +98,7 @@ def main(bench: Bench) -> object:
         return many
     scores = scored(models, closed, parts, experiment, 3 if quick else 16)
     show(scores)
-    check_goals(bench, scores, [name for name in FITTED if name in only], experiment.judge.coverage)
+    check_goals(bench, scores, [name for name in FITTED if name in only], experiment.evaluation.coverage)
     if "recurrent" in only:
         compiled, plain = (update_ms(experiment, parts, how) for how in (TwinNetwork.forward, plain_steps))
         name = "forward and backward pass, 100 samples, batch of 64: compiled loop against autograd"
@@ -136,7 +136,7 @@ def fitted_models(arguments: Any, experiment: TwinExperiment, parts: Any) -> dic
             print(f"fitting: {name}", flush=True)
             models[name] = fitted_once(arguments.kept, name, fitted, (parts, seed, fit))
     if arguments.specialist:
-        free_only = replace(training, measured_share=0.0, mixed_share=0.0)
+        free_only = replace(training, measured_fraction=0.0, mixed_fraction=0.0)
         models[FREE_ONLY] = network(FREE_ONLY, free_only)
         # As many updates, all on runs as long as a look ahead: it is told the commands in between, as the twin is.
         short = replace(training, lengths_s=(AHEAD / parts[0].rate_hz,), updates=(sum(training.updates),))
@@ -151,8 +151,8 @@ def scored(
     data, scores = parts[2], {}
     for name, (twin, seconds) in models.items():
         taught = name not in closed
-        intervals = calibrated([(twin, data.validation)], experiment.judge) if taught else None
-        own = free_run_scores(free_runs(twin, data.test, 60.0, starts), experiment.judge, intervals)
+        intervals = calibrated([(twin, data.validation)], experiment.evaluation) if taught else None
+        own = free_run_scores(free_runs(twin, data.test, 60.0, starts), experiment.evaluation, intervals)
         scores[name] = plain_value(replace(own, ahead=score_ahead(look_ahead(twin, data.test, AHEAD))))
         scores[name]["training_s"] = seconds
         if taught:
@@ -163,7 +163,7 @@ def scored(
 def validation_mae(twin: Twin, data: Any, experiment: TwinExperiment) -> float:
     """Error of the velocities over free runs of the validation part, mm/s, by which formulations are chosen."""
     runs = free_runs(twin, data.validation, VALIDATION_S, 4)
-    return float(free_run_scores(runs, experiment.judge).velocity_mae.mean or 0.0)
+    return float(free_run_scores(runs, experiment.evaluation).velocity_mae.mean or 0.0)
 
 
 def check_goals(bench: Bench, scores: dict[str, dict[str, Any]], named: list[str], coverage: float) -> None:

@@ -129,7 +129,7 @@ def update_cost(data: Prepared, settings: Experiment) -> float:
 def experiment(seed: int, quick: bool, ahead: bool = False) -> Experiment:
     """Of the network without forecasts, or with them where `ahead` asks for them."""
     # Regressions on 50 ticks of all channels alone would take more than the short form's minute.
-    short = ("judge.history=8", BYPASS_OF.format(taps=8)) if quick else ()
+    short = ("evaluation.history=8", BYPASS_OF.format(taps=8)) if quick else ()
     forecast = tuple(f"{target}{AHEAD}{k}" for k in HORIZONS for target in TARGETS) if ahead else ()
     channels = f"task.features={{name='measured', channels={[*MEASURED, *forecast]}}}"
     changes = [*CHANGES, *short, channels, f"task.horizons={list(HORIZONS)}", f"training.seed={seed}"]
@@ -182,12 +182,12 @@ def trained(
     training = replace(settings.training, epochs=LOOKS, updates=updates)
     net = fit(short, settings.model, training).predictor
     rivals = () if rounded else ("persistence", "ridge_arx")
-    errors = judged(net, data, replace(settings.judge, baselines=rivals))
+    errors = judged(net, data, replace(settings.evaluation, baselines=rivals))
     found: dict[str, Any] = {"mae": errors.pop("network"), **errors, "updates": LOOKS * updates}
     found |= {"cost_of_update_s": cost, "parameters": footprint(net).parameters}
     if rounded:
         integers = integer_predictor(net, data.train)
-        found["integer"] = judged(integers, data, replace(settings.judge, baselines=()))["network"]
+        found["integer"] = judged(integers, data, replace(settings.evaluation, baselines=()))["network"]
         found["bytes"] = constant_bytes(integers.integers, None)
     print(f"{LOOKS * updates} updates of {cost:.3f} s: {found['mae']}", flush=True)
     return found | {"seconds": before_s + LOOKS * updates * cost}

@@ -50,7 +50,7 @@ from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
 ESTIMATION = 0.8
 """Share of the estimation data that trains where nothing is left out in turn; the rest chooses."""
 RIVALS = ("static", "arx", "n4sid")
-QUICK = ("training.updates=[20,20,20,20]", "training.lanes=16")
+QUICK = ("training.updates=[20,20,20,20]", "training.batch=16")
 STARTS, HALF = 64, 0.5
 """Free runs along the test recording on which intervals are judged, each of at most this share of it."""
 
@@ -274,14 +274,14 @@ class Judged:
     def coverage(self, result: FittedFormulation, experiment: TwinExperiment) -> list[dict[str, Any]]:
         """Share of free runs along the test recording that the intervals hold, by horizon."""
         shortest, longest = 1.0 / self.channels.rate_hz, self.test.samples / self.channels.rate_hz
-        twin, judge = result.fitted.twin, experiment.judge
+        twin, judge = result.fitted.twin, experiment.evaluation
         intervals = calibrated(result.unseen or ((twin, [self.estimation]),), judge)
         part = "strokes" if self.which.target == "stroke" else "velocities"
         rows = []
-        for at in sorted({max(at, shortest) for at in judge.covered_at_s if at < HALF * longest}):
+        for at in sorted({max(at, shortest) for at in judge.coverage_at_s if at < HALF * longest}):
             # Runs as long as each horizon, so that starts lie all along the recording.
             runs = free_runs(twin, [self.test], at, STARTS)
-            row = coverage_of(runs, replace(judge, covered_at_s=(at,)), intervals).at[0]
+            row = coverage_of(runs, replace(judge, coverage_at_s=(at,)), intervals).at[0]
             rows.append({"at_s": at, "calibrated": row.calibrated, "share": row.parts()[part].share})
         return rows
 

@@ -43,8 +43,8 @@ from edp.workflows.twin.prepare_twin import cut_recordings
 from verdicts import Verdict
 
 RIVALS = ("static", "arx", "n4sid")
-SPLIT = ByTime(validation_share=0.2, test_share=0.25)
-QUICK = ("training.updates=[60,60,60,20]", "training.lanes=16")
+SPLIT = ByTime(validation_fraction=0.2, test_fraction=0.25)
+QUICK = ("training.updates=[60,60,60,20]", "training.batch=16")
 QUICK_SETS = ("sjoberg", "cylinders")
 
 
@@ -96,7 +96,7 @@ def measure(channels: TwinChannels, data: Prepared, experiment: TwinExperiment) 
     """Errors over the static map's in the test part, of the default twin and its rivals, and what was chosen."""
     began = time.process_time()
     scales, seed = fit_scales(channels, data.train), experiment.training.seed
-    judge = replace(experiment.judge, seconds=30.0, starts=8, at_s=(1.0, 5.0, 10.0, 30.0))
+    judge = replace(experiment.evaluation, seconds=30.0, starts=8, at_s=(1.0, 5.0, 10.0, 30.0))
     with tempfile.TemporaryDirectory() as folder, Run(folder) as run:
         fit = TwinFit(channels, scales, data, experiment)
         result, tried = TwinChoice(fit, experiment.twin, KeyedRun(run, "0" * 32)).best()
@@ -106,7 +106,7 @@ def measure(channels: TwinChannels, data: Prepared, experiment: TwinExperiment) 
     for name in RIVALS:
         spec = replace(TWINS[name](), prefix_ticks=experiment.twin.prefix_ticks)
         twins[name] = spec.start(channels, fit_scales(channels, everything), everything, seed)
-    scores = {name: free_run_scores(free_runs(twin, data.test, judge.seconds, judge.starts), judge)
+    scores = {name: free_run_scores(free_runs(twin, data.test, judge.duration_s, judge.starts), judge)
               for name, twin in twins.items()}  # fmt: skip
     chosen = next(one for one in tried if one.chosen)
     return {

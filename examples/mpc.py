@@ -1,8 +1,8 @@
 """Tracks velocities with a network as the plant: ``python examples/mpc.py EXPORTED/plant.json [TICKS]``.
 
-EXPORTED is what ``edp export RUN --to casadi --name plant`` wrote of a run with ``examples/mpc.toml``. Three commands,
-one a cylinder: above zero the first pilot pressure of its pair, below it the second. Twenty ticks ahead, three ways:
-one Gauss-Newton step a tick on the C code, at most ten of them, and CasADi's SQP on the symbolic step.
+EXPORTED is what ``edp export RUN --format casadi --name plant`` wrote of a run with ``examples/mpc.toml``. Three
+commands, one a cylinder: above zero the first pilot pressure of its pair, below it the second. Twenty ticks ahead,
+three ways: one Gauss-Newton step a tick on the C code, at most ten of them, and CasADi's SQP on the symbolic step.
 """
 
 import sys

@@ -60,10 +60,10 @@ SMALL = {
             members=2,
             units=4,
             centres=5,
-            near=(0, 3),
+            local_lags=(0, 3),
             trees=5,
             tree_depth=3,
-            bounded=True,
+            clip_inputs=True,
         ),
         CommitteeSpec(lags=(2, 5), members=1, units=4, layers=1, activations=("relu",), dropout=0.2),
     ],
@@ -74,7 +74,7 @@ SMALL = {
     "mlp": [MlpHead(hidden=6), MlpHead(hidden=5, layers=2)],
     "glu": [GluHead(hidden=4), GluHead(hidden=4, layers=2)],
     "linear": [LinearHead(dead_band=True)],
-    "linear_bypass": [BLOCKS["linear_bypass"](taps=4), BLOCKS["linear_bypass"](taps=1, trained=False)],
+    "linear_bypass": [BLOCKS["linear_bypass"](taps=4), BLOCKS["linear_bypass"](taps=1, trainable=False)],
 }
 FORMS = [
     (activation, horizons, mode)
@@ -127,8 +127,8 @@ def _physical() -> dict[str, Structure]:
     """Each physics base beside one backbone: it meets the network at the output only."""
     variants = {
         "kinematic": [{}, {"pose": "strokes"}],
-        "force": [{}, {"load": "none", "fade_s": 0.0, "machine": "C14"}],
-        "hybrid": [{"fade_s": 0.0}, {"coupled": True, "pose": "strokes"}],
+        "force": [{}, {"load": "none", "decay_s": 0.0, "machine": "C14"}],
+        "hybrid": [{"decay_s": 0.0}, {"coupled": True, "pose": "strokes"}],
     }
     return {
         f"lstm+{name} physics{number or ''}": Structure(SMALL["lstm"][0], physics=PHYSICS[name](**options))

@@ -171,7 +171,7 @@ def columns(values: FloatArray, places: Sequence[int]) -> FloatArray:
 
 
 def spread_stretches(lengths: Sequence[int], length: int, most: int = MAX_ROWS) -> list[tuple[int, int, int]]:
-    """Return the stretches that are evenly spread over sequences of rows.
+    """Return the segments that are evenly spread over sequences of rows.
 
     Number of the sequence, first row, one after the last.
 

@@ -27,7 +27,7 @@ def entries(names=tuple(DERIVATIONS)):
     for how in names:
         for span in SPANS if DERIVATIONS[how].least_ticks else (None,):
             for source in ("a", "load"):
-                derived.append(Derived(f"{how} of {source} {span}", source, how, seconds=span))
+                derived.append(Derived(f"{how} of {source} {span}", source, how, span_s=span))
     return tuple(derived)
 
 
@@ -52,9 +52,9 @@ def test_a_whole_stretch_has_the_values_of_the_equation(entry):
 
 def test_behind_its_span_a_change_is_a_difference_and_a_mean_forgets():
     x = np.arange(40, dtype=np.float32) ** 2
-    change = derive(Derived("c", "x", "change", seconds=0.05), x, RATE)
+    change = derive(Derived("c", "x", "change", span_s=0.05), x, RATE)
     np.testing.assert_allclose(change[5:], x[5:] - x[:-5], rtol=1e-6)
-    mean = derive(Derived("m", "x", "trailing_mean", seconds=0.05), np.where(np.arange(40) < 20, 7e6, x), RATE)
+    mean = derive(Derived("m", "x", "trailing_mean", span_s=0.05), np.where(np.arange(40) < 20, 7e6, x), RATE)
     np.testing.assert_allclose(mean[24:], [x[t - 4 : t + 1].mean() for t in range(24, 40)], rtol=1e-6)
 
 
@@ -117,4 +117,4 @@ def test_spans_that_cannot_be_are_one_error(options, message):
 def test_spans_are_read_from_settings_and_rounded_to_ticks():
     derived = build(Derived, {"name": "d", "source": "a", "how": "change", "seconds": 0.03}, "test")
     assert (derived.ticks(100.0), derived.ticks(50.0), derived.gain(1000.0)) == (3, 2, 30.0)
-    assert Derived("d", "a", "change", seconds=MAX_LAG / RATE).ticks(RATE) == MAX_LAG
+    assert Derived("d", "a", "change", span_s=MAX_LAG / RATE).ticks(RATE) == MAX_LAG

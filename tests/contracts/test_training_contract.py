@@ -212,7 +212,7 @@ def test_laws_reach_as_far_as_their_quantiles():
         (lambda: Laplace(coverages=(0.5, 0.9)), "decreasing"),
         (lambda: Normal(coverages=(1.0,)), r"coverages = \[1.0\]; 0 < coverages < 1 must hold"),
         (lambda: Jitter(std=0.0), r"std = 0\.0; 0 < std <= 1 must hold"),
-        (lambda: WindowShift(most=0), "most = 0; integers, 1 <= most"),
+        (lambda: WindowShift(max_shift=0), "most = 0; integers, 1 <= most"),
         (lambda: TimeWarp(strength=0.6), r"strength = 0\.6; .* must hold"),
         (lambda: AVERAGES["ema"](decay=1.0), r"decay = 1\.0; .* must hold"),
         (lambda: AVERAGES["swa"](share=0.0), r"share = 0\.0.*must hold"),
@@ -265,7 +265,7 @@ def test_jitter_has_the_size_asked_for():
 def test_a_shift_moves_inputs_against_targets_within_its_bound():
     part, found = stretch(), set()
     for seed in range(60):
-        made = WindowShift(most=2).apply(part, None, np.random.default_rng(seed))
+        made = WindowShift(max_shift=2).apply(part, None, np.random.default_rng(seed))
         (shift,) = [
             s for s in range(-5, 6) if np.array_equal(made.inputs[10:-10], part.inputs[10 + s : -10 + s or None])
         ]
@@ -298,9 +298,9 @@ def test_an_average_is_one_of_the_weights_that_were(name):
         step = spec.step(update, updates)
         assert 0 < step <= 1
         average += step * (weight - average)
-        assert 0 <= spec.factor(0.5, update, updates) <= 1
+        assert 0 <= spec.rate_factor(0.5, update, updates) <= 1
     if name == "swa":
         assert average == pytest.approx(weights[-10:].mean())
-        assert [spec.factor(0.5, update, updates) for update in (40, 41)] == [0.5, 0.3]
+        assert [spec.rate_factor(0.5, update, updates) for update in (40, 41)] == [0.5, 0.3]
     elif name == "none":
         assert average == pytest.approx(weights[-1])

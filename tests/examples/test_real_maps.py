@@ -155,7 +155,7 @@ def test_real_recordings_train_through_their_maps(tmp_path, monkeypatch):
     changes = ["training.epochs=1", "training.updates=2"]
     train(data, load_experiment(REAL / "tanks_freerun_settings.toml", "small", changes), tmp_path / "free")
     assert np.isfinite(rmse(tmp_path / "free", "network", 0))
-    train_auto(data, load_auto(REAL / "tanks_settings.toml", ["auto.minutes=0.05"]), tmp_path / "run")
+    train_auto(data, load_auto(REAL / "tanks_settings.toml", ["auto.time_budget_min=0.05"]), tmp_path / "run")
     for horizon in (1, 5, 10):
         assert rmse(tmp_path / "run", "network", horizon) < rmse(tmp_path / "run", "persistence", horizon)
 

@@ -16,7 +16,7 @@ from edp.training import Bundle
 from edp.workflows.parity import FORMS, compare, golden_case
 
 DERIVED = tuple(
-    Derived(f"{how} of {source}", source, how, seconds=span if DERIVATIONS[how].least_ticks else None)
+    Derived(f"{how} of {source}", source, how, span_s=span if DERIVATIONS[how].least_ticks else None)
     for how in DERIVATIONS
     for source, span in (("a", 0.03), ("load", 0.05), ("b", 0.03))
 )

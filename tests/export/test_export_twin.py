@@ -118,7 +118,7 @@ def test_integers_are_those_of_the_reference(c, name, tmp_path):
 
 
 def test_integers_of_a_network_are_made_by_edp_quantise(bundle_of):
-    with pytest.raises(ConfigError, match="edp quantise"):
+    with pytest.raises(ConfigError, match="edp compress quantise"):
         quantise_twin(bundle_of("lstm"), Recordings())
 
 

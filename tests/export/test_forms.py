@@ -1,4 +1,4 @@
-"""`edp parity`: every registered form says what PyTorch says, and a form that does not is found."""
+"""`edp verify`: every registered form says what PyTorch says, and a form that does not is found."""
 
 from __future__ import annotations
 

@@ -99,7 +99,7 @@ def turning_bench():
 
 def front_bench():
     """A front whose load is bodies of a known linkage, with opening curves of ten stretches."""
-    spec = GreyBox(linkage="m22", stretches=10)
+    spec = GreyBox(linkage="m22", curve_segments=10)
     return plant_bundle(TwinBundle(spec, sample_twin(spec, sample_front())[0]))
 
 

@@ -302,7 +302,7 @@ def ahead_monitor():
     spec = TWINS["recurrent"](units=6, members=1)
     twin = TwinBundle(spec, sample_twin(spec)[0])
     changes = [
-        *("chain.block_s=0.4", "chain.settle_s=1.0", "chain.folds=2", "train_share=0.3"),
+        *("chain.block_s=0.4", "chain.settle_s=1.0", "chain.folds=2", "train_fraction=0.3"),
         'chain.watches=[{detector={kind="cusum",slack=0.5},memory_s=0.4}]',
         'residuals=[{kind="look_ahead"},{kind="twin_ports",free_s=0.3}]',
     ]

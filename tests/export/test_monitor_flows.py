@@ -20,7 +20,13 @@ def excavator():
     """A monitor of balances alone, and a session."""
     sessions = [simulate(Scenario(duration_s=20.0, seed=seed, excitation="aprbs")) for seed in range(10)]
     changes = [
-        *("chain.block_s=0.4", "chain.settle_s=1.0", "chain.folds=2", "train_share=0.3", 'dictionary.machine="none"'),
+        *(
+            "chain.block_s=0.4",
+            "chain.settle_s=1.0",
+            "chain.folds=2",
+            "train_fraction=0.3",
+            'dictionary.machine="none"',
+        ),
         'chain.watches=[{detector={kind="cusum",slack=0.5},memory_s=0.4}]',
         'residuals=[{kind="flow_balances",trials=3,rows=10000,least=0.0},{kind="balances"}]',
     ]

@@ -139,7 +139,7 @@ def adapted(bundle, rank):
 
 
 def stated(bundle, name, adaptation=None):
-    """What `edp footprint` says of the float network in a format."""
+    """What `edp compress estimate` says of the float network in a format."""
     predictor = bundle.predictor
     return footprint(predictor if name == "float32" else predictor.to_float_network(), adaptation).estimate(name)
 

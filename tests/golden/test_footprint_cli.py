@@ -1,4 +1,4 @@
-"""``edp footprint`` on the thesis's settings prints the counts that the thesis prints (Tables B.1, 4.8, 4.9)."""
+"""``edp compress estimate`` prints the counts of the thesis for its settings (Tables B.1, 4.8, 4.9)."""
 
 import dataclasses
 import json
@@ -45,7 +45,7 @@ def test_every_file_is_held_to_the_table():
 
 @pytest.mark.parametrize("name", PRINTED)
 def test_counts(name, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["edp", "footprint", str(FOLDER / f"{name}.toml"), "--json"])
+    monkeypatch.setattr(sys, "argv", ["edp", "compress", "estimate", str(FOLDER / f"{name}.toml"), "--json"])
     assert run_app(app) == 0
     counts = json.loads(capsys.readouterr().out)
     parameters, window, tick = PRINTED[name]
@@ -84,7 +84,7 @@ def test_a_label_names_what_is_not_plain():
 def test_a_budget_file_is_held_against_and_an_impossible_one_is_refused(monkeypatch, capsys, tmp_path):
     budget = FOLDER.parent / "budgets" / "small_controller.toml"
     settings = str(FOLDER / "k10_student_u32.toml")
-    monkeypatch.setattr(sys, "argv", ["edp", "footprint", settings, "--budget", str(budget), "--json"])
+    monkeypatch.setattr(sys, "argv", ["edp", "compress", "estimate", settings, "--budget", str(budget), "--json"])
     assert run_app(app) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["budget"]["cycles"] == 360_000
@@ -93,6 +93,6 @@ def test_a_budget_file_is_held_against_and_an_impossible_one_is_refused(monkeypa
     assert not fits["cycles per prediction, windowed"]
 
     (tmp_path / "none.toml").write_text("cycles = 100")
-    monkeypatch.setattr(sys, "argv", ["edp", "footprint", settings, "--budget", str(tmp_path / "none.toml")])
+    monkeypatch.setattr(sys, "argv", ["edp", "compress", "estimate", settings, "--budget", str(tmp_path / "none.toml")])
     assert run_app(app) == 1
     assert "cycles = 100 can be met by no network" in " ".join(capsys.readouterr().err.split())

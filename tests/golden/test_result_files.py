@@ -27,12 +27,18 @@ NETWORK = (
     'training.loss={kind="heteroscedastic"}',
     "model.blocks=[]",
     "model.window=8",
-    "judge.history=4",
-    'judge.baselines=["persistence", "ridge_arx"]',
+    "evaluation.history=4",
+    'evaluation.baselines=["persistence", "ridge_arx"]',
 )
 TWIN = (
-    *("twin.kind=recurrent", "twin.units=6", "twin.prefix_ticks=20", "training.lanes=4", "training.lengths_s=[0.2]"),
-    *("training.updates=[6]", "training.validate_every=3", "judge.seconds=4", "judge.starts=2", "judge.at_s=[1, 4]"),
+    *("twin.kind=recurrent", "twin.units=6", "twin.prefix_ticks=20", "training.batch=4", "training.lengths_s=[0.2]"),
+    *(
+        "training.updates=[6]",
+        "training.validate_every=3",
+        "evaluation.duration_s=4",
+        "evaluation.starts=2",
+        "evaluation.at_s=[1, 4]",
+    ),
 )
 
 

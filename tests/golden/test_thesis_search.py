@@ -247,7 +247,7 @@ def walked():
         "exploration": TrialsSpec(trials=4),
         "synthesis": TrialsSpec(trials=3),
         "isolation": dataclasses.replace(PLAN.spec.isolation, runs=10),
-        "planning": dataclasses.replace(PLAN.spec.planning, most_runs=5),
+        "planning": dataclasses.replace(PLAN.spec.planning, max_runs=5),
         "calibration": CalibrationSpec(trials=6, warm_rounds=1),
     }
     found = run_phases(context(**small, rungs=(0.5,)), world, until="exploration")

@@ -49,7 +49,7 @@ TEXTS = ("", "-", "--", "ü" * 90, "x" * 400, "a\nb", "\x1b[2J", "\u202eabc", ".
 SETTINGS = (
     "training.epochs=1",
     "training.epochs=1e308",
-    "judge.skip=1e9",
+    "evaluation.warmup_samples=1e9",
     "task.horizons=[0]",
     "task.horizons=[1000000000000000000]",
     "model.window=-1",
@@ -63,7 +63,7 @@ SETTINGS = (
     "task.targets=[]",
 )
 SMALL = (
-    *("training.epochs=1", "training.updates=2", 'training.optimizer={kind="adamw"}', "judge.history=5"),
+    *("training.epochs=1", "training.updates=2", 'training.optimizer={kind="adamw"}', "evaluation.history=5"),
     'training.chunks={regime="chunk",length=32,batch=4,burn_in=10}',
     'task={targets=["CylVels_1"],horizons=[1],features="all"}',
     *('model.backbone={kind="lstm",units=4}', "model.head.hidden=4", "model.window=5"),

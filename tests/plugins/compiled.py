@@ -122,7 +122,7 @@ def call_of(command: Any, options: dict[str, Any]) -> Call | None:
         return None
     words = [str(word) for word in command]
     zig = tuple(words[1:4]) == ZIG
-    # `edp parity` calls a compiler by its whole path.
+    # `edp verify` calls a compiler by its whole path.
     if not zig and Path(words[0]).name not in COMPILERS:
         return None
     program = shutil.which(words[0])

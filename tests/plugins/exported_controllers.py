@@ -1,4 +1,4 @@
-"""Exported controllers for tests: a run of edp control with a small twin, its C code as a library, and the library."""
+"""Exported controllers for tests: a run of edp loop run with a small twin, its C code as a library, and the library."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def front(**changes):
         "linkage": "m22",
         "prefix_ticks": PREFIX,
         "fit": GreyFitSpec(
-            lengths_s=(0.1,), rounds=(1,), final_rounds=0, starts=1, lanes=8, ticks=200, validation_s=1.0
+            lengths_s=(0.1,), rounds=(1,), final_rounds=0, starts=1, batch=8, ticks=200, validation_s=1.0
         ),
     }
     return GreyBox(**(options | changes))

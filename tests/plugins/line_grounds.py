@@ -47,7 +47,7 @@ TRAINING = (
     'model.backbone={kind="hybrid",channels=[6],kernel=3,units=6}',
     "model.head.hidden=6",
     "model.window=12",
-    "judge.history=5",
+    "evaluation.history=5",
 )
 MACHINES = (
     'split.kind="machines"',
@@ -58,10 +58,10 @@ MACHINES = (
 FEW = ('task.targets=["CylVels_1"]', 'task.features={name="few",channels=["CylVels_1","BmUp"]}')
 LIMIT = ("limit.moments=4", "limit.branches=4", "limit.horizons=[1,10]")
 LOOP = ("task.length_m=[0.4,0.5]", "task.hold_s=0.2", "task.lead_s=0.2")
-JUDGED = ("judge.seconds=4", "judge.starts=2", "judge.at_s=[1,4]")
+JUDGED = ("evaluation.duration_s=4", "evaluation.starts=2", "evaluation.at_s=[1,4]")
 TWIN = ("twin.kind=arx", *JUDGED)
 RECURRENT = (
-    *("twin.kind=recurrent", "twin.units=6", "twin.prefix_ticks=20", "training.lanes=4", "training.lengths_s=[0.2]"),
+    *("twin.kind=recurrent", "twin.units=6", "twin.prefix_ticks=20", "training.batch=4", "training.lengths_s=[0.2]"),
     *("training.updates=[2]", "training.validate_every=2", *JUDGED),
 )
 
@@ -338,7 +338,7 @@ def _fmu(ground: Ground, path: Path, version: str) -> None:
 def _tuned(ground: Ground, path: Path) -> None:
     made = ground.folder / "tuning"
     words = ("--on", ground.of("front_twin"), "--trials", "2", "--loops", "1", "--seeds", "1", *settings(LOOP))
-    assert edp("tune", made, "--controller", "pi", *words) == 0
+    assert edp("loop", "tune", made, "--controller", "pi", *words) == 0
     shutil.copy(made / "tuned.toml", path)
 
 
@@ -555,7 +555,7 @@ MORE: Mapping[str, tuple[str, ...]] = {
     r"^control": tuple(settings(LOOP)),
     r"^tune": ("--trials", "2", "--loops", "1", "--seeds", "1", *settings(LOOP)),
     r"^distil": tuple(settings(("training.epochs=1", "training.updates=3"))),
-    r"^finetune": tuple(settings(("finetune.rounds=1",))),
+    r"^finetune": tuple(settings(("finetune.single_phase_epochs=1",))),
     r"^simulate .*--limit": ("--minutes", "0.1", "--recordings", "1", *settings(LIMIT)),
     r"^simulate (?!.*--minutes)": ("--minutes", "0.1", "--recordings", "2"),
     r"^evaluate (?!.*(runs/twin|TWIN))": ("--baselines", "persistence"),

@@ -41,10 +41,10 @@ def run(base, x, state=None):
 
 SPECS = [
     KinematicSpec(pose="strokes"),
-    ForceSpec(load="none", fade_s=0.0),
-    ForceSpec(load="all", pose="strokes", fade_s=0.0),
-    HybridPhysicsSpec(load="gravity", machine="C14", fade_s=0.0),
-    HybridPhysicsSpec(coupled=True, fade_s=0.1),
+    ForceSpec(load="none", decay_s=0.0),
+    ForceSpec(load="all", pose="strokes", decay_s=0.0),
+    HybridPhysicsSpec(load="gravity", machine="C14", decay_s=0.0),
+    HybridPhysicsSpec(coupled=True, decay_s=0.1),
 ]
 
 
@@ -65,7 +65,7 @@ def test_a_held_acceleration_grows_with_the_horizon_and_a_fading_one_stops(spec,
     base, x = base_and_inputs(spec, (1, 2, k + 1), seed)
     z, _ = run(base, x)
     torch.testing.assert_close(z[:, :, 2] - z[:, :, 0], k * (z[:, :, 1] - z[:, :, 0]), rtol=1e-5, atol=1e-6)
-    fading, _ = base_and_inputs(type(spec)(machine=spec.machine, load=spec.load, pose=spec.pose, fade_s=0.05), (k,), 0)
+    fading, _ = base_and_inputs(type(spec)(machine=spec.machine, load=spec.load, pose=spec.pose, decay_s=0.05), (k,), 0)
     assert 0.0 < fading.lasting()[0] < min(0.05, k * 0.01)
 
 

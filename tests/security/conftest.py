@@ -29,7 +29,7 @@ class Ended:
 
 @pytest.fixture
 def edp(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Ended]:
-    """Run a command line: ``edp("inspect", folder)``."""
+    """Run a command line: ``edp("data", "check", folder)``."""
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setenv("TERM", "dumb")
 

@@ -22,7 +22,7 @@ from edp.signals import TABLE_A1
 SETTINGS = (
     *("training.epochs=1", "training.updates=2", 'training.optimizer={kind="adamw"}', "model.window=12"),
     'training.chunks={regime="chunk",length=32,batch=4,burn_in=10}',
-    *('model.backbone={kind="lstm",units=4}', "model.head.hidden=4", "judge.history=5"),
+    *('model.backbone={kind="lstm",units=4}', "model.head.hidden=4", "evaluation.history=5"),
 )
 SMALL = ("--preset", "quick", *(word for change in SETTINGS for word in ("--set", change)))
 LIMITS = {"export": (200, 2_000)}

@@ -306,7 +306,7 @@ DOORS = {
 CALLS = {
     # A file that leaves with an export and runs without EDP; it reads the arrays that were written beside it.
     "export/casadi/runtime.py": {"load"},
-    # Arrays that a program of `edp parity` wrote, which consent was given to; plain .npy files without packing.
+    # Arrays that a program of `edp verify` wrote, which consent was given to; plain .npy files without packing.
     "workflows/parity/forms/casadi.py": {"load"},
     "workflows/parity/forms/onnx_runtime.py": {"load"},
 }

@@ -31,18 +31,18 @@ SETTINGS_ALWAYS_WRONG = {
     ("distil", "distil.objective.truth"): ("-1", "nan", "inf"),
     ("distil", "distil.objective.hint"): ("-1", "nan", "inf"),
     ("distil", "distil.objective.soft"): ('{kind="quantile"}', '{kind="huberr"}'),
-    ("pretrain", "pretrain.inner_rate"): ("-1", "0", "nan", "inf"),
+    ("pretrain", "pretrain.inner_learning_rate"): ("-1", "0", "nan", "inf"),
     ("pretrain", "pretrain.inner_steps"): ("-1", "0", HUGE),
     ("pretrain", "pretrain.shots"): ("-1", "0", HUGE),
     ("finetune", "finetune.epochs"): ("-1", "0", HUGE, "9" * 6000),
-    ("finetune", "finetune.head_rate"): ("-1", "nan", "inf"),
+    ("finetune", "finetune.head_learning_rate"): ("-1", "nan", "inf"),
     ("finetune", "finetune.batch"): ("-1", "0", HUGE),
     ("finetune", "finetune.smoothness"): ("-1", "nan", "inf"),
     ("finetune", "finetune.weight_decay"): ("-1", "nan", "inf"),
     ("finetune", "finetune.patience"): ("-1", HUGE),
     ("finetune", "finetune.rank"): ("-1", "0", HUGE),
-    ("finetune", "finetune.soft"): ("-1", "nan", "2"),
-    ("finetune", "finetune.inner_rate"): ("-1", "nan", "inf"),
+    ("finetune", "finetune.distillation_fraction"): ("-1", "nan", "2"),
+    ("finetune", "finetune.inner_learning_rate"): ("-1", "nan", "inf"),
     ("finetune", "finetune.center"): ("1", "no"),
     ("adapt", "adapt.rank"): ("-1", HUGE),
     ("adapt", "adapt.noise"): ("-1", "nan", "inf"),
@@ -258,9 +258,9 @@ def test_empty_paths_are_refused(option, form, edp):
 
 
 def test_empty_arguments_are_refused_and_empty_texts_are_not(edp):
-    code, err, _ = edp("inspect", "")
+    code, err, _ = edp("data", "check", "")
     assert code == 1
     assert "an argument is empty" in err
-    code, err, _ = edp("screen", "missing", "--out", "x", "--targets", "")
+    code, err, _ = edp("data", "screen", "missing", "--out", "x", "--targets", "")
     assert "missing" in err
     assert code == 1

@@ -43,7 +43,7 @@ def test_the_name_of_its_recording_has_the_byte_as_an_escape(tmp_path):
 def test_the_command_line_goes_on_and_its_json_is_sound(tmp_path):
     odd(tmp_path, ".csv")
     for options in ([], ["--json"]):
-        done = CliRunner().invoke(app, ["inspect", str(tmp_path), *options])
+        done = CliRunner().invoke(app, ["data", "check", str(tmp_path), *options])
         assert done.exit_code in (0, 3), done.output
         assert "b\\xff" in done.output or "b\\\\xff" in done.output
     assert len(json.loads(done.stdout)["recordings"]) == 2

@@ -120,7 +120,7 @@ def test_commands_say_once_which_layer_is_missing(layer, tmp_path):
     for name in ("a", "b", "c"):
         write_recording(recording(), tmp_path / f"{name}.csv")
     # As a document for programs where a layer is missing, which the warning must not get into.
-    done = without(layer, "-m", "edp", "inspect", tmp_path, *(["--json"] if layer else []))
+    done = without(layer, "-m", "edp", "data", "check", tmp_path, *(["--json"] if layer else []))
     assert done.stderr.count("warning: logs are read with less protection") == bool(layer)
     if layer:
         assert f"'{layer}'" in done.stderr
@@ -129,9 +129,9 @@ def test_commands_say_once_which_layer_is_missing(layer, tmp_path):
 
 def test_a_missing_layer_can_be_accepted_and_can_be_a_reason_to_end(tmp_path):
     path = write_recording(recording(), tmp_path / "a.csv")
-    silent = without("file rules", "-m", "edp", "inspect", path, EDP_SANDBOX="accept")
+    silent = without("file rules", "-m", "edp", "data", "check", path, EDP_SANDBOX="accept")
     assert "protection" not in silent.stderr
-    refused = without("file rules", "-m", "edp", "inspect", path, EDP_SANDBOX="require")
+    refused = without("file rules", "-m", "edp", "data", "check", path, EDP_SANDBOX="require")
     assert "is not read: the layer 'file rules'" in " ".join((refused.stderr + refused.stdout).split())
     assert "Traceback" not in refused.stderr
     assert refused.returncode != 0

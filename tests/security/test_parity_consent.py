@@ -1,4 +1,4 @@
-"""`edp parity` compiles and runs code of a bundle: of one from elsewhere it asks first."""
+"""`edp verify` compiles and runs code of a bundle: of one from elsewhere it asks first."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def parity(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "400")
 
     def run(*args: object, terminal: bool = False, answer: bool = False) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["edp", "parity", *map(str, args)])
+        monkeypatch.setattr(sys, "argv", ["edp", "verify", *map(str, args)])
         monkeypatch.setattr(sys.stdin, "isatty", lambda: terminal, raising=False)
         monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)
         monkeypatch.setattr("typer.confirm", lambda *_, **__: answer)

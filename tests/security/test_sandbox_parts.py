@@ -30,7 +30,7 @@ def recording(samples):
 
 
 def test_the_command_line_says_what_takes_long(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["edp", "inspect", "a.csv"])
+    monkeypatch.setattr(sys, "argv", ["edp", "data", "check", "a.csv"])
     try:
         notices.tell_of_slow_logs()
         heard = sandbox._watcher
@@ -38,7 +38,7 @@ def test_the_command_line_says_what_takes_long(monkeypatch, capsys):
             heard(Path("day/a[/b]\x1b.mf4"), seconds, 1_200_000_000)
         heard(Path("b.mf4"), 5.0, 3_000_000)
         watch(None)
-        monkeypatch.setattr(sys, "argv", ["edp", "inspect", "a.csv", "--json"])
+        monkeypatch.setattr(sys, "argv", ["edp", "data", "check", "a.csv", "--json"])
         notices.tell_of_slow_logs()
         assert sandbox._watcher is None
     finally:

@@ -162,8 +162,8 @@ def test_the_bound_of_a_network_is_never_below_its_size(structure, predictor_of)
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("judge.skip=-5", r"judge: skip = -5; integers, 0 <= skip"),
-        ("judge.skip=-100000", r"skip = -100000"),
+        ("evaluation.warmup_samples=-5", r"judge: skip = -5; integers, 0 <= skip"),
+        ("evaluation.warmup_samples=-100000", r"skip = -100000"),
         ("model.window=true", r"model\.window = True: true and false are no numbers"),
         ("model.window=1000000000", r"window = 1000000000"),
         ("model.backbone.units=100000", r"units = 100000; integers, 1 <= units <= 4,096"),
@@ -177,8 +177,8 @@ def test_the_bound_of_a_network_is_never_below_its_size(structure, predictor_of)
         ("training.optimizer.learning_rate=nan", r"learning_rate"),
         ("training.optimizer.learning_rate=-1.0", r"learning_rate = -1\.0"),
         ("training.optimizer.beta1=1.0", r"beta1 = 1\.0"),
-        ("split.test_share=nan", r"split\.test_share"),
-        ("split.test_share=5", r"test_share = 5"),
+        ("split.test_fraction=nan", r"split\.test_fraction"),
+        ("split.test_fraction=5", r"test_fraction = 5"),
         (f"task.horizons={list(range(1, 5001))}", r"horizons has 5,000 entries; 1 to 1,000 must hold"),
         ("task.horizons=[1000000000]", r"horizons = \[1000000000\]"),
         ("task.targets=['CylVels_1','CylVels_1']", r"targets names CylVels_1 twice"),
@@ -193,7 +193,9 @@ def test_settings_from_the_list_are_refused(override, words):
 
 def test_all_problems_are_still_told_at_once_and_long_ones_are_cut():
     with pytest.raises(ConfigError) as caught:
-        load_experiment(overrides=["judge.skip=-5", "training.seed=-1", "model.window=0", "x" * 5000 + "=1"])
+        load_experiment(
+            overrides=["evaluation.warmup_samples=-5", "training.seed=-1", "model.window=0", "x" * 5000 + "=1"]
+        )
     text = str(caught.value)
     for part in ("4 problems", "skip = -5", "seed = -1", "window = 0", "unknown key 'xxx"):
         assert part in text
@@ -289,7 +291,7 @@ def test_a_judgement_of_too_many_predictions_is_refused(monkeypatch):
     task = experiment.task.resolve(100.0)
     net = build_model(task, experiment.model, blank_scaler(task), 0)
     with pytest.raises(ConfigError, match=r"judge: 2,000 ticks of 1,000 horizon\(s\)"):
-        judge(net, prepared(task, 2000), experiment.judge, "net")
+        judge(net, prepared(task, 2000), experiment.evaluation, "net")
 
 
 def test_a_regression_on_too_long_a_history_is_refused(monkeypatch):

@@ -119,7 +119,7 @@ def test_inspect_of_a_file_of_a_hostile_name(name, tmp_path, monkeypatch, capsys
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
     path.write_text(LOG)
-    code, out, err = run(monkeypatch, capsys, "inspect", path, "--no-coverage")
+    code, out, err = run(monkeypatch, capsys, "data", "check", path, "--no-coverage")
     shows(out)
     shows(err)
     if name.isprintable():
@@ -131,17 +131,17 @@ def test_inspect_of_a_file_of_a_hostile_name(name, tmp_path, monkeypatch, capsys
 @pytest.mark.parametrize(
     "args",
     [
-        ["inspect", "missing a[/b]"],
+        ["data", "check", "missing a[/b]"],
         ["train", "missing [/b]", "--out", "x[/b]", "--set", r"a\[/b]=1"],
         ["train", "d", "--out", "x", "--set", r"a\[/b]=1"],
         ["train", "d", "--out", "x", "--preset", "[/b]"],
         ["train", "d", "--out", "x", "--config", "[/b]\x1b[2J.toml"],
         ["evaluate", "\x1b]0;title\x07[/b]"],
-        ["footprint", "[/b].toml"],
-        ["screen", "[/b]", "--out", "x"],
+        ["compress", "estimate", "[/b].toml"],
+        ["data", "screen", "[/b]", "--out", "x"],
         ["nonsense[/b]\x1b[2J"],
         ["train", "d", "--nonsense[/b]\x1b[2J"],
-        ["distil", "d", "--units", "[/b]\x1b[2J", "--out", "x"],
+        ["compress", "distil", "d", "--units", "[/b]\x1b[2J", "--out", "x"],
     ],
 )
 def test_command_lines_of_hostile_words(args, tmp_path, monkeypatch, capsys):
@@ -158,7 +158,7 @@ def test_a_budget_of_a_hostile_name(tmp_path, monkeypatch, capsys):
     budget.write_text('name = "[/b] \\u001b[2J"\n')
     settings = tmp_path / "net.toml"
     settings.write_text("[model]\nwindow = 20\n")
-    code, out, err = run(monkeypatch, capsys, "footprint", settings, "--budget", budget)
+    code, out, err = run(monkeypatch, capsys, "compress", "estimate", settings, "--budget", budget)
     assert code == 0, err
     shows(out, "[/b] \x1b[2J")
 

@@ -33,27 +33,30 @@ FOLDERS = (
 PAGES = [page for folder in FOLDERS for page in sorted(folder.glob("*.md")) if page.name != "CHANGELOG.md"]
 LEFT_OUT = {
     "edp live runs/m22 --ros2": "needs ROS 2; tests/unit/live/test_live_sources.py has a stand-in",
-    "edp store build s3://fleet/logs --map mine.toml --out store": "needs a bucket; tests/unit/test_store_buckets.py",
+    "edp data store build s3://fleet/logs --map mine.toml --out store": (
+        "needs a bucket; tests/unit/test_store_buckets.py"
+    ),
     "edp train s3://fleet/stores/first --out runs/first": "needs a bucket; tests/unit/test_store_buckets.py",
-    "edp search /shared/logs --study studies/first --preset standard --cluster HOST:6379": (
+    "edp search /shared/logs --out studies/first --preset standard --cluster HOST:6379": (
         "needs a cluster; tests/unit/search/test_cluster.py"
     ),
-    "edp identify LOGS --out MACHINE.toml": "fits a machine; tests/unit/cli/test_cli_identify.py",
-    "edp identify logs --out mine.toml --machine measured.toml": "fits a machine; tests/unit/cli/test_cli_identify.py",
-    "edp replay runs/first_adapted logs/monday --twin runs/grey": (
+    "edp calibrate LOGS --out MACHINE.toml": "fits a machine; tests/unit/cli/test_cli_identify.py",
+    "edp calibrate LOGS --out machine.toml": "fits a machine; tests/unit/cli/test_cli_identify.py",
+    "edp calibrate logs --out mine.toml --machine measured.toml": "fits a machine; tests/unit/cli/test_cli_identify.py",
+    "edp adapt replay runs/first_adapted logs/monday --twin runs/grey": (
         "needs a grey box of the network's velocities; tests/unit/test_adaptation.py runs it on one"
     ),
-    "edp identify logs --out mine.toml --run runs/grey": "fits a machine; tests/unit/cli/test_cli_identify.py",
+    "edp calibrate logs --out mine.toml --run runs/grey": "fits a machine; tests/unit/cli/test_cli_identify.py",
     "edp twin logs --set twin.kind=greybox --set twin.linkage=mine.toml --out runs/grey": (
         "fits a grey box; tests/unit/twin/test_grey_linkage.py"
     ),
     "edp twin data/m22 --set twin.kind=greybox --set twin.linkage=mine.toml --out runs/grey": (
         "fits a grey box; tests/unit/twin/test_grey_linkage.py"
     ),
-    "edp export RUN --to follower --twin GREY --out DIR": (
+    "edp export RUN --format follower --twin GREY --out DIR": (
         "needs a grey box of the network's velocities; tests/unit/test_adaptation.py runs it on one"
     ),
-    "edp export runs/first_adapted --to follower --twin runs/grey --out firmware/follower": (
+    "edp export runs/first_adapted --format follower --twin runs/grey --out firmware/follower": (
         "needs a grey box of the network's velocities; tests/unit/test_adaptation.py runs it on one"
     ),
 }

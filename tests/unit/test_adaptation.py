@@ -41,8 +41,8 @@ SETTINGS = (
     "model.head.hidden=4",
     "model.blocks=[]",
     "model.window=10",
-    "judge.history=4",
-    'judge.baselines=["persistence"]',
+    "evaluation.history=4",
+    'evaluation.baselines=["persistence"]',
 )
 SPEC = AdaptationSpec(rank=1, noise=1.0)
 
@@ -159,7 +159,7 @@ def test_commands_say_what_it_is_worth(run, adapted, lever_sessions, tmp_path):
     assert done.exit_code == 0, done.output
     facts = json.loads(done.stdout)
     assert facts["features"] == 5
-    shown = runner.invoke(app, ["replay", str(folder), str(lever_sessions.path), "--carry"])
+    shown = runner.invoke(app, ["adapt", "replay", str(folder), str(lever_sessions.path), "--carry"])
     assert shown.exit_code == 0, shown.output
     assert "0 to 10" in shown.output
     assert "ticks taught" in shown.output
@@ -185,7 +185,9 @@ def test_a_grey_box_that_follows_the_machine_moves_what_is_replayed(adapted, lev
     twin = saved_twin(GreyBox(), lever_sessions, tmp_path / "grey")
     plain, moved = (
         json.loads(
-            command.invoke(app, ["replay", folder, str(lever_sessions.path), "--carry", *more, "--json"]).stdout
+            command.invoke(
+                app, ["adapt", "replay", folder, str(lever_sessions.path), "--carry", *more, "--json"]
+            ).stdout
         )["mae"]
         for more in ((), ("--twin", twin))
     )
@@ -258,6 +260,6 @@ def test_what_cannot_be_is_refused_before_anything_is_written(run, adapted, leve
     blind = dataclasses.replace(data.task, targets=("other",), mode="absolute")
     with pytest.raises(ConfigError, match="other is predicted, but not measured"):
         fit_adaptation(bundle.predictor, dataclasses.replace(data, task=blind), SPEC)
-    done = CliRunner().invoke(app, ["replay", str(run), str(lever_sessions.path)])
+    done = CliRunner().invoke(app, ["adapt", "replay", str(run), str(lever_sessions.path)])
     assert isinstance(done.exception, BundleError)
     assert "edp adapt" in str(done.exception)

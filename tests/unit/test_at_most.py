@@ -23,7 +23,7 @@ pytestmark = pytest.mark.processes
 HZ = 2.0
 """A stretch of two minutes has 240 rows."""
 LENGTHS = (1500, 900, 120, 2000)
-HALVED = (*SMALL, "training.updates=2", 'split={kind="time",validation_share=0.2,test_share=0.4}')
+HALVED = (*SMALL, "training.updates=2", 'split={kind="time",validation_fraction=0.2,test_fraction=0.4}')
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_hours_that_are_none_are_refused(store, hours):
 def test_logs_are_refused_with_the_command_that_stores_them(store):
     logs = DataSource(store.parent / "logs", at_most_h=1.0)
     for look in (logs.read, logs.inspect):
-        with pytest.raises(ConfigError, match=r"no store.*edp store build"):
+        with pytest.raises(ConfigError, match=r"no store.*edp data store build"):
             look()
 
 

@@ -28,7 +28,13 @@ from edp.workflows.train_evaluate import DataSource, evaluate, read_trained_run
 pytestmark = pytest.mark.processes
 
 RATE = 50.0
-SET = ["task.targets=['y']", "task.horizons=[1, 4]", "auto.minutes=0.01", "split.kind='time'", "judge.baselines=[]"]
+SET = [
+    "task.targets=['y']",
+    "task.horizons=[1, 4]",
+    "auto.time_budget_min=0.01",
+    "split.kind='time'",
+    "evaluation.baselines=[]",
+]
 
 
 def write(folder, y=None, ticks=900, seed=0, u=None):
@@ -61,7 +67,7 @@ def test_the_run_is_that_of_the_chosen_candidate(result):
     assert json.loads((folder / "auto.json").read_text())["sentence"] == found.sentence
     bundle, experiment, provenance, _ = read_trained_run(folder)
     assert provenance.more["auto"] == found.sentence
-    assert experiment.training.bagging is not None
+    assert experiment.training.ensemble is not None
     assert load_bundle(folder).predictor.spec == bundle.predictor.spec
     for one in found.choice.to_table()["candidates"].values():
         assert set(one["promise"]) == {"1", "4"}
@@ -93,7 +99,7 @@ def test_a_finished_run_is_read_again_and_another_one_refused(result):
     [
         (["model.window=5"], "chooses the network"),
         (["training.epochs=5"], "chooses the network"),
-        (["auto.minutes=0"], "minutes"),
+        (["auto.time_budget_min=0"], "minutes"),
         (["auto.seconds=5"], "did you mean|unknown"),
         (["auto.candidates=['liner']"], "linear"),
         (["auto.candidates=['recurrent']"], "suits"),
@@ -174,7 +180,7 @@ def test_recordings_are_divided_by_time_where_whole_ones_are_no_parts(tmp_path, 
         (tmp_path / "logs" / "log.csv").rename(tmp_path / "logs" / f"{number}.csv")
     (tmp_path / "logs" / "map.toml").rename(tmp_path / "map.toml")
     source = DataSource.from_path(tmp_path / "logs", tmp_path / "map.toml")
-    settings = [*SET[:3], "auto.candidates=['linear']", "judge.baselines=[]"]
+    settings = [*SET[:3], "auto.candidates=['linear']", "evaluation.baselines=[]"]
     train_auto(source, load_auto(None, settings), tmp_path / "run")
     _, experiment, _, data = read_trained_run(tmp_path / "run")
     assert SPLITS.name_of(experiment.split) == kind
@@ -300,7 +306,7 @@ def test_spans_grow_with_the_horizon_as_far_as_the_data_allow():
     backbone = CANDIDATES["committee"].plan(replace(amount, rows=5000, shortest=40)).model.backbone
     assert (backbone.lags, backbone.near) == ((1, 2, 3, 4), (0, 1, 2, 4))
     steps = [
-        CANDIDATES["committee"].plan(replace(amount, minutes=minutes)).training.bagging.steps
+        CANDIDATES["committee"].plan(replace(amount, minutes=minutes)).training.ensemble.steps
         for minutes in (0.01, 1.0, 100.0)
     ]
     assert steps == sorted(steps)

@@ -21,7 +21,7 @@ SMALL = [
     *("training.epochs=3", "training.updates=40", "training.chunks.length=32", "training.chunks.batch=8"),
     *("training.chunks.burn_in=20", "training.threads=1"),
 ]
-AUTO = [*TASK, "auto.minutes=0.002", "judge.baselines=['persistence']", "judge.history=20"]
+AUTO = [*TASK, "auto.time_budget_min=0.002", "evaluation.baselines=['persistence']", "evaluation.history=20"]
 
 
 def logs(folder: Path, gain: float, ticks: int = 3000, names: tuple[str, str] = ("u", "y"), rate: float = 50.0):
@@ -68,7 +68,7 @@ def test_alone_it_is_kept_as_a_run_like_any_other(pretrained, tmp_path):
     assert found.choice.to_table()["chosen"] == "foundation"
     bundle, experiment, _, _ = read_trained_run(tmp_path / "run")
     assert experiment.model == bundle.predictor.spec
-    assert experiment.training.bagging is None
+    assert experiment.training.ensemble is None
     assert train_auto(source, load_auto(None, changes), tmp_path / "run").choice.to_table() == found.choice.to_table()
 
 

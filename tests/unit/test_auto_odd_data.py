@@ -28,8 +28,8 @@ REAL = ROOT / "examples" / "real"
 SHARED = Path(os.environ.get("EDP_SHARED_DATA") or ROOT.parent / "shared" / "data")
 RIVALS = ("persistence", "ridge_arx")
 QUICK = (
-    *("auto.minutes=0.001", "auto.candidates=['linear', 'committee']"),
-    *("judge.baselines=['persistence', 'ridge_arx']", "judge.history=20"),
+    *("auto.time_budget_min=0.001", "auto.candidates=['linear', 'committee']"),
+    *("evaluation.baselines=['persistence', 'ridge_arx']", "evaluation.history=20"),
 )
 UNITS = {"velocity": "m/s", "pressure": "Pa", "generic": "1"}
 KINDS = {"v": "velocity", "p": "pressure"}

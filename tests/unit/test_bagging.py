@@ -66,7 +66,7 @@ MODEL = ModelSpec(
 def spec(**bagging):
     return TrainingSpec(
         loss=build(TrainingSpec, {"loss": {"kind": "mse"}}, "test").loss,
-        bagging=BaggingSpec(**{"folds": 4, "steps": 200, "batch": 64, "checks": 4, **bagging}),
+        ensemble=BaggingSpec(**{"folds": 4, "steps": 200, "batch": 64, "validations": 4, **bagging}),
     )
 
 
@@ -93,14 +93,14 @@ def test_the_network_predicts_the_test_part_as_well_as_it_promised(bagged):
 
 
 PARTS = {
-    "perceptrons of two losses": ({"members": 8}, {"robust_width": 0.1}),
+    "perceptrons of two losses": ({"members": 8}, {"huber_delta": 0.1}),
     "radial": ({"activations": (), "centres": 100}, {}),
-    "radial on few columns": ({"activations": (), "centres": 100, "near": (0, 1)}, {}),
+    "radial on few columns": ({"activations": (), "centres": 100, "local_lags": (0, 1)}, {}),
     "trees": ({"activations": (), "trees": 60}, {}),
     "trees that leave out two folds at a time": ({"activations": (), "trees": 60}, {"tree_folds": 2}),
-    "deep trees of few leaves": ({"activations": (), "trees": 60, "tree_depth": 7}, {"tree_leaves": 12}),
+    "deep trees of few leaves": ({"activations": (), "trees": 60, "tree_depth": 7}, {"tree_max_leaves": 12}),
     "one tree": ({"activations": (), "trees": 1}, {}),
-    "all": ({"members": 8, "centres": 100, "trees": 60}, {"robust_width": 0.1}),
+    "all": ({"members": 8, "centres": 100, "trees": 60}, {"huber_delta": 0.1}),
 }
 
 
@@ -128,7 +128,7 @@ def test_every_kind_of_learner_lowers_the_error_and_keeps_its_promise(name):
 def test_the_network_computes_the_weighted_sum_of_its_learners():
     """On rows that all models were fitted to: the linear model, the centres and the trees, put together by hand."""
     data = data_of(recording(), horizons=(1,), mode=TargetMode.ABSOLUTE)
-    model = committee(activations=(), centres=40, near=(2,), trees=20)
+    model = committee(activations=(), centres=40, local_lags=(2,), trees=20)
     outcome = fit_bagged(data, model, spec())
     net, table = outcome.fitted.predictor, outcome.table
     backbone, columns = net.backbone, torch.from_numpy(table.columns)
@@ -160,7 +160,7 @@ def test_where_rows_are_few_what_reads_few_columns_errs_less():
     data = data_of(log, horizons=(1,), mode=TargetMode.ABSOLUTE)
     errors = []
     for near in ((), (0,)):
-        outcome = fit_bagged(data, committee(activations=(), centres=100, near=near), spec())
+        outcome = fit_bagged(data, committee(activations=(), centres=100, local_lags=near), spec())
         (predicted,) = stream_predictions(outcome.fitted.predictor, data.test)
         errors.append(np.square(predicted[10:-1, 0, 0] - data.test[0].targets[11:, 0]).mean() ** 0.5)
     assert errors[1] < 0.6 * errors[0]
@@ -178,7 +178,7 @@ def test_basis_functions_on_few_columns_read_no_others():
 
 def test_few_columns_count_no_further_than_they_were_recorded():
     """Beyond the recorded range nothing changes, in the network and in its list of layers."""
-    outcome = fit_bagged(data_of(recording(600)), committee(activations=(), centres=30, near=(0, 2)), spec())
+    outcome = fit_bagged(data_of(recording(600)), committee(activations=(), centres=30, local_lags=(0, 2)), spec())
     net, columns = outcome.fitted.predictor, torch.from_numpy(outcome.table.columns)
     functions = net.backbone.near[0]
     far = columns.clone()
@@ -192,12 +192,12 @@ def test_few_columns_count_no_further_than_they_were_recorded():
 @pytest.mark.parametrize("near", [(3,), (2, 1), (0, 0), (-1,)])
 def test_impossible_spans_of_few_columns_are_refused(near):
     with pytest.raises(ConfigError, match="near"):
-        CommitteeSpec(lags=(1, 2, 4), centres=10, near=near)
+        CommitteeSpec(lags=(1, 2, 4), centres=10, local_lags=near)
 
 
 def test_few_columns_without_centres_are_refused():
     with pytest.raises(ConfigError, match="centres = 0"):
-        CommitteeSpec(near=(0,))
+        CommitteeSpec(local_lags=(0,))
 
 
 def test_trees_that_predict_the_target_take_their_share_from_the_linear_model():
@@ -251,13 +251,15 @@ def test_trees_see_no_row_that_they_are_judged_by(parts, monkeypatch):
 
 def test_a_tree_has_as_many_leaves_as_the_settings_say():
     outcome = fit_bagged(
-        data_of(recording()), committee(activations=(), trees=20, tree_depth=6), spec(tree_leaves=5, tree_leaf=5)
+        data_of(recording()),
+        committee(activations=(), trees=20, tree_depth=6),
+        spec(tree_max_leaves=5, tree_min_leaf_rows=5),
     )
     trees = outcome.fitted.predictor.backbone.trees
     splits = (trees.threshold < 1e30).sum(dim=-1)
     assert splits.max() == 4
     with pytest.raises(ConfigError, match="a tree of one leaf splits nothing"):
-        BaggingSpec(tree_leaves=1)
+        BaggingSpec(tree_max_leaves=1)
 
 
 def test_a_learner_of_noise_gets_no_share():
@@ -306,7 +308,7 @@ def test_the_liveliest_fold_does_not_choose_for_all():
 
 def test_members_of_two_losses_are_a_multiple_of_twice_the_folds():
     with pytest.raises(ConfigError, match="twice the folds"):
-        fit(data_of(recording(600)), MODEL, spec(robust_width=0.1))
+        fit(data_of(recording(600)), MODEL, spec(huber_delta=0.1))
 
 
 def test_trees_without_folds_are_refused():
@@ -356,7 +358,7 @@ def test_folds_leave_out_pieces_as_long_as_what_tests():
     assert pieces_of(recording()) == 1
     logs = [recording(600, seed, f"log{seed}") for seed in range(4)]
     assert pieces_of(*logs) == 4
-    assert pieces_of(*logs, rows=800) == 4
+    assert pieces_of(*logs, max_rows=800) == 4
 
 
 def by_recording(*recordings, test):
@@ -400,7 +402,7 @@ def test_an_axis_that_rested_in_training_moves_no_prediction_far(monkeypatch):
     moving[:, 2] = np.sin(np.arange(len(moving)) / 20)
 
     def moved_by() -> float:
-        net = fit_bagged(data, committee(bounded=True), spec(steps=20)).fitted.predictor
+        net = fit_bagged(data, committee(clip_inputs=True), spec(steps=20)).fitted.predictor
         rest, motion = (stream_predictions(net, [replace(part, inputs=x)])[0] for x in (part.inputs, moving))
         return float(np.abs(motion - rest).max())
 
@@ -410,7 +412,7 @@ def test_an_axis_that_rested_in_training_moves_no_prediction_far(monkeypatch):
 
 
 def test_long_recordings_are_thinned_out_evenly():
-    found = fit_bagged(data_of(recording()), MODEL, spec(rows=300, steps=10))
+    found = fit_bagged(data_of(recording()), MODEL, spec(max_rows=300, steps=10))
     assert 250 < len(found.table.columns) <= 310
     assert found.table.stride > 1
     data = data_of(recording())
@@ -436,7 +438,7 @@ def test_a_channel_that_never_moved_moves_no_prediction_later():
 def test_what_is_far_outside_of_what_trained_is_held_at_limits(parts):
     """A sensor that jumps far off moves no prediction further than one at the limits does, as a graph just as well."""
     data = data_of(recording())
-    nets = [fit_bagged(data, committee(bounded=b, **parts), spec()).fitted.predictor for b in (False, True)]
+    nets = [fit_bagged(data, committee(clip_inputs=b, **parts), spec()).fitted.predictor for b in (False, True)]
     usual = replace(data.test[0], inputs=data.test[0].inputs[:200])
     spread = np.ptp(data.train[0].inputs[:, 0])
 
@@ -461,9 +463,9 @@ def test_what_is_far_outside_of_what_trained_is_held_at_limits(parts):
 
 
 def test_limits_that_nothing_sets_are_refused():
-    with pytest.raises(ConfigError, match=r"bounded = true.*training on folds sets limits"):
-        check_fitted_parts(committee(bounded=True), TrainingSpec())
-    check_fitted_parts(committee(bounded=True), spec())
+    with pytest.raises(ConfigError, match=r"clip_inputs = true.*training on folds sets limits"):
+        check_fitted_parts(committee(clip_inputs=True), TrainingSpec())
+    check_fitted_parts(committee(clip_inputs=True), spec())
 
 
 @pytest.mark.parametrize(
@@ -536,7 +538,7 @@ def test_fold_ridge_is_the_ridge_regression_of_each_fold(of_fold):
 
 def test_where_rows_are_taken_at_a_distance_logs_show_different_ticks_of_their_starts():
     data = data_of(*(recording(600, seed, f"log{seed}") for seed in range(4)))
-    table = table_of(build_model(data.task, MODEL, data.scaler(), 0), data, BaggingSpec(folds=4, rows=800))
+    table = table_of(build_model(data.task, MODEL, data.scaler(), 0), data, BaggingSpec(folds=4, max_rows=800))
     assert table.stride > 1
     firsts = [first for _, first in table.starts]
     assert {first - min(firsts) for first in firsts} == set(range(table.stride))

@@ -13,7 +13,7 @@ from edp.recording import Recording
 from edp.signals import Channel, Kind
 
 BASELINE = BASELINES["ridge_arx"]
-SPEC = JudgeSpec(baselines=("ridge_arx",), history=8, skip=0)
+SPEC = JudgeSpec(baselines=("ridge_arx",), history=8, warmup_samples=0)
 
 
 def data_of(offset, hidden):

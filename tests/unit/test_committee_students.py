@@ -56,7 +56,9 @@ def teacher_of(data, **parts):
     backbone = CommitteeSpec(lags=(1, 2, 4, 8), members=4, units=16, **parts)
     model = ModelSpec(backbone=backbone, head=LinearHead(), blocks=(), window=10)
     loss = build(TrainingSpec, {"loss": {"kind": "mse"}}, "test").loss
-    spec = TrainingSpec(loss=loss, bagging=BaggingSpec(folds=4, steps=600, batch=64, checks=4, learning_rate=1e-2))
+    spec = TrainingSpec(
+        loss=loss, ensemble=BaggingSpec(folds=4, steps=600, batch=64, validations=4, learning_rate=1e-2)
+    )
     return fit_bagged(data, model, spec).fitted.predictor
 
 
@@ -116,9 +118,9 @@ def test_moved_rows_combine_what_was_never_recorded_together():
 
 
 def test_a_student_with_an_objective_learns_in_chunks(data, teacher):
-    order = CompressionRequest(name="student", units=16, distillation=DistillationSpec(truth=0.2))
+    order = CompressionRequest(name="student", units=16, distillation=DistillationSpec(target_weight=0.2))
     assert not order.on_rows([teacher])
-    training = replace(order.training(TrainingSpec(bagging=BaggingSpec())), epochs=4, updates=60)
+    training = replace(order.training(TrainingSpec(ensemble=BaggingSpec())), epochs=4, updates=60)
     model = order.model(teacher.spec)
     student = fit(data, model, training, strategy=order.strategy([teacher], data, None)).predictor
     begun, taught, wanted = (error(net, data) for net in (committee_start(teacher, model, data), student, teacher))
@@ -165,21 +167,21 @@ def test_a_committee_without_perceptrons_has_no_student(data):
 
 
 def test_a_committee_trains_on_by_gradient_and_keeps_its_trees(data, teacher):
-    spec = TrainingSpec(bagging=BaggingSpec())
+    spec = TrainingSpec(ensemble=BaggingSpec())
     adapted = fit(data, teacher.spec, replace(spec, epochs=1, updates=5), strategy=WarmStart(teacher)).predictor
     assert torch.equal(adapted.backbone.trees.leaf, teacher.backbone.trees.leaf)
     assert error(adapted, data) < 1.2 * error(teacher, data)
 
 
 def test_training_by_gradient_obeys_all_settings_that_were_given():
-    spec = TrainingSpec(bagging=BaggingSpec(), epochs=3, patience=2)
+    spec = TrainingSpec(ensemble=BaggingSpec(), epochs=3, patience=2)
     plain = to_gradient_training(spec)
-    assert plain.bagging is None
+    assert plain.ensemble is None
     assert (plain.epochs, plain.patience) == (3, 2)
     assert plain.updates > 0
     assert plain.chunks.burn_in == 0
     own = replace(spec, chunks=ChunkSpec(length=32), updates=7)
-    assert to_gradient_training(own) == replace(own, bagging=None)
+    assert to_gradient_training(own) == replace(own, ensemble=None)
     assert to_gradient_training(plain) is plain
 
 

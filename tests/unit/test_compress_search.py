@@ -52,7 +52,7 @@ SETTINGS = (
     "model.head.hidden=8",
     "model.blocks=[]",
     "model.window=10",
-    'judge.baselines=["persistence"]',
+    'evaluation.baselines=["persistence"]',
 )
 
 
@@ -280,4 +280,4 @@ def test_a_result_that_was_changed_by_hand_is_one_message(done, tmp_path, part, 
     (tmp_path / "compression.json").write_text(json.dumps(content))
     with pytest.raises(StorageError, match=message) as told:
         read_compression(tmp_path)
-    assert "run edp compress again" in str(told.value)
+    assert "run edp compress search again" in str(told.value)

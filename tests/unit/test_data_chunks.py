@@ -64,7 +64,7 @@ def test_chunks_give_each_sample_one_loss_but_for_the_burn_in_at_the_start(case)
 @pytest.mark.parametrize(("samples", "lanes"), [(300, 8), (5000, 4)])
 def test_streams_start_anew_as_often_as_asked_and_short_data_fill_all_lanes(samples, lanes):
     parts = [series(0, samples)]
-    spec = ChunkSpec(length=40, batch=lanes, burn_in=5, carried=2)
+    spec = ChunkSpec(length=40, batch=lanes, burn_in=5, reset_after_chunks=2)
     batches = list(ChunkSampler(parts, [0], spec, seed=1).epoch(0))
     counts = rows_with_a_loss(batches, parts, [0])
     assert {row for _, row in counts} >= set(range(45, samples))

@@ -53,7 +53,7 @@ def test_parts_are_disjoint_with_a_gap(samples, gap, kind, seed):
     options = {
         "recordings": {"seed": seed},
         "names": {"seed": seed},
-        "blocks": {"block_s": 8.0, "validation_share": 0.5},
+        "blocks": {"block_s": 8.0, "validation_fraction": 0.5},
     }.get(kind, {})
     spec = SPLITS[kind](**options)
     try:
@@ -68,7 +68,7 @@ def test_parts_are_disjoint_with_a_gap(samples, gap, kind, seed):
 
 
 def test_time_splits_in_order():
-    split = ByTime(validation_share=0.2, test_share=0.2).split(recordings(1000), 30)
+    split = ByTime(validation_fraction=0.2, test_fraction=0.2).split(recordings(1000), 30)
     assert [(s.start, s.stop) for part in parts_of(split).values() for s in part] == [(0, 570), (600, 770), (800, 1000)]
 
 
@@ -84,14 +84,14 @@ def test_recordings_keep_whole_recordings_and_honour_names():
 
 
 def test_two_recordings_validate_on_the_tail_of_the_one_that_trains():
-    split = ByRecording(tail_share=0.2).split(recordings(1000, 1000), 50)
+    split = ByRecording(tail_fraction=0.2).split(recordings(1000, 1000), 50)
     assert split.train[0].recording == split.validation[0].recording != split.test[0].recording
     assert (split.train[0].stop, split.validation[0].start) == (750, 800)
 
 
 def test_blocks_test_every_third_and_are_apart():
     logged = recordings(2000)
-    split = ByBlocks(block_s=20.0, every=3, validation_share=0.25).split(logged, 10)
+    split = ByBlocks(block_s=20.0, every=3, validation_fraction=0.25).split(logged, 10)
     check(split, logged, 10)
     assert [(s.start, s.stop) for s in split.test] == [(400, 600), (1000, 1200), (1600, 1800)]
     # Blocks 0 and 1 both train: no gap between them is needed.
@@ -100,7 +100,7 @@ def test_blocks_test_every_third_and_are_apart():
 
 
 def test_a_short_rest_joins_the_last_block():
-    split = ByBlocks(block_s=20.0, every=3, validation_share=0.5).split(recordings(699), 10)
+    split = ByBlocks(block_s=20.0, every=3, validation_fraction=0.5).split(recordings(699), 10)
     assert [(s.start, s.stop) for part in parts_of(split).values() for s in part] == [(0, 190), (200, 390), (400, 699)]
 
 
@@ -121,7 +121,11 @@ def test_data_that_cannot_be_divided_is_refused(spec, samples, message):
 
 @pytest.mark.parametrize(
     ("rule", "options"),
-    [(ByTime, {"validation_share": 0.6, "test_share": 0.4}), (ByBlocks, {"every": 1}), (ByBlocks, {"block_s": 2.0})],
+    [
+        (ByTime, {"validation_fraction": 0.6, "test_fraction": 0.4}),
+        (ByBlocks, {"every": 1}),
+        (ByBlocks, {"block_s": 2.0}),
+    ],
 )
 def test_options_that_leave_nothing_are_refused(rule, options):
     with pytest.raises(ConfigError, match="split"):

@@ -70,7 +70,7 @@ def test_a_student_of_the_teacher_alone_does_as_it_does_whatever_the_truth_says(
     spec = dataclasses.replace(brief, updates=150)
     strategy_columns, plain = (
         fit(tiny, small, spec, strategy=strategy).predictor
-        for strategy in (Distillation([teacher], DistillationSpec(truth=0.0)), None)
+        for strategy in (Distillation([teacher], DistillationSpec(target_weight=0.0)), None)
     )
     assert gap(strategy_columns, teacher, tiny.test) < 0.5 * gap(plain, teacher, tiny.test)
 
@@ -81,7 +81,7 @@ def test_loss_is_the_dual_objective(tiny, tiny_training, teacher, small):
     objective = Objective(training, net.code)
 
     def loss(truth):
-        strategy = Distillation([teacher], DistillationSpec(truth=truth, soft=MeanSquared()))
+        strategy = Distillation([teacher], DistillationSpec(target_weight=truth, distillation_loss=MeanSquared()))
         strategy_columns = strategy.series(tiny.task, tiny.train)
         batch = next(ChunkSampler(strategy_columns, tiny.task.horizons, training.chunks, 0).epoch(0))
         x = torch.from_numpy(batch.inputs)
@@ -146,7 +146,7 @@ def test_unlabelled_takes_a_recording_that_has_inputs_only(tiny):
 
 
 def test_a_lesson_that_was_stopped_goes_on_to_the_same_bits(tiny, tiny_training, teacher, small, tmp_path):
-    strategy = Distillation([teacher], DistillationSpec(hint=0.1, components=4))
+    strategy = Distillation([teacher], DistillationSpec(hint_weight=0.1, components=4))
     spec = dataclasses.replace(tiny_training, epochs=3, updates=4, chunks=ChunkSpec(length=32, batch=8, burn_in=20))
     whole = fit(tiny, small, spec, strategy=strategy).predictor
 
@@ -168,12 +168,12 @@ def test_a_lesson_that_was_stopped_goes_on_to_the_same_bits(tiny, tiny_training,
 
 def test_a_refit_learns_from_the_teacher_too(tiny, tiny_training, teacher, small):
     spec = dataclasses.replace(tiny_training, epochs=1, updates=3, refit="whole")
-    strategy = Distillation([teacher], DistillationSpec(truth=0.0))
+    strategy = Distillation([teacher], DistillationSpec(target_weight=0.0))
     assert not same(fit(tiny, small, spec).predictor, fit(tiny, small, spec, strategy=strategy).predictor)
 
 
 def test_the_gradient_of_a_hint_pulls_hidden_features_towards_the_teachers(tiny, teacher, small):
-    strategy = Distillation([teacher], DistillationSpec(hint=1.0, components=6))
+    strategy = Distillation([teacher], DistillationSpec(hint_weight=1.0, components=6))
     part = strategy.series(tiny.task, tiny.train)[0]
     wanted, x = torch.from_numpy(part.strategy_columns[None, :, 7:]), torch.from_numpy(part.inputs[None])
     net = build_model(tiny.task, small, tiny.scaler(), seed=1)
@@ -263,8 +263,8 @@ def test_students_of_other_backbones():
         (lambda m: student(m, 9), "units = 9; 1 <= units <= 8"),
         (lambda m: student(m, 4, levels=2), "levels = 2; 1 <= levels <= 1"),
         (lambda m: student(ModelSpec(backbone=LstmSpec(units=8)), 4, levels=1), "has no convolutions"),
-        (lambda m: DistillationSpec(truth=1.0), "truth = 1.0; 0 <= truth < 1"),
-        (lambda m: DistillationSpec(hint=-1.0), "hint = -1.0"),
+        (lambda m: DistillationSpec(target_weight=1.0), "truth = 1.0; 0 <= truth < 1"),
+        (lambda m: DistillationSpec(hint_weight=-1.0), "hint = -1.0"),
         (lambda m: SoftmaxDivergence(temperature=0.0), "temperature = 0.0; 0 < temperature"),
         (lambda m: Distillation([]), "no teacher"),
     ],
@@ -288,7 +288,7 @@ def test_teacher_and_student_must_read_and_predict_the_same(tiny, tiny_model, ti
 def test_a_batch_too_small_for_a_hint_is_refused(tiny, tiny_training, teacher, small):
     spec = dataclasses.replace(tiny_training, chunks=ChunkSpec(regime="window", length=10, batch=8))
     with pytest.raises(ConfigError, match="a batch has 8 ticks with a loss, too few to compare 8 hidden features"):
-        fit(tiny, small, spec, strategy=Distillation([teacher], DistillationSpec(hint=1.0)))
+        fit(tiny, small, spec, strategy=Distillation([teacher], DistillationSpec(hint_weight=1.0)))
 
 
 def test_training_begins_with_the_weights_of_a_start(tiny, tiny_model, brief, teacher):

@@ -32,8 +32,8 @@ SETTINGS = (
     "model.head.hidden=8",
     "model.blocks=[]",
     "model.window=10",
-    "judge.history=4",
-    'judge.baselines=["persistence"]',
+    "evaluation.history=4",
+    'evaluation.baselines=["persistence"]',
 )
 
 
@@ -74,7 +74,11 @@ def test_a_student_is_a_run_that_goes_on_after_a_stop(run, tmp_path):
 def test_another_lesson_is_another_run(run, tmp_path):
     distil(run, DistilRequest(spec=DistilSpec(units=4)), tmp_path / "run")
     with pytest.raises(StorageError, match="holds another run"):
-        distil(run, DistilRequest(spec=DistilSpec(units=4, objective=DistillationSpec(truth=0.2))), tmp_path / "run")
+        distil(
+            run,
+            DistilRequest(spec=DistilSpec(units=4, objective=DistillationSpec(target_weight=0.2))),
+            tmp_path / "run",
+        )
 
 
 def test_pruned_starts_further_recordings_and_teachers_take_part(run, lever_sessions, tmp_path):
@@ -132,10 +136,12 @@ def test_other_recordings_can_be_learned_on(run, lever_sessions, tmp_path):
 
 
 def test_the_command_makes_a_run_and_says_what_it_is(run, tmp_path):
-    told = CliRunner().invoke(app, ["distil", str(run), "--units", "4", "--out", str(tmp_path / "small"), "--json"])
+    told = CliRunner().invoke(
+        app, ["compress", "distil", str(run), "--units", "4", "--out", str(tmp_path / "small"), "--json"]
+    )
     assert told.exit_code == 0, told.output
     facts = json.loads(told.stdout)
     assert facts["student"]["parameters"] < facts["teacher"]["parameters"]
     assert load_bundle(tmp_path / "small").predictor.spec.backbone.units == 4
-    shown = CliRunner().invoke(app, ["distil", str(run), "--units", "4", "--out", str(tmp_path / "small")])
+    shown = CliRunner().invoke(app, ["compress", "distil", str(run), "--units", "4", "--out", str(tmp_path / "small")])
     assert "next: edp evaluate" in shown.output

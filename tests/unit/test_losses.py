@@ -246,7 +246,7 @@ def test_horizons_decay_geometrically_with_mean_one():
 
 
 def test_adaptive_weights_are_inverse_running_errors_cut_and_blended():
-    spec = AdaptiveWeights(blend=0.3, max_ratio=3.0, memory=0.9)
+    spec = AdaptiveWeights(blend=0.3, max_ratio=3.0, decay=0.9)
     running = np.array([[1.0, 0.5, 0.1], [2.0, 2.0, 2.0]])
     inverse = np.minimum(1 / running, 3.0 * (1 / running).min(axis=1, keepdims=True))
     wanted = 0.7 + 0.3 * inverse / inverse.mean(axis=1, keepdims=True)
@@ -270,7 +270,7 @@ def test_adaptive_weights_are_inverse_running_errors_cut_and_blended():
         (lambda: Correlation(weight=math.nan), "correlation: weight = nan"),
         (lambda: AdaptiveWeights(blend=2.0), r"blend = 2\.0.*must hold"),
         (lambda: AdaptiveWeights(max_ratio=1.0), r"max_ratio = 1\.0.*must hold"),
-        (lambda: AdaptiveWeights(memory=1.0), r"memory = 1\.0.*must hold"),
+        (lambda: AdaptiveWeights(decay=1.0), r"memory = 1\.0.*must hold"),
     ],
 )
 def test_values_out_of_range_are_refused_with_the_value(make, message):

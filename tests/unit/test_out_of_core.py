@@ -129,7 +129,7 @@ def test_columns_side_by_side_are_views(stored):
 
 @pytest.mark.parametrize(
     "derived",
-    [(), (Derived("dc", "c"),), (Derived("mc", "c", "trailing_mean", seconds=0.2),)],
+    [(), (Derived("dc", "c"),), (Derived("mc", "c", "trailing_mean", span_s=0.2),)],
     ids=["logged", "difference", "mean"],
 )
 def test_a_task_reads_from_a_store_what_it_reads_from_logs(logs, stored, derived):
@@ -342,7 +342,7 @@ def test_a_large_data_set_is_screened_on_stretches_of_it(monkeypatch):
                 50.0,
             )
         )
-    result = screen(recordings, ScreeningSpec(max_lag=20, horizon=5, piece_samples=200, information_samples=500))
+    result = screen(recordings, ScreeningSpec(max_lag=20, horizon=5, segment_samples=200, information_samples=500))
     assert 6_000 <= result.samples <= 8_000
     assert len(result.recordings) == 8
     (curve,) = [one for one in result.lags if (one.channel, one.target) == ("u", "v")]

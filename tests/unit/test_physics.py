@@ -155,7 +155,7 @@ def test_strokes_give_the_mean_velocity_since_the_tick_before(truth):
 @pytest.mark.parametrize("load", ["none", "gravity", "all"])
 def test_force_and_hybrid_are_eq_3_8_and_3_9_with_the_stated_load(truth, load):
     recording, log = truth
-    for spec, mass in ((ForceSpec(load=load, fade_s=0.0), "mean"), (HybridPhysicsSpec(load=load, fade_s=0.0), None)):
+    for spec, mass in ((ForceSpec(load=load, decay_s=0.0), "mean"), (HybridPhysicsSpec(load=load, decay_s=0.0), None)):
         found, _ = predicted(spec, recording, (1, 7))
         speed, acceleration = reference(log, load, mass)
         for i, k in enumerate((1, 7)):
@@ -174,8 +174,8 @@ def test_the_load_decides_whether_a_force_tells_the_change_of_velocity(truth):
         found, _ = predicted(spec, recording)
         return np.sqrt(np.mean((found[:-1, 0] - velocity[1:]) ** 2, axis=0)) / change
 
-    literal, gravity, whole = (share(HybridPhysicsSpec(load=load, fade_s=0.0)) for load in ("none", "gravity", "all"))
-    coupled = share(HybridPhysicsSpec(coupled=True, fade_s=0.0))
+    literal, gravity, whole = (share(HybridPhysicsSpec(load=load, decay_s=0.0)) for load in ("none", "gravity", "all"))
+    coupled = share(HybridPhysicsSpec(coupled=True, decay_s=0.0))
     assert (literal > 1.2).all()  # worse than no change at all: gravity alone moves the boom
     assert literal[0] > 2.0
     assert gravity[0] < 0.5

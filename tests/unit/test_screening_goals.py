@@ -43,7 +43,7 @@ def laid(recordings, bench):
 
 @pytest.fixture(scope="module")
 def found(laid):
-    forest = ForestSpec(trees=10, samples=4_000, tests=2_000)
+    forest = ForestSpec(trees=10, samples=4_000, test_samples=2_000)
     few = {"information_samples": 1_500, "rank_samples": 1_000}
     return screen(laid[0], ScreeningSpec(targets=TARGETS, max_lag=60, forest=forest, **few))
 

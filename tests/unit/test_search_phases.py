@@ -255,14 +255,14 @@ def test_the_thesis_mode_uses_its_own_estimates():
 
 def test_sessions_set_apart_are_spread_over_families_and_drawn_by_the_root():
     families = {name: "dig" if number % 3 else "grading" for number, name in enumerate(SESSIONS)}
-    spec = dataclasses.replace(SPEC, test_share=0.25)
+    spec = dataclasses.replace(SPEC, test_fraction=0.25)
     development, test, second = set_apart(SESSIONS, families, spec)
     assert len(test) == 3
     assert len(second) == 1
     assert {families[name] for name in test} == {"dig", "grading"}
     assert sorted(development + test + second) == list(SESSIONS)
     assert set_apart(SESSIONS, families, spec) == (development, test, second)
-    without = set_apart(SESSIONS, families, dataclasses.replace(spec, compression=CompressionSpec(on=False)))
+    without = set_apart(SESSIONS, families, dataclasses.replace(spec, compression=CompressionSpec(enabled=False)))
     assert without == (tuple(name for name in SESSIONS if name not in test), test, ())
     others = {set_apart(SESSIONS, families, dataclasses.replace(spec, seed=seed))[1] for seed in range(6)}
     assert len(others) > 1
@@ -274,7 +274,10 @@ def test_sessions_set_apart_are_spread_over_families_and_drawn_by_the_root():
     ("options", "message"),
     [
         ({"mode": "quick"}, "mode = 'quick'"),
-        ({"updates": 0, "test_share": 1.0}, r"updates = 0; .* test_share = 1\.0; 0 < test_share < 1 must hold"),
+        (
+            {"updates": 0, "test_fraction": 1.0},
+            r"updates = 0; .* test_fraction = 1\.0; 0 < test_fraction < 1 must hold",
+        ),
         ({"folds": 3, "isolation": IsolationSpec(runs=4)}, "two repeats of the 3 folds"),
         ({"limits": {"flash": 1.0}}, "limits.flash"),
         ({"cost": "cycles"}, "cost = 'cycles'"),
@@ -303,7 +306,7 @@ CONFIRMED = dataclasses.replace(
     SPEC,
     backbones=("hybrid",),
     features=("FG1", "FG2"),
-    planning=PlanningSpec(most_runs=6),
+    planning=PlanningSpec(max_runs=6),
     calibration=CalibrationSpec(trials=6),
     synthesis=TrialsSpec(trials=6),
     exploration=TrialsSpec(trials=16),
@@ -334,7 +337,7 @@ def test_the_plan_says_how_many_runs_and_why(sound):
 
 def test_a_plan_that_no_number_of_runs_meets_makes_the_most_that_are_allowed(sound):
     small = dataclasses.replace(
-        sound[0], spec=dataclasses.replace(CONFIRMED, planning=PlanningSpec(most_runs=6, least_effect=1e-4))
+        sound[0], spec=dataclasses.replace(CONFIRMED, planning=PlanningSpec(max_runs=6, min_effect=1e-4))
     )
     decision = run_phases(small, World(with_effects), phases=["planning"]).decided["planning"]
     assert decision.facts.runs == 6
@@ -365,7 +368,7 @@ def test_the_thesis_mode_walks_the_same_phases_by_its_own_rules():
         mode="thesis",
         run_seeds=2,
         screening=ModuleScreeningSpec(trials=3),
-        planning=PlanningSpec(most_runs=4),
+        planning=PlanningSpec(max_runs=4),
     )
     found = run_phases(context(spec), World(with_effects), until="confirmation")
     screening, confirmation = (found.decided[name].to_json()["facts"] for name in ("screening", "confirmation"))
@@ -477,7 +480,7 @@ def test_phase_6_can_be_left_out_and_a_budget_that_nothing_meets_ends_in_a_sente
     before = dataclasses.replace(
         sound[0], decided={name: held for name, held in sound[0].decided.items() if name != "compression"}
     )
-    off = dataclasses.replace(CONFIRMED, compression=CompressionSpec(on=False))
+    off = dataclasses.replace(CONFIRMED, compression=CompressionSpec(enabled=False))
     world = World(with_effects)
     found = run_phases(dataclasses.replace(before, spec=off), world, phases=["compression"])
     assert (world.trained, found.decided["compression"].to_json()["facts"]["on"]) == (0, False)

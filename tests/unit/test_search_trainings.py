@@ -79,7 +79,7 @@ def test_nothing_is_chosen_in_a_training(order):
 
 
 def test_settings_that_an_order_decides_are_not_part_of_its_key():
-    one = load_experiment(None, "quick", [*CHANGES, "training.epochs=3", "training.seed=5", "judge.baselines=[]"])
+    one = load_experiment(None, "quick", [*CHANGES, "training.epochs=3", "training.seed=5", "evaluation.baselines=[]"])
     other = load_experiment(None, "quick", [*CHANGES, "training.epochs=9", "training.updates=7"])
     assert Arm.from_experiment(one) == Arm.from_experiment(other)
     assert Arm.from_experiment(one) != Arm.from_experiment(

@@ -113,7 +113,7 @@ print(kinematics.strokes(kinematics.poses(np.linspace(0.1, 1.0, 300).reshape(100
 for excitation, material in (("combined", ""), ("dig", "clay"), ("six_levers", "")):
     state = simulate(Scenario(excitation=excitation, duration_s=2.0, **({"material": material} if material else {})))
     print(hashlib.sha256(state.values.tobytes()).hexdigest())
-fit = GreyFitSpec(lengths_s=(0.1,), rounds=(2,), final_rounds=2, lanes=8, ticks=200, final_ticks=200, validation_s=0.5)
+fit = GreyFitSpec(lengths_s=(0.1,), rounds=(2,), final_rounds=2, batch=8, ticks=200, final_ticks=200, validation_s=0.5)
 series = [bench_series(seed=seed) for seed in range(3)]
 twin = bench_grey_box(prefix_ticks=30, fit=fit).start(bench_channels(), fit_scales(bench_channels(), series), series, 0)
 fitted = fit_grey_box(twin, series[:2], series[2:], seed=0)

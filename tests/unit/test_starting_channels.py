@@ -23,7 +23,7 @@ from edp.training.optimizers import AdamW
 pytestmark = pytest.mark.long
 
 TICKS = 4
-FEATURES = FeatureSet("free", ("lever",), (Derived("dlever", "lever"),), starting=("boom",), starting_ticks=TICKS)
+FEATURES = FeatureSet("free", ("lever",), (Derived("dlever", "lever"),), init_channels=("boom",), init_samples=TICKS)
 TASK = Task(FEATURES, ("boom",), (0,), TargetMode.ABSOLUTE, 100.0)
 
 
@@ -72,11 +72,11 @@ def test_names_and_order():
 
 def test_sources_and_lengths_that_cannot_be_are_refused():
     with pytest.raises(ConfigError, match="not an input at every tick"):
-        FeatureSet("f", ("a",), (Derived("db", "b"),), starting=("b",))
+        FeatureSet("f", ("a",), (Derived("db", "b"),), init_channels=("b",))
     with pytest.raises(ConfigError, match="names a twice"):
-        FeatureSet("f", ("a",), starting=("a",))
-    with pytest.raises(ConfigError, match="starting_ticks = 0; integers, 1 <= starting_ticks"):
-        FeatureSet("f", ("a",), starting=("b",), starting_ticks=0)
+        FeatureSet("f", ("a",), init_channels=("a",))
+    with pytest.raises(ConfigError, match="init_samples = 0; integers, 1 <= init_samples"):
+        FeatureSet("f", ("a",), init_channels=("b",), init_samples=0)
     with pytest.raises(ConfigError, match="not a feature"):
         Task(FEATURES, ("boom",), (1,), TargetMode.DELTA, 100.0)
 
@@ -118,12 +118,12 @@ def test_features_are_scaled_as_in_the_first_ticks(free, predictor):
 def test_a_task_survives_the_header_of_a_bundle():
     assert task_from_dict(task_to_dict(TASK)) == TASK
     plain = task_to_dict(TASK)
-    del plain["features"]["starting"], plain["features"]["starting_ticks"]  # of a bundle from before
+    del plain["features"]["init_channels"], plain["features"]["init_samples"]  # of a bundle from before
     assert task_from_dict(plain).features.starting == ()
 
 
 def test_baselines_do_not_see_the_start_and_it_is_not_scored(free, predictor):
-    spec = JudgeSpec(baselines=("persistence", "ridge_arx"), history=5, skip=0)
+    spec = JudgeSpec(baselines=("persistence", "ridge_arx"), history=5, warmup_samples=0)
     assert baseline_task(free, spec).present == (None,)
     found = judge(predictor.float(), free, spec, "network").scores
     assert found.task.skip == TICKS
@@ -133,7 +133,7 @@ def test_baselines_do_not_see_the_start_and_it_is_not_scored(free, predictor):
 
 
 def test_a_network_learns_to_start_from_a_measured_state(free, tiny_model, tiny_training):
-    chunks = dataclasses.replace(tiny_training.chunks, length=75, batch=8, burn_in=TICKS, carried=1)
+    chunks = dataclasses.replace(tiny_training.chunks, length=75, batch=8, burn_in=TICKS, reset_after_chunks=1)
     spec = dataclasses.replace(
         tiny_training, chunks=chunks, epochs=4, updates=100, patience=0, optimizer=AdamW(learning_rate=1e-2)
     )
@@ -152,7 +152,7 @@ def test_a_network_learns_to_start_from_a_measured_state(free, tiny_model, tiny_
 
     def error(data):
         fitted = fit(data, tiny_model, spec)
-        scores = judge(fitted.predictor, data, JudgeSpec(baselines=(), skip=TICKS), "").scores
+        scores = judge(fitted.predictor, data, JudgeSpec(baselines=(), warmup_samples=TICKS), "").scores
         return scores.models["network"].overall["0"]["mean"]["mae"]
 
     assert error(free) < 0.7 * error(blind)

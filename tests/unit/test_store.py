@@ -199,7 +199,7 @@ def test_a_build_that_was_stopped_goes_on(logs, tmp_path, monkeypatch, after):
     with pytest.raises(Stopped):
         build(logs, tmp_path / "store", progress=NotedProgress(stop))
     assert is_store(tmp_path / "store")
-    with pytest.raises(DataError, match=r"is half built: .* give the same `edp store build` again"):
+    with pytest.raises(DataError, match=r"is half built: .* give the same `edp data store build` again"):
         DataSource.from_path(tmp_path / "store").read()
     reached = NotedProgress()
     build(logs, tmp_path / "store", progress=reached)
@@ -222,7 +222,7 @@ def test_maps_and_repairs_are_those_of_the_build(tmp_path):
         DataSource.from_path(tmp_path / "store", tmp_path / "map.toml"),
         DataSource(tmp_path / "store", None, Repair()),
     ):
-        with pytest.raises(ConfigError, match=r"came with the store .* give them to `edp store build`"):
+        with pytest.raises(ConfigError, match=r"came with the store .* give them to `edp data store build`"):
             given.read()
 
 

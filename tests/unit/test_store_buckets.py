@@ -185,7 +185,9 @@ def test_a_disk_without_room_is_refused_before_the_copy(server, top, monkeypatch
 
 
 def test_what_a_bucket_is_not_for_is_refused(server, top, tmp_path):
-    with pytest.raises(ConfigError, match=r"holds logs and no store; read them once with `edp store build s3://fleet"):
+    with pytest.raises(
+        ConfigError, match=r"holds logs and no store; read them once with `edp data store build s3://fleet"
+    ):
         DataSource.from_path("s3://fleet/logs").read()
     with pytest.raises(ConfigError, match=r"a store is built on this machine"):
         DataSource.from_path(top / "fleet" / "logs").store("s3://fleet/store")

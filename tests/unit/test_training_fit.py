@@ -128,7 +128,7 @@ def test_every_loss_and_output_trains_with_all_terms_and_augmentations(loss, out
         weight_power=0.5,
         horizon_decay=0.9,
         adaptive=AdaptiveWeights(blend=0.3),
-        average=Stochastic(share=0.5),
+        average=Stochastic(fraction=0.5),
         epochs=2,
         updates=4,
         device="cpu",

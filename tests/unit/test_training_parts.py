@@ -56,7 +56,7 @@ def test_every_optimizer_goes_on_with_what_else_has_a_memory(optimizer, tiny, ti
     spec = dataclasses.replace(
         one_epoch,
         optimizer=OPTIMIZERS[optimizer](),
-        average=Stochastic(share=0.5),
+        average=Stochastic(fraction=0.5),
         adaptive=AdaptiveWeights(blend=0.5),
         augmentations=tuple(kind() for kind in AUGMENTATIONS.values()),
     )

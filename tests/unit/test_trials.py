@@ -41,8 +41,8 @@ SMALL = (
     'model.backbone={kind="lstm",units=4}',
     'model.blocks=[{kind="linear_bypass", taps=4}]',
     "model.window=8",
-    "judge.history=4",
-    "split.test_share=0.4",
+    "evaluation.history=4",
+    "split.test_fraction=0.4",
 )
 SETS = {
     "proposed": FeatureSettings(name="proposed", channels=("u",)),
@@ -85,7 +85,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def trials(source, experiment, folder):
     told = []
-    spec = TrialSpec(random=1, seeds=(0, 1), barred=("u", "p"))
+    spec = TrialSpec(random_sets=1, seeds=(0, 1), excluded_channels=("u", "p"))
     found = try_feature_sets(source, experiment, SETS, folder, spec, lambda *facts: told.append(facts))
     assert [(name, done, total) for name, done, total, event in told if event is None] == [
         (name, 2 * n + seed, 8) for n, name in enumerate(["proposed", "all", "blind", "random 1"]) for seed in range(2)
@@ -124,7 +124,9 @@ def test_trials_are_kept(trials, source, experiment, folder):
     assert read_json(folder / "trials.json") == json.loads(json.dumps(trials.to_table()))
     before = {path: path.stat().st_mtime_ns for path in folder.glob("*/history.jsonl")}
     assert len(before) == 8
-    again = try_feature_sets(source, experiment, SETS, folder, TrialSpec(random=1, seeds=(0, 1), barred=("u", "p")))
+    again = try_feature_sets(
+        source, experiment, SETS, folder, TrialSpec(random_sets=1, seeds=(0, 1), excluded_channels=("u", "p"))
+    )
     assert again.to_table() == trials.to_table()
     assert {path: path.stat().st_mtime_ns for path in folder.glob("*/history.jsonl")} == before
 
@@ -148,7 +150,7 @@ def test_pressures_get_their_differences():
 )
 def test_no_set_is_drawn_that_is_there_already(experiment, channels, asked, found):
     first = FeatureSettings(name="first", channels=channels)
-    drawn = _draw_sets({"first": first}, experiment, drive("d", 1), TrialSpec(random=asked))
+    drawn = _draw_sets({"first": first}, experiment, drive("d", 1), TrialSpec(random_sets=asked))
     assert list(drawn) == [f"random {k + 1}" for k in range(len(found))]
     assert {tuple(one.channels) for one in drawn.values()} == {("v", name) for name in found}
 
@@ -159,4 +161,4 @@ def test_mistakes_are_told(source, experiment, tmp_path):
     with pytest.raises(ConfigError, match="no feature set can be tried: FG1 was not tried"):
         try_feature_sets(source, experiment, {"FG1": "FG1"}, tmp_path)
     with pytest.raises(ConfigError, match="random = -1"):
-        TrialSpec(random=-1)
+        TrialSpec(random_sets=-1)

@@ -50,8 +50,8 @@ SMALL = (
     'model.backbone={kind="lstm",units=4}',
     "model.blocks=[]",
     "model.window=8",
-    "judge.history=4",
-    'judge.baselines=["persistence"]',
+    "evaluation.history=4",
+    'evaluation.baselines=["persistence"]',
 )
 
 

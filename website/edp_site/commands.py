@@ -11,7 +11,9 @@ from typing import Any, NamedTuple
 
 import typer
 
-from edp.cli import app
+from edp.cli import PANELS, app
+from edp.cli.exit_codes import EXIT_CODES
+from edp.cli.groups import RUN, RunByDefault
 from edp_site import markdown
 from edp_site.pending import as_today
 
@@ -62,7 +64,7 @@ def command_lines(text: str) -> Iterator[tuple[int, str]]:
 
 
 def problems_of(line: str, known: dict[tuple[str, ...], Command]) -> list[str]:
-    """What a command line names that does not exist: commands and options; values are not looked at.
+    """Return the commands and options of a command line that do not exist; values are not checked.
 
     Args:
         line: ``edp ...`` as on a page; placeholders such as ``RUN`` or ``...`` may stand for values.
@@ -77,8 +79,9 @@ def problems_of(line: str, known: dict[tuple[str, ...], Command]) -> list[str]:
         named = (*named, words.pop(0))
     if not named and not (words and words[0].startswith("-")):
         return [f"there is no command '{words[0]}'"] if words and not _PLACES.match(words[0]) else []
-    if named == ("search",) and words:  # `edp search DATA` is `edp search run DATA`
-        named = ("search", "run")
+    # `edp search DATA` is `edp search run DATA`
+    if words and (*named, RUN) in known and isinstance(known[named].parsed, RunByDefault):
+        named = (*named, RUN)
     command = known[named]
     options = command.options
     wrong = [
@@ -92,28 +95,32 @@ def problems_of(line: str, known: dict[tuple[str, ...], Command]) -> list[str]:
 
 
 def settings_of(line: str) -> tuple[tuple[str, ...], list[str]]:
-    """The words of a command line without options, and the changes that its ``--set`` options name."""
+    """Return the words of a command line without options, and the settings that its ``--set`` options change."""
     words = shlex.split(ENDS.split(f"{line} ")[0], comments=True)[1:]
     changes = [after for word, after in pairwise(words) if word == "--set"]
     return tuple(words), changes
 
 
 def commands_page() -> str:
-    """The reference of all commands."""
+    """Return the reference of all commands."""
     known = commands()
     parts = [
         "# Commands",
         "",
-        "Made from the code, like `edp COMMAND --help`. A mistake ends in one message and exit code 1; a training that "
-        "diverged ends with 4, another process in the way with 75; what else a command ends with is in its text.",
+        "Made from the code, like `edp COMMAND --help`. `edp train DATA`, `edp search DATA` and `edp adapt RUN` are "
+        "the commands `run` of these groups.",
         "",
-        "| Command | Does |",
-        "|---|---|",
+        "| Panel | Command | Does |",
+        "|---|---|---|",
     ]
+    panels = {name: panel for panel, entries in PANELS for name in entries}
     for words, command in known.items():
         if words and not hasattr(command.parsed, "commands"):
             name = " ".join(("edp", *words))
-            parts.append(f"| [`{name}`](#{markdown.anchor_of(name)}) | {_cell(_summary(command))} |")
+            link = f"[`{name}`](#{markdown.anchor_of(name)})"
+            parts.append(f"| {panels[words[0]]} | {link} | {_cell(_summary(command))} |")
+    parts += ["", "## Exit codes", "", "| Exit code | Means |", "|---|---|"]
+    parts += [f"| {code} | {_cell(meaning)} |" for code, meaning in EXIT_CODES.items()]
     for words, command in known.items():
         if words and not hasattr(command.parsed, "commands"):
             parts += ["", *_section(command)]

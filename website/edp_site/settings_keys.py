@@ -24,7 +24,7 @@ from edp.workflows.pretraining import MetaSpec
 from edp.workflows.search.settings import SearchSpec
 from edp.workflows.transfer import FinetuneSpec
 
-_TABLES: Mapping[str, type] = {
+TABLES: Mapping[str, type] = {
     "auto": Portfolio,
     "adapt": AdaptationSpec,
     "compress": CompressionSearchSpec,
@@ -45,9 +45,9 @@ _ROOTS: Mapping[str, tuple[type, ...]] = {
     "monitor": (MonitorExperiment,),
 }
 """What keys begin in, by the first word of a command; an experiment and the tables of commands for all others."""
-_TREES = (SETTINGS, TWIN_SETTINGS, CONTROL_SETTINGS, MONITOR_SETTINGS)
+TREES = (SETTINGS, TWIN_SETTINGS, CONTROL_SETTINGS, MONITOR_SETTINGS)
 _CONTROLLER_OPTIONS = frozenset(("iterations", "newton"))
-"""Of `edp export --to controller`, whose options are no dataclass."""
+"""Of `edp export --format controller`, whose options are no dataclass."""
 
 
 def unknown_keys(words: tuple[str, ...], changes: list[str]) -> list[str]:
@@ -72,8 +72,8 @@ def _exists(command: str, key: str) -> bool:
         return True
     if command in _ROOTS:
         return any(_follow(root, path) for root in _ROOTS[command])
-    if path[0] in _TABLES:
-        return _follow(_TABLES[path[0]], path[1:])
+    if path[0] in TABLES:
+        return _follow(TABLES[path[0]], path[1:])
     roots = {Experiment} | ({root for found in _ROOTS.values() for root in found} if not command else set())
     return any(_follow(root, path) for root in roots)
 
@@ -98,8 +98,8 @@ def _follow(cls: type, path: list[str]) -> bool:
 
 
 def _specs(name: str, hint: Any) -> Iterator[type]:
-    """The specs that a field may hold: those of its type, and those of the registry of its name."""
-    for tree in _TREES:
+    """Return the specs that a field may contain: specs of its type and of the registry with its name."""
+    for tree in TREES:
         registry: Registry[type] | None = tree.parts.get(name)
         if registry is not None:
             yield from registry.values()

@@ -23,6 +23,7 @@ from edp_site import (
     repository_files,
     result_files,
     results,
+    settings_reference,
 )
 
 ROOT = Path(__file__).parents[2]
@@ -75,6 +76,7 @@ def _made(root: Path) -> dict[str, Callable[[], str]]:
     benchmarks = results.read_benchmarks(root)
     made: dict[str, Callable[[], str]] = {
         "reference/commands.md": commands.commands_page,
+        "reference/settings.md": settings_reference.settings_page,
         "reference/python.md": python_api.python_page,
         "reference/parts.md": parts.parts_page,
         "reference/errors.md": errors.errors_page,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Mapping
 from io import TextIOWrapper
 from typing import Annotated
 
@@ -20,7 +21,6 @@ from edp.cli import (
     doctor,
     evaluate,
     export,
-    finetune,
     fleet,
     footprint,
     forecast,
@@ -30,7 +30,6 @@ from edp.cli import (
     live,
     monitor,
     parity,
-    pretrain,
     quantise,
     registry,
     report,
@@ -43,52 +42,68 @@ from edp.cli import (
     twin,
 )
 from edp.cli.console import err, run_app
-from edp.cli.notices import tell_of_missing_layers, tell_of_slow_logs, tell_of_unsealed_files
+from edp.cli.groups import Root
+from edp.cli.notices import tell_of_earlier_keys, tell_of_missing_layers, tell_of_slow_logs, tell_of_unsealed_files
 from edp.cli.process import stop_on_request, use_one_blas_thread
 from edp.workflows import load_plugins
 
 app = typer.Typer(
     name="edp",
+    cls=Root,
     help="Fast, accurate plant models of hydraulic machines, learned from recordings and run as a stream.",
     no_args_is_help=True,
     rich_markup_mode="markdown",
     # Tracebacks are for developers; users get one message.
     pretty_exceptions_enable=False,
 )
-app.command("demo")(demo.demo)
-app.command("simulate")(simulate.simulate)
-app.command("init")(init.init)
-app.command("inspect")(inspect.inspect)
-app.add_typer(store.app, name="store")
-app.command("screen")(screen.screen)
-app.command("animate")(animate.animate)
-app.command("train")(train.train)
-app.command("evaluate")(evaluate.evaluate)
-app.command("twin")(twin.twin)
-app.command("rollout")(twin.rollout)
-app.command("forecast")(forecast.forecast)
-app.command("control")(control.control)
-app.command("live")(live.live)
-app.command("tune")(control.tune)
-app.command("identify")(identify.identify)
-app.add_typer(search.app, name="search")
-app.command("distil")(distil.distil)
-app.command("compress")(compress.compress)
-app.command("pretrain")(pretrain.pretrain)
-app.command("finetune")(finetune.finetune)
-app.add_typer(fleet.app, name="fleet")
-app.add_typer(registry.app, name="registry")
-app.command("adapt")(adapt.adapt)
-app.command("replay")(adapt.replay)
-app.add_typer(monitor.app, name="monitor")
-app.command("footprint")(footprint.footprint)
-app.command("export")(export.export)
-app.command("parity")(parity.parity)
-app.command("quantise")(quantise.quantise)
-app.command("report")(report.report)
-app.command("compare")(compare.compare)
-app.command("runs")(runs.runs)
-app.command("doctor")(doctor.doctor)
+data_app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode="markdown", help="Check, select, convert and show recordings."
+)
+data_app.command("check")(inspect.inspect)
+data_app.command("screen")(screen.screen)
+data_app.command("animate")(animate.animate)
+data_app.command("add-forecasts")(forecast.forecast)
+data_app.add_typer(store.app, name="store")
+compress_app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode="markdown", help="Make a trained network smaller or faster."
+)
+compress_app.command("distil")(distil.distil)
+compress_app.command("quantise")(quantise.quantise)
+compress_app.command("search")(compress.compress)
+compress_app.command("estimate")(footprint.footprint)
+loop_app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode="markdown", help="Run and tune controllers in closed loop."
+)
+loop_app.command("run")(control.control)
+loop_app.command("tune")(control.tune)
+PANELS: tuple[tuple[str, Mapping[str, typer.Typer | Callable[..., None]]], ...] = (
+    ("Start", {"init": init.init, "demo": demo.demo, "doctor": doctor.doctor}),
+    ("Data", {"data": data_app}),
+    ("Train", {"train": train.app, "twin": twin.twin, "search": search.app}),
+    (
+        "Evaluate",
+        {
+            "evaluate": evaluate.evaluate,
+            "compare": compare.compare,
+            "report": report.report,
+            "runs": runs.runs,
+            "rollout": twin.rollout,
+        },
+    ),
+    ("Compress", {"compress": compress_app}),
+    ("Deploy", {"export": export.export, "verify": parity.verify, "adapt": adapt.app}),
+    ("Simulate", {"simulate": simulate.simulate, "calibrate": identify.identify}),
+    ("Control", {"loop": loop_app}),
+    ("Operate", {"monitor": monitor.app, "live": live.live, "fleet": fleet.app, "registry": registry.app}),
+)
+"""Commands and groups by the panel of `edp --help` that shows them."""
+Root.order = tuple(name for _, entries in PANELS for name in entries)
+for _panel, _entries in PANELS:
+    for _name, _entry in _entries.items():
+        if isinstance(_entry, typer.Typer):
+            app.add_typer(_entry, name=_name, rich_help_panel=_panel)
+        else:
+            app.command(_name, rich_help_panel=_panel)(_entry)
 
 
 def _version(show_version: bool) -> None:
@@ -118,5 +133,6 @@ def main() -> None:
     tell_of_slow_logs()
     tell_of_missing_layers()
     code = run_app(app)
+    tell_of_earlier_keys()
     tell_of_unsealed_files()
     sys.exit(code)

@@ -1,4 +1,4 @@
-"""``edp adapt`` and ``edp replay``: a correction that is learned on board, and its effect on recorded logs."""
+"""``edp adapt`` and ``edp adapt replay``: a correction that is learned on board, and its effect on recorded logs."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out, table
+from edp.cli.groups import RUN, RunByDefault
 from edp.cli.options import LogsArgument, MapOption, RepairOption, SettingsOption, source_of
 from edp.cli.progress import show_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
@@ -17,6 +18,15 @@ if TYPE_CHECKING:
     from edp.evaluation.adaptation_file import AdaptationFile, ReplayErrors
 
 
+app = typer.Typer(
+    cls=RunByDefault,
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="Add a correction that adapts on board. `edp adapt RUN --out DIR` is `edp adapt run ...`.",
+)
+
+
+@app.command(RUN)
 def adapt(
     run: Annotated[Path, typer.Argument(help="Run folder of edp train, finetune, distil, compress or quantise.")],
     folder: Annotated[Path, typer.Option("--out", help="Folder of the new run.")],
@@ -49,7 +59,7 @@ def adapt(
         out.print(f"{correction.features} features, {correction.macs:,} multiply-accumulates a tick; {folder}")
         out.print("its test recordings, each from nothing:")
         replay_tables(content)
-        out.print(f"next: edp replay {folder} LOGS, edp export {folder} --to c --out firmware/predictor")
+        out.print(f"next: edp adapt replay {folder} LOGS, edp export {folder} --format c --out firmware/predictor")
 
     emit(
         as_json,
@@ -60,6 +70,7 @@ def adapt(
     end_with(verdict)
 
 
+@app.command("replay")
 def replay(
     run: Annotated[Path, typer.Argument(help="Run folder of edp adapt, or its bundle.")],
     logs: LogsArgument,
@@ -77,9 +88,9 @@ def replay(
 ) -> None:
     """Run logs through a network and its adaptation, tick by tick: the error with and without, over time in motion.
 
-    Example: `edp replay runs/first_adapted logs/monday --carry`
+    Example: `edp adapt replay runs/first_adapted logs/monday --carry`
 
-    Example: `edp replay runs/first_adapted logs/monday --twin runs/grey`
+    Example: `edp adapt replay runs/first_adapted logs/monday --twin runs/grey`
     """
     from edp.evaluation.guard import adaptation_verdict
     from edp.workflows.adaptation import replay_run

@@ -1,4 +1,4 @@
-"""``edp animate``: the side view of a recording."""
+"""``edp data animate``: the side view of a recording."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out
-from edp.cli.options import MAX_SECONDS, MapOption, check_effects, within
+from edp.cli.options import MAX_SECONDS, MapOption, check_effects, parse_seconds, within
 from edp.errors import ConfigError
 from edp.settings.bounds import above, span
 from edp.storage.paths import full_path
@@ -32,10 +32,18 @@ def animate(
     machine: Annotated[
         str | None, typer.Option(help="Machine name or file (.toml) to draw; default: the recording's.")
     ] = None,
-    start: Annotated[float, typer.Option(callback=within(span(0.0, MAX_SECONDS)), help="First second shown.")] = 0.0,
+    start: Annotated[
+        float, typer.Option("--from", callback=within(span(0.0, MAX_SECONDS)), help="First second shown.")
+    ] = 0.0,
     seconds: Annotated[
         float | None,
-        typer.Option(callback=within(above(0.0, MAX_SECONDS)), help="How many seconds; default: up to 600."),
+        typer.Option(
+            "--duration",
+            parser=parse_seconds,
+            metavar="TIME",
+            callback=within(above(0.0, MAX_SECONDS)),
+            help="Length that is shown, such as 90s; default: up to 600 s.",
+        ),
     ] = None,
     horizon: Annotated[
         int | None, typer.Option(min=1, help="Samples ahead of the run's predictions; default: its furthest.")
@@ -47,7 +55,7 @@ def animate(
 
     With a run before the log, its predictions and their intervals stand beside what then happened.
 
-    Example: `edp animate runs/m22 data/m22/m22_000_combined.parquet`
+    Example: `edp data animate runs/m22 data/m22/m22_000_combined.parquet`
     """
     from edp.logs.source import DataSource, read_with_truth
     from edp.report.animation.film import FILMS, write_film
@@ -84,5 +92,5 @@ def _run_and_log(paths: Sequence[Path]) -> tuple[Path | None, Path]:
         ConfigError: more than these two.
     """
     if len(paths) > 2:
-        raise ConfigError(f"edp animate takes a log, or a run and a log; {len(paths)} paths were given")
+        raise ConfigError(f"edp data animate takes a log, or a run and a log; {len(paths)} paths were given")
     return (None if len(paths) == 1 else paths[0]), paths[-1]

@@ -1,4 +1,4 @@
-"""``edp compress``: the best network that a controller can run."""
+"""``edp compress search``: the best network that a controller can run."""
 
 from __future__ import annotations
 
@@ -24,8 +24,11 @@ def compress(
     budget: Annotated[
         Path | None, typer.Option("--budget", help="Limits of the controller (TOML); by default those of the thesis.")
     ] = None,
-    again: Annotated[
-        bool, typer.Option(help="Open the sealed test set again for another choice; the opening is recorded.")
+    reopen_test_set: Annotated[
+        bool,
+        typer.Option(
+            "--reopen-test-set", help="Open the sealed test set again for another choice; the opening is recorded."
+        ),
     ] = False,
     config: SettingsOption = None,
     changes: Annotated[
@@ -40,7 +43,7 @@ def compress(
     Choices rest on the validation part; the test part is opened once, for the chosen network and the teacher. Stop
     it at any moment (Ctrl-C): the same command continues.
 
-    Example: `edp compress runs/first --budget examples/budgets/small_controller.toml --out runs/small`
+    Example: `edp compress search runs/first --budget examples/budgets/small_controller.toml --out runs/small`
     """
     from edp.config.commands import TRAINING_TABLES, command_settings
     from edp.evaluation.controller import load_budget
@@ -53,7 +56,7 @@ def compress(
 
     own = [] if budget is None else [{"compress": {"budget": asdict(load_budget(budget))}}]
     spec, others = command_settings("compress", CompressionSearchSpec, config, [*changes, *own], TRAINING_TABLES)
-    request = CompressionSearchRequest(spec=spec, again=again, changes=others)
+    request = CompressionSearchRequest(spec=spec, again=reopen_test_set, changes=others)
     source = source_if_given(data, signal_map, repair)
     with show_progress("compress", as_json) as progress:
         compression = search(bundle, request, folder, source, progress)
@@ -71,8 +74,8 @@ def compress(
 def _show_next(best: CompressedRow, folder: Path) -> None:
     # An integer network leaves its run in float; quantising it is the next step.
     whole = best.number_format == "w8a16"
-    then = f"edp quantise {best.run} --out {folder / 'w8a16'}" if whole else f"edp evaluate {best.run}"
-    out.print(f"next: {then}, or edp footprint {best.run}")
+    then = f"edp compress quantise {best.run} --out {folder / 'w8a16'}" if whole else f"edp evaluate {best.run}"
+    out.print(f"next: {then}, or edp compress estimate {best.run}")
 
 
 def _tables(facts: CompressionResult) -> None:

@@ -22,7 +22,8 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from edp.cli.error_index import identify
-from edp.cli.options import check_belonging, setting_of
+from edp.cli.exit_codes import EXIT_CODES_AT
+from edp.cli.options import check_belonging, setting_of, words_of
 from edp.cli.process import exit_code_of_stop, memory_message, out_of_memory
 from edp.errors import ConfigError, EdpError
 from edp.table import Column, Table
@@ -92,8 +93,8 @@ _GAP = 2
 PATH_OPTIONS = frozenset(
     f"--{name}"
     for name in (
-        *("base", "budget", "config", "data", "deltas", "features", "fleet", "further", "limit", "map", "on", "out"),
-        *("page", "scenario", "start"),
+        *("base", "budget", "config", "data", "deltas", "features", "fleet", "unlabelled", "limit", "map", "out"),
+        *("page", "scenario", "start", "tuning-plant"),
         *(
             "log",
             "mdf",
@@ -104,7 +105,6 @@ PATH_OPTIONS = frozenset(
             "record",
             "run",
             "save",
-            "study",
             "teacher",
             "twin",
             "w8a16",
@@ -367,10 +367,11 @@ def _command(app: typer.Typer) -> Callable[..., Any]:
 
 
 def _check_options_of(command: Any) -> None:
-    """Let every command below a group refuse options without effect before it begins."""
+    """Prepare every command below a group: it refuses options without effect, and its help names the exit codes."""
     for inner in getattr(command, "commands", {}).values():
         _check_options_of(inner)
     if not hasattr(command, "commands"):
+        command.epilog = EXIT_CODES_AT
         run = command.invoke
 
         def invoke(context: typer.Context) -> Any:
@@ -423,5 +424,5 @@ def _say_usage(error: Any) -> None:
     if context is not None:
         err.print(" ".join(context.get_usage().split()))
         err.print(f"Try '{context.command_path} --help' for help.", style="dim")
-    setting = setting_of(str(getattr(context, "info_name", "")), str(getattr(error, "option_name", "")))
+    setting = setting_of("" if context is None else words_of(context), str(getattr(error, "option_name", "")))
     _say_error(error.format_message() if setting is None else f"{error.option_name} is a setting now: give {setting}")

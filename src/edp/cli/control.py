@@ -1,4 +1,4 @@
-"""``edp control``: a controller in closed loop with a plant, along tasks of the bucket tip."""
+"""``edp loop run``: a controller in closed loop with a plant, along tasks of the bucket tip."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import typer
 
 from edp.cli.consent import ask_for_fmus
 from edp.cli.console import JsonFlag, emit, out, table
-from edp.cli.options import MOST_LOOPS, ClusterOption, OpenOption, WorkersOption, workers_of
+from edp.cli.options import MOST_LOOPS, ClusterOption, OpenOption, WorkersOption, complete_from, workers_of
 from edp.cli.progress import show_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.storage.paths import full_path
@@ -18,12 +18,28 @@ from edp.wording import figure, number
 if TYPE_CHECKING:
     from edp.control.run_file import ControlFile
 
-TaskOption = Annotated[str, typer.Option("--task", help="What to follow: grade, corners, level, point or dig.")]
+TaskOption = Annotated[
+    str,
+    typer.Option(
+        "--task",
+        autocompletion=complete_from("edp.control.tasks", "TASKS"),
+        help="What to follow: grade, corners, level, point or dig.",
+    ),
+]
 MachineOption = Annotated[str, typer.Option("--machine", help="Machine name or file (.toml).")]
-ControllerOption = Annotated[str, typer.Option("--controller", help="What moves the levers, such as pi or inversion.")]
-SeedsOption = Annotated[
+ControllerOption = Annotated[
+    str,
+    typer.Option(
+        "--controller",
+        autocompletion=complete_from("edp.control.controllers", "CONTROLLERS"),
+        help="Controller of the levers, such as pi or inversion.",
+    ),
+]
+LoopsOption = Annotated[
     int | None,
-    typer.Option("--seeds", min=1, max=MOST_LOOPS, help="Number of loops, each of a reference of its own; default: 6."),
+    typer.Option(
+        "--loops", min=1, max=MOST_LOOPS, help="Number of closed-loop runs, each along its own reference; default: 6."
+    ),
 ]
 PlantOption = Annotated[
     Path | None, typer.Option("--plant", help="Run folder of a twin, or an FMU (.fmu), that is the plant instead.")
@@ -49,7 +65,7 @@ def control(
     task: TaskOption = "",
     machine: MachineOption = "",
     controller: ControllerOption = "",
-    seeds: SeedsOption = None,
+    loops: LoopsOption = None,
     plant: PlantOption = None,
     twin: TwinOption = None,
     predictor: PredictorOption = None,
@@ -67,7 +83,7 @@ def control(
     The plant is the simulator, or with --plant a twin or an FMU, whose native code it asks about first. Position
     errors are to the reference of the same time; the distance to the path stands beside them.
 
-    Example: `edp control runs/grade --task grade --machine M22 --controller pi --seeds 6`
+    Example: `edp loop run runs/grade --task grade --machine M22 --controller pi --loops 6`
     """
     from edp.config.control import load_control_experiment
     from edp.workflows.control import ControlSources, control_loops
@@ -78,7 +94,7 @@ def control(
         from edp.workflows.monitor.loop_guard import monitor_guard
 
         guard = monitor_guard(monitor)
-    experiment = load_control_experiment(config, changes, _options(task, machine, controller, seeds))
+    experiment = load_control_experiment(config, changes, _options(task, machine, controller, loops))
     with show_progress("control", as_json, "loops run") as progress:
         sources = ControlSources(plant, twin, predictor, trusted=True)
         divided = workers_of(workers, cluster, open_cluster)
@@ -100,13 +116,22 @@ def tune(
     task: TaskOption = "",
     machine: MachineOption = "",
     controller: ControllerOption = "",
-    seeds: SeedsOption = None,
-    on: Annotated[Path | None, typer.Option("--on", help="Run folder of a twin, or an FMU, on which to tune.")] = None,
+    evaluation_loops: Annotated[
+        int | None,
+        typer.Option(
+            min=1, max=MOST_LOOPS, help="Number of evaluation runs, each along its own reference; default: 6."
+        ),
+    ] = None,
+    tuning_plant: Annotated[
+        Path | None, typer.Option(help="Run folder of a twin, or an FMU, on which to tune; default: the simulator.")
+    ] = None,
     plant: PlantOption = None,
     twin: TwinOption = None,
     predictor: PredictorOption = None,
-    trials: Annotated[int, typer.Option(min=1, max=MOST_LOOPS, help="Settings of the gains to try.")] = 40,
-    loops: Annotated[int, typer.Option(min=1, max=MOST_LOOPS, help="References that each of them is run along.")] = 4,
+    trials: Annotated[int, typer.Option(min=1, max=MOST_LOOPS, help="Number of controller settings to try.")] = 40,
+    tuning_loops: Annotated[
+        int, typer.Option(min=1, max=MOST_LOOPS, help="Number of references for each of these settings.")
+    ] = 4,
     config: ConfigOption = None,
     changes: ChangesOption = [],  # noqa: B006
     yes: YesOption = False,
@@ -115,22 +140,22 @@ def tune(
     open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Tune a controller's gains on the simulator (with --on: on a twin or FMU) and evaluate them on the plant.
+    """Tune a controller's gains on the simulator or on a twin and evaluate them on the plant.
 
-    References of the tuning are never those of the judgement. The tuned settings are for `edp control --config`.
+    References of the tuning are never those of the judgement. The tuned settings are for `edp loop run --config`.
 
-    Example: `edp tune runs/tuned --task grade --controller pi --on runs/twin`
+    Example: `edp loop tune runs/tuned --task grade --controller pi --tuning-plant runs/twin`
     """
     from edp.config.control import load_control_experiment
     from edp.evaluation.guard import tuning_verdict
     from edp.workflows.control import ControlSources, TuningSpec, tune_gains
     from edp.workflows.control.tune_gains import TUNED
 
-    ask_for_fmus(yes, on, plant)
-    experiment = load_control_experiment(config, changes, _options(task, machine, controller, seeds))
+    ask_for_fmus(yes, tuning_plant, plant)
+    experiment = load_control_experiment(config, changes, _options(task, machine, controller, evaluation_loops))
     with show_progress("tune", as_json, "trials run") as progress:
-        tuned_on, judged_on = (ControlSources(where, twin, predictor, trusted=True) for where in (on, plant))
-        tuning_spec, divided = TuningSpec(trials=trials, loops=loops), workers_of(workers, cluster, open_cluster)
+        tuned_on, judged_on = (ControlSources(where, twin, predictor, trusted=True) for where in (tuning_plant, plant))
+        tuning_spec, divided = TuningSpec(trials=trials, loops=tuning_loops), workers_of(workers, cluster, open_cluster)
         tuning = tune_gains(experiment, folder, tuned_on, judged_on, tuning_spec, progress, divided)
     judged = tuning.content.judged_mm
     verdict = tuning_verdict(judged)
@@ -143,17 +168,17 @@ def tune(
             f"{number(judged.before, 1)} mm before"
         )
         out.print(f"gains: {gains}")
-        out.print(f"next: edp control RUN --config {folder / TUNED}")
+        out.print(f"next: edp loop run RUN --config {folder / TUNED}")
 
     places = {"run": str(folder), "settings": str(folder / TUNED)}
     emit(as_json, places | tuning.content.to_table() | verdict_facts(verdict), show)
     end_with(verdict)
 
 
-def _options(task: str, machine: str, controller: str, seeds: int | None) -> dict[str, object]:
+def _options(task: str, machine: str, controller: str, loops: int | None) -> dict[str, object]:
     """Return the settings of the given options."""
     options: dict[str, object] = {"machine": machine} if machine else {}
-    options |= {} if seeds is None else {"loops": seeds}
+    options |= {} if loops is None else {"loops": loops}
     options |= {"task": {"kind": task}} if task else {}
     return options | ({"controller": {"kind": controller}} if controller else {})
 

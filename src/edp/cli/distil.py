@@ -1,4 +1,4 @@
-"""``edp distil``: a smaller network that learns from a trained one."""
+"""``edp compress distil``: a smaller network that learns from a trained one."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def distil(
     ] = None,
     data: DataOption = [],  # noqa: B006
     teachers: Annotated[list[Path], typer.Option("--teacher", help="A further teacher; may be repeated.")] = [],  # noqa: B006
-    further: Annotated[
+    unlabelled: Annotated[
         list[Path],
         typer.Option(
             help="Recordings without measured targets, on which the student learns the teachers' predictions; may be "
@@ -45,7 +45,7 @@ def distil(
 
     Stop it at any moment (Ctrl-C): the same command continues. The run is judged with `edp evaluate`.
 
-    Example: `edp distil runs/first --units 32 --out runs/small`
+    Example: `edp compress distil runs/first --units 32 --out runs/small`
     """
     from edp.config.commands import TRAINING_TABLES, command_settings
     from edp.evaluation.footprint import footprint
@@ -60,7 +60,7 @@ def distil(
     request = DistilRequest(
         spec=spec,
         teachers=tuple(map(str, teachers)),
-        further=source_if_given(further, signal_map, repair),
+        further=source_if_given(unlabelled, signal_map, repair),
         changes=others,
     )
     source = source_if_given(data, signal_map, repair)

@@ -20,6 +20,7 @@ from edp.cli.options import (
     RepairOption,
     WorkersOption,
     check_effects,
+    parse_minutes,
     source_if_given,
     within,
     workers_of,
@@ -48,19 +49,20 @@ def evaluate(
     channel_importance: Annotated[
         bool, typer.Option(help="Also measure channel importance: the growth of the error when a channel is removed.")
     ] = False,
-    minutes: Annotated[
+    time_budget: Annotated[
         float | None,
         typer.Option(
+            parser=parse_minutes,
+            metavar="TIME",
             callback=within(span(0.0, MAX_MINUTES)),
-            help="After these begin no further baseline; cheap ones come first.",
+            help="Processor time, such as 30min, after which no other baseline is started; fast baselines come first.",
         ),
     ] = None,
-    at_most: Annotated[
+    max_hours: Annotated[
         float | None,
         typer.Option(
-            "--at-most",
             callback=within(above(0.0, MAX_HOURS)),
-            help="Judge on evenly spread stretches of at most so many hours, about.",
+            help="Evaluate on evenly spaced segments with a total length of about this many hours.",
         ),
     ] = None,
     predictor: Annotated[
@@ -83,8 +85,8 @@ def evaluate(
     divided = workers_of(workers, cluster, open_cluster)
     names = None if baselines is None else baseline_names(baselines)
     is_twin = holds_twin(run)
-    of_networks = ("baselines", "at_most", "channel_importance", "workers", "cluster")
-    effects = {"predictor": is_twin, "minutes": not is_twin and names != [] and divided.are_alone}
+    of_networks = ("baselines", "max_hours", "channel_importance", "workers", "cluster")
+    effects = {"predictor": is_twin, "time_budget": not is_twin and names != [] and divided.are_alone}
     check_effects(context, effects | dict.fromkeys(of_networks, not is_twin))
     if is_twin:
         evaluate_twin_run(run, source, predictor, as_json)
@@ -94,18 +96,18 @@ def evaluate(
     from edp.report.run.outputs import describe_evaluation, losses_line, minutes_of, situation_line
     from edp.settings.provenance import read_provenance
 
-    folder, scores = run_evaluation(run, source, names, as_json, minutes, divided, at_most)
+    folder, scores = run_evaluation(run, source, names, as_json, time_budget, divided, max_hours)
     verdict = network_verdict(scores, minutes_of(run))
     lost, judged = losses_line(scores), describe_evaluation(scores, read_provenance(run))
     choice = read_choice(run) if source is None else None
     beyond, promise = situation_line(scores), "" if choice is None else promise_line(choice)
-    importances = run_importance(run, source, as_json, at_most) if channel_importance else None
+    importances = run_importance(run, source, as_json, max_hours) if channel_importance else None
 
     def show() -> None:
         show_verdict(verdict)
         if lost:
             out.print(lost)
-        show_scores(scores, (promise, beyond, judged), minutes)
+        show_scores(scores, (promise, beyond, judged), time_budget)
         out.print(f"scores in {folder / 'scores.json'}")
         if importances is not None:
             importance_table(importances)
@@ -127,11 +129,11 @@ def show_scores(scores: ScoresFile, sentences: Sequence[str], minutes: float | N
         if sentence:
             out.print(sentence)
     if scores.drawn is not None:
-        out.print(f"judged on {scores.drawn.what}; leave --at-most out for all")
+        out.print(f"judged on {scores.drawn.what}; leave --max-hours out for all")
     if scores.left_out:
         left = ", ".join(scores.left_out)
         out.print(
-            f"left out after --minutes {setting_text(minutes)}: {left}; give the command without it to judge them, too"
+            f"left out after --time-budget {setting_text(minutes)}min: {left}; to evaluate them, leave the option out"
         )
 
 

@@ -8,9 +8,15 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out, waiting
-from edp.cli.options import MapOption, RepairOption, source_if_given
+from edp.cli.options import MapOption, RepairOption, complete, source_if_given
 from edp.errors import ConfigError
 from edp.storage.paths import full_path, is_file_at
+
+
+def _names_of_formats() -> list[str]:
+    from edp.workflows.export_forms import all_forms
+
+    return list(all_forms())
 
 
 def _list_forms(listing_asked: bool) -> None:
@@ -29,16 +35,23 @@ COMPILING = "compiling the FMU's libraries; for the first one of a system the co
 
 def export(
     bundle: Annotated[
-        Path, typer.Argument(help="Bundle, run folder of edp train, edp twin or edp control, or a monitor.")
+        Path, typer.Argument(help="Bundle, run folder of edp train, edp twin or edp loop run, or a monitor.")
     ],
-    to: Annotated[str, typer.Option(help="Form, such as c (C99 for controllers); --forms lists all.")],
+    form: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            autocompletion=complete(_names_of_formats),
+            help="Format, such as c (C99 for controllers); --formats lists all.",
+        ),
+    ],
     folder: Annotated[Path, typer.Option("--out", help="Folder for the files; an existing export is replaced.")],
     name: Annotated[
         str,
         typer.Option(help="Name in the exported files; default: predictor, machine (a controller), monitor, follower."),
     ] = "",
     changes: Annotated[
-        list[str] | None, typer.Option("--set", help="Option of the form, such as opset=11 of onnx; may be repeated.")
+        list[str] | None, typer.Option("--set", help="Option of the format, such as opset=11 of onnx; may be repeated.")
     ] = None,
     w8a16: Annotated[
         list[Path],
@@ -48,30 +61,30 @@ def export(
     ] = [],  # noqa: B006
     twin: Annotated[
         Path | None,
-        typer.Option("--twin", help="For --to follower: the run of a grey box of the machine as it was."),
+        typer.Option("--twin", help="For --format follower: the run of a grey box of the machine as it was."),
     ] = None,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     forms: Annotated[
-        bool, typer.Option("--forms", callback=_list_forms, is_eager=True, help="List the forms and end.")
+        bool, typer.Option("--formats", callback=_list_forms, is_eager=True, help="List the formats and exit.")
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Write a trained network in a form that runs without EDP; it reads and gives SI units.
 
-    Example: `edp export runs/first --to c --out firmware/predictor`
+    Example: `edp export runs/first --format c --out firmware/predictor`
 
-    Example: `edp export runs/first_adapted --to follower --twin runs/grey --out firmware/follower`
+    Example: `edp export runs/first_adapted --format follower --twin runs/grey --out firmware/follower`
     """
     from edp.workflows.export_forms import ExportOrder, export_run
 
     options = dict(map(_option, changes or []))
     calibration = source_if_given(w8a16, signal_map, repair)
     order = ExportOrder(
-        run=bundle, to=to, folder=folder, name=name, options=options, twin=twin, calibration=calibration
+        run=bundle, to=form, folder=folder, name=name, options=options, twin=twin, calibration=calibration
     )
     # Other forms are written in a moment, or run no compiler.
-    slow = to == FMU and options.get("binaries") != "none"
+    slow = form == FMU and options.get("binaries") != "none"
     with waiting(COMPILING, quiet=as_json or not slow):
         exported = export_run(order)
     first = exported.files[0]
@@ -80,13 +93,13 @@ def export(
         for file in exported.files:
             out.print(str(file))
         if exported.without_adaptation:
-            out.print(f"note: the form '{to}' holds the network alone; its adaptation is held by c")
+            out.print(f"note: the format '{form}' holds the network alone; its adaptation is held by c")
         out.print(f"written: {full_path(first.parent)}; read {first.name} first")
         if is_file_at(first.parent / "CMakeLists.txt"):
             where, build = first.parent, first.parent / "build"
             out.print(f"next: cmake -S {where} -B {build} && cmake --build {build} && ctest --test-dir {build}")
 
-    emit(as_json, {"to": to, "name": exported.name, "files": [str(file) for file in exported.files]}, show)
+    emit(as_json, {"to": form, "name": exported.name, "files": [str(file) for file in exported.files]}, show)
 
 
 def _option(text: str) -> tuple[str, str]:

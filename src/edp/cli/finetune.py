@@ -1,4 +1,4 @@
-"""Command ``edp finetune``: adapt a network of one machine to another machine."""
+"""Command ``edp train finetune``: adapt a network of one machine to another machine."""
 
 from __future__ import annotations
 
@@ -45,7 +45,8 @@ def finetune(
     ] = "ridge_arx",
     config: SettingsOption = None,
     changes: Annotated[
-        list[str], typer.Option("--set", help="One setting, for example finetune.rate=1e-3 or training.updates=100.")
+        list[str],
+        typer.Option("--set", help="One setting, for example finetune.learning_rate=1e-3 or training.updates=100."),
     ] = [],  # noqa: B006
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
@@ -66,13 +67,14 @@ def finetune(
     kept. The result is a run, which can be judged, reported and exported. After a stop (Ctrl-C) the same command
     continues.
 
-    Example: `edp finetune runs/m22 logs/c14 --out runs/c14 --baselines all`
+    Example: `edp train finetune runs/m22 logs/c14 --out runs/c14 --baselines all`
 
-    Example: `edp finetune runs/m22 logs/c14 --out runs/c14 --set finetune.rounds=20 --set finetune.batch=16`
+    Example: `edp train finetune runs/m22 logs/c14 --out runs/c14 --set finetune.single_phase_epochs=20 --set
+    finetune.batch=16`
 
     With --fleet a store of many machines is taken, and what comes out is a delta of kilobytes for each of them.
 
-    Example: `edp finetune runs/foundation --fleet stores/fleet --out fleet/own --workers 4`
+    Example: `edp train finetune runs/foundation --fleet stores/fleet --out fleet/own --workers 4`
     """
     from edp.config.commands import TRAINING_TABLES, command_settings
     from edp.report import read_transfer, write_transfer_page
@@ -108,7 +110,7 @@ def finetune(
         show_verdict(verdict)
         _tables(facts)
         out.print(f"report: {page}")
-        out.print(f"next: edp evaluate {folder}, or edp export {folder} --to c --out exported")
+        out.print(f"next: edp evaluate {folder}, or edp export {folder} --format c --out exported")
 
     emit(as_json, result.to_table() | {"run": str(folder), "report": str(page)} | verdict_facts(verdict), show)
     end_with(verdict)

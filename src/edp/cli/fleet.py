@@ -26,7 +26,7 @@ def report(
     store: Annotated[Path, typer.Argument(help="Store of recordings that say their machine.")],
     folder: Annotated[Path, typer.Option("--out", help="Folder for the page and fleet_report.json.")],
     deltas: Annotated[
-        Path | None, typer.Option(help="Folder of edp finetune --fleet: each machine runs under its own delta.")
+        Path | None, typer.Option(help="Folder of edp train finetune --fleet: each machine runs under its own delta.")
     ] = None,
     monitor: Annotated[Path | None, typer.Option(help="Monitor that watches every machine, too.")] = None,
     workers: WorkersOption = 1,
@@ -60,7 +60,7 @@ def report(
 
 @app.command("network")
 def network(
-    deltas: Annotated[Path, typer.Argument(help="Folder of edp finetune --fleet.")],
+    deltas: Annotated[Path, typer.Argument(help="Folder of edp train finetune --fleet.")],
     machine: Annotated[str, typer.Argument(help="Name of the machine.")],
     folder: Annotated[Path, typer.Option("--out", help="Folder for the bundle.")],
     base: Annotated[
@@ -70,7 +70,7 @@ def network(
 ) -> None:
     """Write the network of one machine, the fleet's with its delta added, as a bundle to export.
 
-    Example: `edp fleet network fleet/own "C14 no. 3" --out c14_3`, then `edp export c14_3 --to c --out exported`
+    Example: `edp fleet network fleet/own "C14 no. 3" --out c14_3`, then `edp export c14_3 --format c --out exported`
     """
     from edp.workflows.fleet.personal import network_of
 
@@ -78,6 +78,6 @@ def network(
 
     def show() -> None:
         out.print(f"network of '{machine}' in {written}")
-        out.print(f"next: edp export {written} --to c --out exported")
+        out.print(f"next: edp export {written} --format c --out exported")
 
     emit(as_json, {"bundle": str(written), "machine": machine}, show)

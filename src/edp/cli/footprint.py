@@ -1,4 +1,4 @@
-"""Command ``edp footprint``: memory and computing cost of a network."""
+"""Command ``edp compress estimate``: memory and computing cost of a network."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def footprint(
 ) -> None:
     """Count parameters, multiply-accumulates, activations and state; estimate cycles and memory; hold them to a budget.
 
-    Example: `edp footprint examples/thesis/table_b1.toml --budget examples/budgets/small_controller.toml`
+    Example: `edp compress estimate examples/thesis/table_b1.toml --budget examples/budgets/small_controller.toml`
     """
     from edp.evaluation.controller import CORES, Budget, load_budget
     from edp.workflows.deployment import footprint_of

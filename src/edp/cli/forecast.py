@@ -1,4 +1,4 @@
-"""Command ``edp forecast``: add forecasts of a twin to logs as additional channels."""
+"""Command ``edp data add-forecasts``: add forecasts of a twin to logs as additional channels."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ def forecast(
     run: Annotated[Path, typer.Argument(help="Run folder of edp twin.")],
     data: LogsArgument,
     folder: Annotated[Path, typer.Option("--out", help="New folder for the logs with forecasts (Parquet).")],
-    ahead: Annotated[list[int], typer.Option(help="Ticks ahead; give it again for more.")] = [10],  # noqa: B006
-    answer: Annotated[
-        list[str], typer.Option(help="A channel that is forecast; give it again for more. Default: the velocities.")
+    horizon: Annotated[list[int], typer.Option(help="Prediction horizon in samples; may be repeated.")] = [10],  # noqa: B006
+    channel: Annotated[
+        list[str], typer.Option(help="Channel to forecast; may be repeated. Default: the velocities.")
     ] = [],  # noqa: B006
-    gain: Annotated[
+    observer_gain: Annotated[
         float | None,
-        typer.Option(help="Share by which a tick's measurement moves the observer, 0 to 1; default: the logs choose."),
+        typer.Option(help="Gain of the observer, 0 to 1; default: the gain with the least error on the logs."),
     ] = None,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
@@ -40,12 +40,14 @@ def forecast(
     The channel CylVels_1_in_10 is what it then says of CylVels_1 in ten ticks: a network with task.features = "all"
     reads it like any other channel. Prints how far off the forecasts are, beside holding the present value.
 
-    Example: `edp forecast runs/twin logs --out logs_ahead --ahead 10`
+    Example: `edp data add-forecasts runs/twin logs --out logs_ahead --horizon 10`
     """
     from edp.workflows.twin import forecast_logs
 
     with show_progress("forecast", as_json) as progress:
-        result = forecast_logs(run, source_of(data, signal_map, repair), ahead, folder, answer, gain, progress)
+        result = forecast_logs(
+            run, source_of(data, signal_map, repair), horizon, folder, channel, observer_gain, progress
+        )
     facts = {
         "folder": str(folder),
         "logs": len(result.files),

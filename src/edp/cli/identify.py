@@ -1,4 +1,4 @@
-"""``edp identify``: from logs to a machine file of the simulator."""
+"""``edp calibrate``: from logs to a machine file of the simulator."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def identify(
     logs; pins, lengths and bores are those of --machine, and so is what the logs do not tell, which is said number by
     number. Both machines are then driven by the commands of held-out recordings.
 
-    Example: `edp identify logs --out mine.toml --machine measured.toml`
+    Example: `edp calibrate logs --out mine.toml --machine measured.toml`
     """
     from edp.config.twin import load_twin_experiment
     from edp.evaluation.guard import machine_verdict

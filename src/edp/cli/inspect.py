@@ -1,4 +1,4 @@
-"""Command ``edp inspect``: content and problems of logs, and coverage of a data set."""
+"""Command ``edp data check``: content and problems of logs, and coverage of a data set."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import typer
 from edp.cli.console import JsonFlag, emit, err, out, print_table, table
 from edp.cli.options import ClusterOption, LogsArgument, MapOption, OpenOption, WorkersOption, workers_of
 from edp.cli.progress import show_progress
-from edp.cli.quality import AtMostOption, show_between, show_lines, show_report, verdict_text
+from edp.cli.quality import MaxHoursOption, show_between, show_lines, show_report, verdict_text
 from edp.errors import DataError, EdpError, count_of
 from edp.storage.paths import full_path, is_file_at
 from edp.wording import figure, number, percent
@@ -51,7 +51,7 @@ def inspect(
     inputs: Annotated[
         str, typer.Option(help="Command channels, where names and kinds do not identify them: a,b.")
     ] = "",
-    at_most: AtMostOption = None,
+    max_hours: MaxHoursOption = None,
     workers: WorkersOption = 1,
     cluster: ClusterOption = "",
     open_cluster: OpenOption = False,
@@ -62,11 +62,11 @@ def inspect(
     Then what the data cover: how rich the inputs are, poses, joint histograms, events.
     Ends with exit code 3 where a log has an error that training would refuse.
 
-    Example: `edp inspect logs/ --map mine.toml --page coverage.html`
+    Example: `edp data check logs/ --map mine.toml --page coverage.html`
     """
     from edp.logs.source import DataSource
 
-    source = replace(DataSource.from_path(data, signal_map), at_most_h=at_most)
+    source = replace(DataSource.from_path(data, signal_map), at_most_h=max_hours)
     asked = page is not None or bool(split or inputs)
     names = tuple(filter(None, inputs.split(",")))
     with show_progress("read", as_json) as progress:

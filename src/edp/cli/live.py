@@ -66,7 +66,7 @@ def live(
         str | None, typer.Option("--udp-bind", help="Address that --udp listens on; default: 127.0.0.1.")
     ] = None,
     free_s: Annotated[
-        float | None, typer.Option("--free-s", help="Length (s) of a twin's free runs; default: 60.")
+        float | None, typer.Option("--rollout-seconds", help="Length of a twin's simulations in seconds; default: 60.")
     ] = None,
     signal_map: MapOption = None,
     as_json: JsonFlag = False,

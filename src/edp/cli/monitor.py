@@ -17,6 +17,7 @@ from edp.cli.options import (
     RepairOption,
     WorkersOption,
     check_effects,
+    parse_minutes,
     source_of,
     workers_of,
 )
@@ -57,7 +58,12 @@ def fit(
     hours: Annotated[
         float | None, typer.Option("--hours-per-false-alarm", help="Operating hours to one false alarm; default: 8.")
     ] = None,
-    minutes: Annotated[float | None, typer.Option(help="Processor time of its networks, about; default: 5.")] = None,
+    time_budget: Annotated[
+        float | None,
+        typer.Option(
+            parser=parse_minutes, metavar="TIME", help="Processor time of the networks, such as 30min; default: 5min."
+        ),
+    ] = None,
     machine: Annotated[
         str | None,
         typer.Option(
@@ -89,10 +95,10 @@ def fit(
     from edp.workflows.monitor.fit_monitor import holds_model
 
     options: dict[str, object] = {} if hours is None else {"hours_per_false_alarm": hours}
-    options |= {} if minutes is None else {"minutes": minutes}
+    options |= {} if time_budget is None else {"time_budget_min": time_budget}
     options |= {} if machine is None else {"dictionary": {"machine": machine}}
     experiment = load_monitor_experiment(config, changes, options)
-    check_effects(context, {"minutes": trains_networks(experiment)})
+    check_effects(context, {"time_budget": trains_networks(experiment)})
     runs = [path for path in arguments if holds_model(path)]
     logs = [path for path in arguments if path not in runs]
     if not logs:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from edp.cli.console import err
 from edp.sandbox import layers, sandbox
+from edp.settings.earlier_keys import used_earlier_keys
 from edp.storage.memory import readable
 from edp.storage.seals import files_without_seal
 from edp.wording import number
@@ -42,6 +43,13 @@ def tell_of_slow_logs() -> None:
 def tell_of_missing_layers() -> None:
     """Say on standard error, once in each command, that logs are read with less protection than elsewhere."""
     layers.announce_by(lambda text: err.print(f"warning: {text}"))
+
+
+def tell_of_earlier_keys() -> None:
+    """Print one note that lists the keys of settings that have another name now."""
+    if renamed := used_earlier_keys():
+        listed = ", ".join(f"{key} (now {present})" for key, present in renamed.items())
+        err.print(f"note: settings with earlier names, which the next release will no longer read: {listed}")
 
 
 def tell_of_unsealed_files() -> None:

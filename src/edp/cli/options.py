@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,6 +12,7 @@ import typer
 
 from edp.errors import ConfigError
 from edp.settings.bounds import Bound, shown
+from edp.settings.earlier_keys import KEYS
 
 if TYPE_CHECKING:
     from edp.jobs import Workers
@@ -61,54 +63,54 @@ OpenOption = Annotated[
 
 OWNERS: Mapping[tuple[str, str], tuple[str, ...]] = {
     ("*", "open_cluster"): ("cluster",),
-    ("distil", "signal_map"): ("data", "further"),
-    ("distil", "repair"): ("data", "further"),
-    ("compress", "signal_map"): ("data",),
-    ("compress", "repair"): ("data",),
+    ("compress distil", "signal_map"): ("data", "unlabelled"),
+    ("compress distil", "repair"): ("data", "unlabelled"),
+    ("compress search", "signal_map"): ("data",),
+    ("compress search", "repair"): ("data",),
     ("evaluate", "signal_map"): ("data",),
     ("evaluate", "repair"): ("data",),
     ("export", "signal_map"): ("w8a16",),
     ("export", "repair"): ("w8a16",),
-    ("parity", "signal_map"): ("data",),
-    ("parity", "repair"): ("data",),
-    ("screen", "preset"): ("trials",),
-    ("screen", "own"): ("trials",),
-    ("finetune", "delta_kb"): ("fleet",),
+    ("verify", "signal_map"): ("data",),
+    ("verify", "repair"): ("data",),
+    ("data screen", "preset"): ("trials",),
+    ("data screen", "own"): ("trials",),
+    ("train finetune", "delta_kb"): ("fleet",),
 }
 """Parameters by command ("*": every command), each with the parameters one of which it needs."""
 EXCLUDED: Mapping[tuple[str, str], tuple[str, ...]] = {
-    ("finetune", "fleet"): ("baselines",),
-    ("replay", "frozen"): ("carry",),
-    ("inspect", "page"): ("covered",),
-    ("inspect", "split"): ("covered",),
-    ("inspect", "inputs"): ("covered",),
-    ("inspect", "as_json"): ("details",),
-    ("runs", "as_json"): ("most",),
+    ("train finetune", "fleet"): ("baselines",),
+    ("adapt replay", "frozen"): ("carry",),
+    ("data check", "page"): ("covered",),
+    ("data check", "split"): ("covered",),
+    ("data check", "inputs"): ("covered",),
+    ("data check", "as_json"): ("details",),
+    ("runs", "as_json"): ("max_runs",),
 }
 """Parameters by command ("*": every command), each with parameters that have no effect beside it."""
-TRIAL_TABLES = ("trials", "task", "split", "model", "training", "judge")
-"""Settings of the trials of edp screen: their own table and those of an experiment."""
+TRIAL_TABLES = ("trials", "task", "split", "model", "training", "evaluation")
+"""Settings of the trials of edp data screen: their own table and those of an experiment."""
 DEPENDENT: Mapping[tuple[str, str], str] = {
-    ("animate", "horizon"): "a run before the log",
-    ("evaluate", "baselines"): "the run of a network (judge.floors are those of a twin)",
-    ("evaluate", "minutes"): "the run of a network, baselines, and one process",
-    ("evaluate", "at_most"): "the run of a network",
+    ("data animate", "horizon"): "a run before the log",
+    ("evaluate", "baselines"): "the run of a network (evaluation.baselines are those of a twin)",
+    ("evaluate", "time_budget"): "the run of a network, baselines, and one process",
+    ("evaluate", "max_hours"): "the run of a network",
     ("evaluate", "channel_importance"): "the run of a network",
     ("evaluate", "workers"): "the run of a network",
     ("evaluate", "cluster"): "the run of a network",
     ("evaluate", "predictor"): "the run of a twin, with which it is compared",
-    ("monitor fit", "minutes"): "residuals of networks: virtual_sensors or look_ahead",
-    ("parity", "interpreters"): "a form of ONNX Runtime: onnx_step or onnx_window",
-    ("pretrain", "changes.pretrain"): "an episodic method",
+    ("monitor fit", "time_budget"): "residuals of networks: virtual_sensors or look_ahead",
+    ("verify", "interpreters"): "a form of ONNX Runtime: onnx_step or onnx_window",
+    ("train pretrain", "changes.pretrain"): "an episodic method",
     ("report", "limit"): "the run of a network, which looks a fixed time ahead",
-    ("report", "budget"): "the run of a network (edp footprint takes twins)",
+    ("report", "budget"): "the run of a network (edp compress estimate takes twins)",
     ("search run", "budget"): "phase 6 (search.compression.on)",
-    **{("screen", f"changes.{table}"): "--trials" for table in TRIAL_TABLES},
+    **{("data screen", f"changes.{table}"): "--trials" for table in TRIAL_TABLES},
     ("simulate", "changes.limit"): "--limit",
-    ("train", "minutes"): "the preset auto",
-    ("train", "workers"): "the preset auto",
-    ("train", "cluster"): "the preset auto",
-    ("twin", "minutes"): "a choice among formulations (without twin.kind, --start and ground)",
+    ("train run", "time_budget"): "the preset auto",
+    ("train run", "workers"): "the preset auto",
+    ("train run", "cluster"): "the preset auto",
+    ("twin", "time_budget"): "a choice among formulations (without twin.kind, --start and ground)",
     **{
         ("twin", option): "several trainings (a choice among formulations, twin.members above 1, or --start)"
         for option in ("workers", "cluster")
@@ -118,31 +120,45 @@ DEPENDENT: Mapping[tuple[str, str], str] = {
 
 ``changes.TABLE`` are the values of ``--set`` for one table of the settings.
 """
-_SAME = {
-    "finetune": "head_epochs epochs head_rate backbone_rate depth_decay rounds rate batch smoothness weight_decay "
-    "patience rank source_weight soft reversal inner_rate inner_steps center",
-    "adapt": "rank noise prior limit margin",
-    "distil": "levels",
-    "compress": "units",
-    "pretrain": "inner_rate inner_steps shots",
-    "screen": "trusted",
+_TABLES = {
+    "train finetune": "finetune",
+    "adapt run": "adapt",
+    "compress distil": "distil",
+    "compress search": "compress",
+    "train pretrain": "pretrain",
+    "data screen": "screen",
 }
-FORMER = {(command, name): f"{command}.{name}=VALUE" for command, names in _SAME.items() for name in names.split()} | {
-    ("finetune", "no_center"): "finetune.center=false",
-    ("finetune", "any_sign"): "finetune.check_signs=false",
-    ("adapt", "rest"): "adapt.dead_zone=VALUE",
-    ("adapt", "forgetting"): "adapt.forgetting_s=VALUE",
-    ("adapt", "judged"): "adapt.judged_s=VALUE",
-    ("distil", "pruned"): "distil.pruned=true",
-    ("distil", "truth"): "distil.objective.truth=VALUE",
-    ("distil", "hint"): "distil.objective.hint=VALUE",
-    ("compress", "format"): "compress.formats=[VALUE]",
-    ("compress", "thesis"): "compress.thesis=true",
-    ("compress", "units"): "compress.units=[VALUE]",
-    ("pretrain", "head_only"): "pretrain.head_only=true",
-    ("screen", "trusted"): "screen.trusted=[VALUE]",
-    ("screen", "random"): "trials.random=VALUE",
-    ("run", "mode"): "search.mode=VALUE",
+"""Table of settings by command."""
+_SAME = {
+    "train finetune": "head_epochs epochs head_rate backbone_rate depth_decay rounds rate batch smoothness "
+    "weight_decay patience rank source_weight soft reversal inner_rate inner_steps center",
+    "adapt run": "rank noise prior limit margin",
+    "compress distil": "levels",
+    "compress search": "units",
+    "train pretrain": "inner_rate inner_steps shots",
+    "data screen": "trusted",
+}
+_KEYS = {**KEYS["FinetuneSpec"], **KEYS["MetaSpec"]}
+FORMER = {
+    (command, name): f"{_TABLES[command]}.{_KEYS.get(name, name)}=VALUE"
+    for command, names in _SAME.items()
+    for name in names.split()
+} | {
+    ("train finetune", "no_center"): "finetune.center=false",
+    ("train finetune", "any_sign"): "finetune.check_signs=false",
+    ("adapt run", "rest"): "adapt.dead_zone=VALUE",
+    ("adapt run", "forgetting"): "adapt.forgetting_s=VALUE",
+    ("adapt run", "judged"): "adapt.evaluation_s=VALUE",
+    ("compress distil", "pruned"): "distil.pruned=true",
+    ("compress distil", "truth"): "distil.objective.target_weight=VALUE",
+    ("compress distil", "hint"): "distil.objective.hint_weight=VALUE",
+    ("compress search", "format"): "compress.formats=[VALUE]",
+    ("compress search", "thesis"): "compress.thesis=true",
+    ("compress search", "units"): "compress.units=[VALUE]",
+    ("train pretrain", "head_only"): "pretrain.head_only=true",
+    ("data screen", "trusted"): "screen.measured=[VALUE]",
+    ("data screen", "random"): "trials.random_sets=VALUE",
+    ("search run", "mode"): "search.mode=VALUE",
     ("simulate", "masses"): "masses=[LOW, HIGH]",
     ("simulate", "scatter"): "scatter=VALUE",
     ("simulate", "layout"): "files.layout=VALUE",
@@ -152,6 +168,53 @@ FORMER = {(command, name): f"{command}.{name}=VALUE" for command, names in _SAME
     ("simulate", "horizons"): "limit.horizons=[VALUE]",
 }
 """By command and option up to version 0.1, what stands behind ``--set`` for it now."""
+
+
+_UNITS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
+_TIME = re.compile(r"\s*([-+.\deE]*[\d.])\s*(ms|s|min|h)\s*")
+
+
+def parse_seconds(text: str) -> float:
+    """Return a length of time with a unit, such as ``90s``, ``3min`` or ``2h``, in seconds.
+
+    Raises:
+        ConfigError: the text is not a number with one of these units.
+    """
+    found = _TIME.fullmatch(str(text))
+    try:
+        return float(found[1]) * _UNITS[found[2]] if found else float(text if isinstance(text, float) else "")
+    except ValueError:
+        raise ConfigError(
+            f"time '{text}': expected a number with a unit (ms, s, min or h); write for example 90s, 3min or 2h"
+        ) from None
+
+
+def parse_minutes(text: str) -> float:
+    """Return a length of time with a unit in minutes; see `parse_seconds`."""
+    return parse_seconds(text) / 60.0
+
+
+def complete(load: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """Return the shell completion of an option with a closed list of values.
+
+    Args:
+        load: returns the values; called only while the shell completes.
+    """
+
+    def matching(incomplete: str) -> list[str]:
+        return [name for name in load() if name.startswith(incomplete)]
+
+    return matching
+
+
+def complete_from(module: str, name: str) -> Callable[[str], list[str]]:
+    """Return the shell completion of an option whose values are the entries of a registry or tuple.
+
+    Args:
+        module: module of the registry, imported only while the shell completes.
+        name: its name in the module.
+    """
+    return complete(lambda: getattr(importlib.import_module(module), name))
 
 
 def within(bound: Bound) -> Callable[[typer.CallbackParam, Any], Any]:
@@ -225,7 +288,7 @@ def check_belonging(context: typer.Context) -> None:
     Raises:
         ConfigError: names the option and the one that it depends on.
     """
-    command = _command(context)
+    command = words_of(context)
     words = {parameter.name: _word(parameter, context) for parameter in context.command.params}
     stated = {name for name in words if _is_given(context, name)}
     for name, owners in _rules(OWNERS, command, words):
@@ -262,11 +325,11 @@ def check_effects(context: typer.Context, effects: Mapping[str, bool]) -> None:
             if not values:
                 continue
             word = f"{word} {values[0]}"
-        needed = DEPENDENT[_command(context), name]
+        needed = DEPENDENT[words_of(context), name]
         raise ConfigError(f"{word}: it has no effect without {needed}; leave {word} out")
 
 
-def _command(context: typer.Context) -> str:
+def words_of(context: typer.Context) -> str:
     """Return the words of the command without the name of the program."""
     return " ".join(context.command_path.split()[1:])
 

@@ -1,4 +1,4 @@
-"""Command ``edp parity``: check that all forms of a network give equal results."""
+"""Command ``edp verify``: check that all forms of a network give equal results."""
 
 from __future__ import annotations
 
@@ -9,33 +9,40 @@ import typer
 
 from edp.cli.consent import ask
 from edp.cli.console import JsonFlag, emit, err, out, table
-from edp.cli.options import MOST_TICKS, MapOption, RepairOption, check_effects, source_if_given
+from edp.cli.options import MOST_TICKS, MapOption, RepairOption, check_effects, complete_from, source_if_given
 from edp.wording import figure, number
 
 if TYPE_CHECKING:
     from edp.workflows.parity import Row
 
 
-def parity(
+def verify(
     context: typer.Context,
-    bundle: Annotated[Path, typer.Argument(help="Bundle, or run folder of edp train, edp quantise or edp twin.")],
+    bundle: Annotated[
+        Path, typer.Argument(help="Bundle, or run folder of edp train, edp compress quantise or edp twin.")
+    ],
     data: Annotated[
         list[Path],
         typer.Option(
-            help="Logs and folders of logs whose first ticks, in equal parts, are the reference recording; may be "
+            help="Logs and folders of logs whose first samples, in equal parts, are the reference recording; may be "
             "repeated. Default: random inputs."
         ),
     ] = [],  # noqa: B006
-    ticks: Annotated[
+    samples: Annotated[
         int | None,
         typer.Option(
             min=1,
             max=MOST_TICKS,
-            help="Length of the reference recording; default 400 ticks, of a twin its prefix and 60 s.",
+            help="Samples of the reference recording; default: 400, or for a twin its start-up samples and 60 s.",
         ),
     ] = None,
     forms: Annotated[
-        list[str], typer.Option("--form", help="Exported form to run; may be repeated. Default: all.")
+        list[str],
+        typer.Option(
+            "--format",
+            autocompletion=complete_from("edp.workflows.parity", "FORMS"),
+            help="Exported format to run; may be repeated. Default: all.",
+        ),
     ] = [],  # noqa: B006
     interpreters: Annotated[
         list[str],
@@ -56,7 +63,7 @@ def parity(
 
     Ends with 1 where a form differs from PyTorch by more than its tolerance.
 
-    Example: `edp parity runs/first`
+    Example: `edp verify runs/first`
     """
     from edp.workflows.deployment import load_exported
     from edp.workflows.parity import compare, from_own_run, golden_case, record_case
@@ -66,7 +73,7 @@ def parity(
         _ask(bundle)
     loaded = load_exported(bundle)
     source = source_if_given(data, signal_map, repair)
-    case = golden_case(loaded, ticks) if source is None else record_case(loaded, source, ticks)
+    case = golden_case(loaded, samples) if source is None else record_case(loaded, source, samples)
 
     def tell(row: Row) -> None:
         if not as_json:

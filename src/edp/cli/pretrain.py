@@ -1,4 +1,4 @@
-"""``edp pretrain``: one network over many machines."""
+"""``edp train pretrain``: one network over many machines."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def pretrain(
     moment (Ctrl-C): the same command continues.
 
     Example: `edp simulate data/many --scenario examples/scenarios/many_machines.toml`, then
-    `edp pretrain data/many --out runs/foundation --set split.test_masses=[12,17]`
+    `edp train pretrain data/many --out runs/foundation --set split.test_masses=[12,17]`
     """
     from edp.config.commands import TRAINING_TABLES, command_settings
     from edp.config.experiment import load_experiment
@@ -71,7 +71,7 @@ def pretrain(
 
     def show() -> None:
         _tables(result)
-        out.print(f"next: edp finetune {folder} LOGS --out RUN, or edp evaluate {folder}")
+        out.print(f"next: edp train finetune {folder} LOGS --out RUN, or edp evaluate {folder}")
 
     emit(as_json, result.to_table() | {"run": str(folder)}, show)
 

@@ -1,4 +1,4 @@
-"""Terminal output of recording quality, shared by `edp inspect` and `edp screen`."""
+"""Terminal output of recording quality, shared by `edp data check` and `edp data screen`."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from edp.wording import figure, number, percent
 if TYPE_CHECKING:
     from edp.logs import DataQuality, Finding, QualityReport
 
-AtMostOption = Annotated[
+MaxHoursOption = Annotated[
     float | None,
     typer.Option(
-        "--at-most",
+        "--max-hours",
         callback=within(above(0.0, MAX_HOURS)),
         help="Of a store, look at evenly spread stretches of at most so many hours, about; default: all.",
     ),

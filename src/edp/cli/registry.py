@@ -27,7 +27,7 @@ app = typer.Typer(
 @app.command("add")
 def add(
     registry: RegistryArgument,
-    source: Annotated[Path, typer.Argument(help="Run folder, bundle, or folder of edp finetune --fleet.")],
+    source: Annotated[Path, typer.Argument(help="Run folder, bundle, or folder of edp train finetune --fleet.")],
     name: Annotated[str, typer.Option(help="Name of the entry; the latest of one name is meant.")],
     as_json: JsonFlag = False,
 ) -> None:

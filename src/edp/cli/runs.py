@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 def runs(
     folder: Annotated[Path, typer.Argument(help="Folder to look below.")] = Path(),
-    most: Annotated[int, typer.Option(min=1, max=10_000, help="Runs to show, the latest first.")] = 40,
+    max_runs: Annotated[int, typer.Option(min=1, max=10_000, help="Runs to show, the latest first.")] = 40,
     as_json: JsonFlag = False,
 ) -> None:
     """List the runs below a folder: kind, data, error on test logs, when, finished or not.
@@ -30,7 +30,7 @@ def runs(
     def show() -> None:
         rows = [
             (str(_below(run.folder, folder)), run.kind, run.state, run.when[:16].replace("T", " "), run.score or "-")
-            for run in listed[:most]
+            for run in listed[:max_runs]
         ]
         if not rows:
             out.print(f"no runs below '{folder}'; edp train writes one")
@@ -38,14 +38,14 @@ def runs(
         listing("", ["run", "kind", "state", "when", "error on test logs"], rows)
         # One log may have been given by a relative and by an absolute path.
         sources: dict[str, list[ListedRun]] = {}
-        for run in listed[:most]:
+        for run in listed[:max_runs]:
             if run.data:
                 sources.setdefault(os.path.abspath(run.data), []).append(run)
         for own in sources.values():
             names = [str(_below(run.folder, folder)) for run in own]
             out.print(f"  data {own[0].data}: {', '.join(names[:4])}{', ...' if len(names) > 4 else ''}")
-        if len(listed) > most:
-            out.print(f"and {len(listed) - most} older ones (--most)")
+        if len(listed) > max_runs:
+            out.print(f"and {len(listed) - max_runs} older ones (--max-runs)")
         if not whole:
             out.print("there are more folders than were looked into; give one nearer to the runs")
 

@@ -1,4 +1,4 @@
-"""``edp screen``: which channels to feed a model, with how much memory, and why."""
+"""``edp data screen``: which channels to feed a model, with how much memory, and why."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from edp.cli.options import (
     workers_of,
 )
 from edp.cli.progress import Display, StageDisplay
-from edp.cli.quality import AtMostOption, show_between, verdict_text
+from edp.cli.quality import MaxHoursOption, show_between, verdict_text
 from edp.errors import count_of
 from edp.wording import figure, percent
 
@@ -60,7 +60,7 @@ def screen(
     exclude: Annotated[str, typer.Option(help="Channels to leave out of the candidates: a,b.")] = "",
     truth: Annotated[bool, typer.Option(help="Accept channels that exist only in a simulation as candidates.")] = False,
     changes: Annotated[
-        list[str], typer.Option("--set", help='One setting, such as screen.max_lag=200 or screen.trusted=["lever"].')
+        list[str], typer.Option("--set", help='One setting, such as screen.max_lag=200 or screen.measured=["lever"].')
     ] = [],  # noqa: B006
     pictures: Annotated[bool, typer.Option(help="Write the pictures as SVG and PNG too.")] = True,
     trials: Annotated[
@@ -74,7 +74,7 @@ def screen(
     own: Annotated[
         list[Path], typer.Option("--features", help="With --trials: further feature-set file; may be repeated.")
     ] = [],  # noqa: B006
-    at_most: AtMostOption = None,
+    max_hours: MaxHoursOption = None,
     workers: WorkersOption = 1,
     cluster: ClusterOption = "",
     open_cluster: OpenOption = False,
@@ -84,9 +84,9 @@ def screen(
 
     Without a map every column of numbers is a candidate. Writes a page, pictures, feature sets (TOML) and JSON.
 
-    Example: `edp screen logs/ --out screen --targets v_boom,v_arm --horizon 10`
+    Example: `edp data screen logs/ --out screen --targets v_boom,v_arm --horizon 10`
 
-    Example: `edp screen logs/ --out screen --set 'screen.trusted=["lever"]' --set screen.forest.trees=60`
+    Example: `edp data screen logs/ --out screen --set 'screen.measured=["lever"]' --set screen.forest.trees=60`
 
     Example: `edp train logs/ --config screen/settings.toml --out runs/first`
     """
@@ -109,7 +109,7 @@ def screen(
             trials=trial_spec,
             sets=_own_sets(own),
         )
-    source = replace(source_of(data, signal_map, repair), at_most_h=at_most)
+    source = replace(source_of(data, signal_map, repair), at_most_h=max_hours)
     selection = run_screening(source, folder, order, as_json, workers_of(workers, cluster, open_cluster))
     command = next_command(data, signal_map, repair, selection)
 

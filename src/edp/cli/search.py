@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from typer.core import TyperGroup
 
 from edp.cli.console import JsonFlag, duration, emit, out, table
+from edp.cli.groups import RUN, RunByDefault
 from edp.cli.options import LogsArgument, MapOption, RepairOption, check_effects, source_of
 from edp.cli.progress import show_progress
 from edp.errors import count_of
@@ -20,40 +20,22 @@ if TYPE_CHECKING:
     from edp.workflows.search.runner import SearchResult
     from edp.workflows.search.study_log import StudyStatus
 
-StudyArgument = Annotated[Path, typer.Argument(help="Folder of a study, as in edp search --study.")]
-DEFAULT = "run"
-
-
-class _RunByDefault(TyperGroup):
-    """`edp search DATA ...` is `edp search run DATA ...`."""
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the named command, or `run`."""
-        if args and args[0] not in self.commands:
-            args = [DEFAULT, *args]
-        return super().resolve_command(ctx, args)
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Options before the data belong to `run`."""
-        if args and args[0].startswith("-") and args[0] not in ("--help", "-h"):
-            # Options may stand before the data, as in every other command.
-            args = [DEFAULT, *args]
-        return super().parse_args(ctx, args)
+StudyArgument = Annotated[Path, typer.Argument(help="Folder of a study, as in edp search --out.")]
 
 
 app = typer.Typer(
-    cls=_RunByDefault,
+    cls=RunByDefault,
     no_args_is_help=True,
     rich_markup_mode="markdown",
-    help="Search for the network: phases, tests and a report. `edp search DATA --study DIR` is `edp search run ...`.",
+    help="Search for the network: phases, tests and a report. `edp search DATA --out DIR` is `edp search run ...`.",
 )
 
 
-@app.command(DEFAULT)
+@app.command(RUN)
 def run(
     context: typer.Context,
     data: LogsArgument,
-    study: Annotated[Path, typer.Option("--study", help="Folder of the study; an unfinished study continues.")],
+    study: Annotated[Path, typer.Option("--out", help="Folder of the study; an unfinished study continues.")],
     preset: Annotated[str, typer.Option(help="Extent of the search: quick, standard or thesis.")] = "quick",
     config: Annotated[
         Path | None, typer.Option(help="Settings (TOML) that override the preset, with [search].")
@@ -79,8 +61,10 @@ def run(
         ),
     ] = False,
     threads: Annotated[int, typer.Option(help="CPU threads per training (results depend on it).")] = 1,
-    seconds: Annotated[float | None, typer.Option(help="Time limit of a training, in seconds.")] = None,
-    memory: Annotated[float | None, typer.Option(help="Memory limit of a training, in MB.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--max-seconds", help="Time limit of a training, in seconds.")
+    ] = None,
+    memory: Annotated[float | None, typer.Option("--max-memory", help="Memory limit of a training, in MB.")] = None,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     as_json: JsonFlag = False,
@@ -91,9 +75,9 @@ def run(
 
     Stop it at any moment (Ctrl-C, or a power failure): the same command continues, and repeats no training.
 
-    Example: `edp search logs/ --study studies/first --preset quick`
+    Example: `edp search logs/ --out studies/first --preset quick`
 
-    Example: `edp search logs/ --study studies/first --phase screening --set search.features='["FG2", "own.toml"]'`
+    Example: `edp search logs/ --out studies/first --phase screening --set search.features='["FG2", "own.toml"]'`
     """
     from edp.workflows.search.plan import load_plan
     from edp.workflows.search.runner import Resources, run_search
@@ -101,7 +85,7 @@ def run(
     # JSON quotes the path as TOML wants it.
     changes = [*changes, f"search.compression.budget={json.dumps(str(budget))}"] if budget is not None else changes
     plan = load_plan(config, preset, changes)
-    check_effects(context, {"budget": plan.spec.compression.on})
+    check_effects(context, {"budget": plan.spec.compression.enabled})
     resources = Resources(
         count=workers,
         threads=threads,
@@ -213,8 +197,8 @@ def _deploying(result: SearchResult) -> str:
     facts = result.context.facts(SmallerFacts)
     run = result.networks.get("chosen", result.networks.get("teacher"))
     if facts.chosen is not None and facts.rows[facts.chosen].format == "w8a16":
-        return f"edp quantise {run} --out {result.folder / 'w8a16'}"
-    return f"edp export {run} --to c --out firmware/predictor"
+        return f"edp compress quantise {run} --out {result.folder / 'w8a16'}"
+    return f"edp export {run} --format c --out firmware/predictor"
 
 
 def _show_status(state: StudyStatus) -> None:

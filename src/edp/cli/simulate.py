@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, emit, err, format_time_left, out, progress, table
-from edp.cli.options import ClusterOption, OpenOption, WorkersOption, check_effects, workers_of
+from edp.cli.options import ClusterOption, OpenOption, WorkersOption, check_effects, parse_minutes, workers_of
 from edp.cli.progress import show_progress
 from edp.errors import count_of
 from edp.wording import figure, number
@@ -31,7 +31,13 @@ def simulate(
     ] = None,
     machine: Annotated[str | None, typer.Option(help="M22 (default), C14, or the path of a machine file.")] = None,
     minutes: Annotated[
-        float | None, typer.Option(help="Total length of all recordings, in minutes; default: 60.")
+        float | None,
+        typer.Option(
+            "--duration",
+            parser=parse_minutes,
+            metavar="TIME",
+            help="Total length of all recordings with a unit, such as 90min or 2h; default: 60min.",
+        ),
     ] = None,
     recordings: Annotated[int | None, typer.Option(help="Number of recordings; default: 30.")] = None,
     seed: Annotated[
@@ -73,7 +79,7 @@ def simulate(
 ) -> None:
     """Simulate recordings of an excavator: M22 in free air by default, or as a scenario file describes.
 
-    Example: `edp simulate data/m22 --minutes 90 --recordings 30 --seed 1`
+    Example: `edp simulate data/m22 --duration 90min --recordings 30 --seed 1`
 
     Example: `edp simulate data/c14 --scenario examples/scenarios/c14_soil.toml`
 
@@ -126,7 +132,7 @@ def simulate(
         out.print(f"{count_of(len(paths), 'recording')} of {what_simulated}, {figure(order.minutes)} min, in {folder}")
         for text in faults:
             out.print(f"fault: {text}")
-        out.print(f"next: edp inspect {folder}   or   edp train {folder} --out runs/first")
+        out.print(f"next: edp data check {folder}   or   edp train {folder} --out runs/first")
 
     emit(as_json, facts, show)
 

@@ -1,4 +1,4 @@
-"""``edp store``: logs read once into a data-set store that every command takes in their place."""
+"""``edp data store``: logs read once into a data-set store that every command takes in their place."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def build(
     Stopped and given again it goes on. Logs that are in the store and were not changed are not read again, changed ones
     replace what was stored of them. Logs that cannot be read are listed, and the exit code is then 3.
 
-    Example: `edp store build logs/ --map mine.toml --out store`, then `edp train store --out runs/first`
+    Example: `edp data store build logs/ --map mine.toml --out store`, then `edp train store --out runs/first`
     """
     source = source_of(data, signal_map, repair)
     with show_progress("store", as_json) as progress:
@@ -68,8 +68,8 @@ def build(
         raise typer.Exit(FAULTY)
 
 
-@app.command("check")
-def check(
+@app.command("verify")
+def verify(
     folder: Annotated[Path, typer.Argument(help="Folder of a store.")],
     as_json: JsonFlag = False,
 ) -> None:
@@ -77,7 +77,7 @@ def check(
 
     After a store was copied, commands do that each time they open it; this notes that the copy is sound.
 
-    Example: `edp store check store`
+    Example: `edp data store verify store`
     """
     from edp.logs.store import check_store
 
@@ -111,6 +111,6 @@ def _show(index: StoreIndex, folder: Path, as_json: bool) -> None:
             if len(index.refused) > MAX_REFUSED:
                 out.print(f"and {len(index.refused) - MAX_REFUSED} more")
         if index.recordings:
-            out.print(f"next: edp inspect {folder}; edp train {folder} --out runs/first")
+            out.print(f"next: edp data check {folder}; edp train {folder} --out runs/first")
 
     emit(as_json, facts, show)

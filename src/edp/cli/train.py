@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from edp.cli import finetune, pretrain
 from edp.cli.console import JsonFlag, duration, emit, err, out, table
+from edp.cli.groups import RUN, RunByDefault
 from edp.cli.options import (
     MAX_WORKERS,
     ClusterOption,
@@ -18,6 +21,8 @@ from edp.cli.options import (
     OpenOption,
     RepairOption,
     check_effects,
+    complete_from,
+    parse_minutes,
     source_of,
     workers_of,
 )
@@ -30,27 +35,59 @@ if TYPE_CHECKING:
     from edp.report.run.choice import AutoChoice
     from edp.training import Bundle
 
+
+class Focus(StrEnum):
+    """Purpose of a trained model. `edp.cli.names` turns `simulation` into the command `edp twin`."""
+
+    PREDICTION = "prediction"
+    SIMULATION = "simulation"
+
+
 AUTO = "auto"
 """`edp.config.experiment.AUTO`, known here without loading that module."""
 MAX_EXPECTED = 12
 """Outputs of which the terminal says what to expect; the report has all."""
 
 
+app = typer.Typer(
+    cls=RunByDefault,
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="Train a model on recordings. `edp train DATA --out RUN` is `edp train run ...`.",
+)
+app.command("finetune")(finetune.finetune)
+app.command("pretrain")(pretrain.pretrain)
+
+
+@app.command(RUN)
 def train(
     context: typer.Context,
     data: LogsArgument,
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
+    focus: Annotated[
+        Focus,
+        typer.Option(
+            help="prediction: a network that predicts some samples ahead. simulation: a plant model that runs on "
+            "commands alone, with the options of edp twin."
+        ),
+    ] = Focus.PREDICTION,
     config: Annotated[Path | None, typer.Option(help="Settings (TOML) that override the preset.")] = None,
     preset: Annotated[
         str | None,
         typer.Option(
-            help="auto tries several models and keeps the best; quick, small, committee, standard, thesis, "
+            autocompletion=complete_from("edp.config.experiment", "PRESET_NAMES"),
+            help="auto tries several models and keeps the best; quick, small, ensemble, standard, thesis, "
             "pressures, positions. "
-            "Default: auto, or standard where the settings name a network or how to train it."
+            "Default: auto, or standard where the settings name a network or how to train it.",
         ),
     ] = None,
-    minutes: Annotated[
-        float | None, typer.Option(help="Of the preset auto: processor time to spend on training; default 5.")
+    time_budget: Annotated[
+        float | None,
+        typer.Option(
+            parser=parse_minutes,
+            metavar="TIME",
+            help="Processor time of the preset auto with a unit, such as 30min; default: 5min.",
+        ),
     ] = None,
     changes: Annotated[list[str], typer.Option("--set", help="One setting, for example training.epochs=10.")] = [],  # noqa: B006
     signal_map: MapOption = None,
@@ -74,9 +111,9 @@ def train(
 
     source = source_of(data, signal_map, repair)
     preset = preset or usual_preset(config, changes)
-    check_effects(context, dict.fromkeys(("minutes", "workers", "cluster"), preset == AUTO))
+    check_effects(context, dict.fromkeys(("time_budget", "workers", "cluster"), preset == AUTO))
     if preset == AUTO:
-        own = [] if minutes is None else [f"auto.minutes={minutes!r}"]
+        own = [] if time_budget is None else [f"auto.time_budget_min={time_budget!r}"]
         divided = workers_of(workers, cluster, open_cluster, usual=0)
         _train_auto(source, folder, config, [*changes, *own], divided, as_json)
         return
@@ -106,8 +143,8 @@ def _train_auto(
 
     settings = load_auto(config, changes)
     if not quiet:
-        limit = f"{figure(settings.auto.minutes)} min"
-        err.print(f"train: reads the logs, then trains for at most about {limit} of processor time (--minutes)")
+        limit = f"{figure(settings.auto.time_budget_min)} min"
+        err.print(f"train: reads the logs, then trains for at most about {limit} of processor time (--time-budget)")
     with show_progress("train", quiet) as progress:
         result = train_auto(source, settings, folder, progress, workers)
     facts = {"run": str(folder), "bundle": str(folder / "bundle"), **result.choice.to_table()}

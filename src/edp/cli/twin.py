@@ -19,6 +19,7 @@ from edp.cli.options import (
     OpenOption,
     RepairOption,
     check_effects,
+    parse_minutes,
     source_of,
     within,
     workers_of,
@@ -48,11 +49,13 @@ def twin(
     workers: Annotated[int, typer.Option(min=0, max=MAX_WORKERS, help="Parallel trainings; 0: one for each core.")] = 0,
     cluster: ClusterOption = "",
     open_cluster: OpenOption = False,
-    minutes: Annotated[
+    time_budget: Annotated[
         float | None,
         typer.Option(
+            parser=parse_minutes,
+            metavar="TIME",
             callback=within(span(MIN_MINUTES, MAX_MINUTES)),
-            help="Of a choice without twin.kind: processor time of its networks at most; default: no bound.",
+            help="Maximum processor time of the networks without twin.kind, such as 30min; default: no bound.",
         ),
     ] = None,
     as_json: JsonFlag = False,
@@ -76,12 +79,12 @@ def twin(
 
     experiment = load_twin_experiment(config, changes)
     effects = {
-        "minutes": has_choice(experiment) and start is None,
+        "time_budget": has_choice(experiment) and start is None,
         **dict.fromkeys(("workers", "cluster"), trains_several(experiment) or start is not None),
     }
     check_effects(context, {name: effect and not experiment.ground for name, effect in effects.items()})
-    if minutes is not None:
-        experiment = limit_processor_time(experiment, minutes)
+    if time_budget is not None:
+        experiment = limit_processor_time(experiment, time_budget)
     divided = workers_of(workers, cluster, open_cluster, usual=0)
     with show_progress("twin", as_json) as progress:
         source = source_of(data, signal_map, repair)
@@ -110,7 +113,7 @@ def twin(
         out.print(f"trained in {duration(seconds)} of processor time; twin in {folder / 'twin'}")
         if is_file_at(folder / "datasheet.txt"):
             out.print(f"numbers of the machine with units and intervals in {folder / 'datasheet.txt'}")
-        out.print(f"next: edp report {folder}, or edp rollout {folder} LOG --seconds 60")
+        out.print(f"next: edp report {folder}, or edp rollout {folder} LOG --rollout-seconds 60")
 
     emit(as_json, facts, show)
     end_with(verdict)
@@ -136,7 +139,10 @@ def rollout(
     run: Annotated[Path, typer.Argument(help="Run folder of edp twin.")],
     log: Annotated[Path, typer.Argument(help="One log.")],
     seconds: Annotated[
-        float, typer.Option(callback=within(above(0.0, MAX_SECONDS)), help="Length of the free run.")
+        float,
+        typer.Option(
+            "--rollout-seconds", callback=within(above(0.0, MAX_SECONDS)), help="Length of the simulation, in seconds."
+        ),
     ] = 60.0,
     start_s: Annotated[
         float | None,
@@ -161,7 +167,7 @@ def rollout(
     Prints the error by the time since then. Channels of the written file that end in _twin are the twin's, those
     that end in _twin_low and _twin_high are its intervals.
 
-    Example: `edp rollout runs/twin logs/monday.parquet --seconds 60 --from 12.5 --out monday_free.parquet`
+    Example: `edp rollout runs/twin logs/monday.parquet --rollout-seconds 60 --from 12.5 --out monday_free.parquet`
     """
     from edp.evaluation.beyond import describe_excess
     from edp.workflows.twin import RolloutRequest, rollout_log

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TypeVar
@@ -10,6 +10,7 @@ from typing import TypeVar
 from edp.config.experiment import SETTINGS, Change, Experiment, read_layers
 from edp.errors import ConfigError, closest
 from edp.settings.bounds import shown
+from edp.settings.earlier_keys import earlier
 from edp.settings.tree import SettingsTree, merged
 
 TRAINING_TABLES = tuple(entry.name for entry in fields(Experiment))
@@ -48,11 +49,13 @@ def command_settings(
     for key in (key for layer in layers for key in layer):
         if key not in known_tables:
             # A key of the command's own table is easily given without its name.
-            own = key in (entry.name for entry in fields(spec))  # type: ignore[arg-type]
+            own = key in (*(entry.name for entry in fields(spec)), *earlier(spec))  # type: ignore[arg-type]
             hint = f"; did you mean '{command}.{key}'?" if own else closest(key, known_tables)
             raise ConfigError(f"settings {where}: unknown key {shown(key)}{hint}")
     table: dict[str, object] = {}
     for layer in layers:
-        table = merged(table, {key: value for key, value in layer.items() if key == command})
+        given = layer.get(command)
+        present = tree.renamed(spec, given, command) if isinstance(given, Mapping) else given
+        table = merged(table, {command: present} if command in layer else {})
     rest = tuple({key: value for key, value in layer.items() if key != command} for layer in layers)
     return tree.build(spec, table.get(command, {}), where, command), tuple(layer for layer in rest if layer)

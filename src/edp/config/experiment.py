@@ -72,21 +72,33 @@ SETTINGS = SettingsTree(
 """Reads and writes the tables of an experiment and of its parts."""
 build = SETTINGS.build
 plain_tree = SETTINGS.to_dict
-PRESETS = ("quick", "small", "committee", "standard", "thesis", "pressures", "positions")
+PRESETS = ("quick", "small", "ensemble", "standard", "thesis", "pressures", "positions")
+EARLIER_PRESETS = {"committee": "ensemble"}
+"""Presets of earlier versions, and the presets that replace them."""
 AUTO = "auto"
 """The preset that leaves network and training to `edp.workflows.auto`; it is no experiment by itself."""
+PRESET_NAMES = (AUTO, *PRESETS)
 
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureSettings:
-    """A user's own feature set; see `edp.data.features.FeatureSet`."""
+    """A user's own feature set; see `edp.data.features.FeatureSet`.
+
+    Attributes:
+        name: name of the set in reports.
+        channels: logged channels that the network reads, in order.
+        derived: channels that are computed sample by sample inside the model, appended in order.
+        hidden: logged channels that serve as sources of derived channels only.
+        init_channels: logged channels that are read in the first samples after a reset only, as initial state.
+        init_samples: number of samples after a reset in which `init_channels` are read.
+    """
 
     name: str = "own"
     channels: tuple[str, ...] = ()
     derived: tuple[Derived, ...] = ()
     hidden: tuple[str, ...] = ()
-    starting: tuple[str, ...] = ()
-    starting_ticks: int = 5
+    init_channels: tuple[str, ...] = ()
+    init_samples: int = 5
 
     def __post_init__(self) -> None:
         FeatureSet(**{entry.name: getattr(self, entry.name) for entry in fields(self)})
@@ -143,14 +155,14 @@ class Experiment:
         split: division of the recordings.
         model: the network.
         training: settings of the training.
-        judge: settings of the evaluation.
+        evaluation: settings of the evaluation.
     """
 
     task: TaskSettings = field(default_factory=TaskSettings)
     split: SplitSpec = field(default_factory=ByRecording)
     model: ModelSpec = field(default_factory=ModelSpec)
     training: TrainingSpec = field(default_factory=TrainingSpec)
-    judge: JudgeSpec = field(default_factory=JudgeSpec)
+    evaluation: JudgeSpec = field(default_factory=JudgeSpec)
 
 
 def load_experiment(
@@ -194,9 +206,13 @@ def read_layers(path: str | Path | None = None, overrides: Sequence[Change] = ()
         ConfigError: a file or an override that cannot be read.
     """
     # Files named in settings lie beside the settings file, files named on the command line in the working directory.
-    first = [] if path is None else [embed_feature_set(read_toml(path), Path(path).parent)]
-    every = combined([embed_feature_set(override(change), Path()) for change in overrides])
+    first = [] if path is None else [embed_feature_set(_renamed(read_toml(path)), Path(path).parent)]
+    every = combined([embed_feature_set(_renamed(override(change)), Path()) for change in overrides])
     return first + ([every] if every else [])
+
+
+def _renamed(table: Mapping[str, object]) -> dict[str, object]:
+    return SETTINGS.renamed(Experiment, table)
 
 
 def preset_table(name: str) -> dict[str, object]:
@@ -205,6 +221,7 @@ def preset_table(name: str) -> dict[str, object]:
     Raises:
         ConfigError: there is none of this name.
     """
+    name = EARLIER_PRESETS.get(name, name)
     if name not in (*PRESETS, AUTO):
         raise ConfigError(f"there is no preset '{name}'{closest(name, (*PRESETS, AUTO))}")
     text = resources.files("edp.config").joinpath(f"presets/{name}.toml").read_text(encoding="utf-8")

@@ -46,7 +46,7 @@ class DictionarySpec:
         draws: sessions of each fault and size; two at least, so that some are left out.
         before_s: length of a session before its fault, s.
         after_s: length of a session after the onset, s.
-        minutes: processor time, min. A draw that would exceed it is not started, except for the first two.
+        time_budget_min: processor time, min. A draw that would exceed it is not started, except for the first two.
         kinds: kinds of faults; empty for all.
 
     Raises:
@@ -57,7 +57,7 @@ class DictionarySpec:
     draws: int = 3
     before_s: float = 8.0
     after_s: float = 60.0
-    minutes: float = 15.0
+    time_budget_min: float = 15.0
     kinds: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -67,7 +67,7 @@ class DictionarySpec:
             draws=integer(2, 100),
             before_s=span(0.0, 3600.0),
             after_s=span(20.0, 3600.0),
-            minutes=span(MIN_MINUTES, 1e5),
+            time_budget_min=span(MIN_MINUTES, 1e5),
         )
         check_count("dictionary", "kinds", self.kinds, MAX_NAMES)
 
@@ -83,8 +83,9 @@ class MonitorExperiment:
         channels: names of the channels that are watched; empty takes all that sensors can give.
         groups: names of channels that virtual sensors judge together; empty where names and kinds are to tell.
         hours_per_false_alarm: operating hours to one false alarm that are promised.
-        train_share: share of the healthy sessions that residuals are fitted to; the others set conditioning and limit.
-        minutes: processor time that fits of networks may take, about.
+        train_fraction: share of the healthy sessions that residuals are fitted to; the others set conditioning and
+            limit.
+        time_budget_min: processor time that fits of networks may take, about.
         seed: root of every random choice.
 
     Raises:
@@ -97,8 +98,8 @@ class MonitorExperiment:
     channels: tuple[str, ...] = ()
     groups: tuple[tuple[str, ...], ...] = ()
     hours_per_false_alarm: float = 8.0
-    train_share: float = 0.35
-    minutes: float = 5.0
+    train_fraction: float = 0.35
+    time_budget_min: float = 5.0
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -106,8 +107,8 @@ class MonitorExperiment:
             "monitor",
             self,
             hours_per_false_alarm=above(0.0, 1e6),
-            train_share=between(0.0, 1.0),
-            minutes=span(MIN_MINUTES, 1e5),
+            train_fraction=between(0.0, 1.0),
+            time_budget_min=span(MIN_MINUTES, 1e5),
             seed=SEED,
         )
         check_count("monitor", "channels", self.channels, MAX_NAMES)

@@ -35,7 +35,7 @@ class TwinExperiment:
         split: division of the recordings.
         twin: the formulation, or the choice among several.
         training: settings of a training on free runs.
-        judge: settings of the evaluation.
+        evaluation: settings of the evaluation.
         ground: law of the ground that a grey box of free air learns from recordings in soil; empty: none.
     """
 
@@ -43,15 +43,15 @@ class TwinExperiment:
     split: SplitSpec = field(default_factory=ByRecording)
     twin: TwinSpec | AutoTwin = field(default_factory=AutoTwin)
     training: FreeRunSpec = field(default_factory=FreeRunSpec)
-    judge: FreeRunJudgeSpec = field(default_factory=FreeRunJudgeSpec)
+    evaluation: FreeRunJudgeSpec = field(default_factory=FreeRunJudgeSpec)
     ground: str = ""
 
     def __post_init__(self) -> None:
-        for name in self.judge.floors:
+        for name in self.evaluation.baselines:
             try:
                 _ = TWINS[name]
             except ConfigError as error:
-                raise ConfigError(f"judge.floors: {error}") from None
+                raise ConfigError(f"evaluation.baselines: {error}") from None
         if self.ground and self.ground not in GROUNDS:
             raise ConfigError(
                 f"ground = '{self.ground[:80]}' is unknown{closest(self.ground, GROUNDS)}; leave it out for free air"
@@ -80,7 +80,7 @@ def limit_processor_time(experiment: TwinExperiment, minutes: float) -> TwinExpe
     """
     if not isinstance(experiment.twin, AutoTwin):
         return experiment
-    return replace(experiment, twin=replace(experiment.twin, minutes=minutes))
+    return replace(experiment, twin=replace(experiment.twin, time_budget_min=minutes))
 
 
 def has_choice(experiment: TwinExperiment) -> bool:

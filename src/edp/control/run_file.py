@@ -90,7 +90,7 @@ class ControlFile(ResultFile):
     NAME = "results.json"
     SCHEMA = 1
     WHAT = "results of closed loops"
-    ADVICE = "remove the run folder and run edp control"
+    ADVICE = "remove the run folder and run edp loop run"
 
     edp: str
     sentence: str

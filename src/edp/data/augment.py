@@ -62,20 +62,20 @@ class WindowShift:
     """Inputs read some samples earlier or later than their targets, as of a log whose delay is not known exactly.
 
     Attributes:
-        most: largest shift in samples, either way.
+        max_shift: largest shift in samples, either way.
 
     Raises:
         ConfigError: most below 1.
     """
 
-    most: int = 2
+    max_shift: int = 2
 
     def __post_init__(self) -> None:
-        check_bounds("window_shift", self, most=integer(1, MOST_TICKS))
+        check_bounds("window_shift", self, max_shift=integer(1, MOST_TICKS))
 
     def apply(self, part: Series, deviation: NDArray[np.float32], rng: np.random.Generator) -> Series:
         """Shift all inputs alike; the rows that are missing at one end repeat the last there."""
-        shift = int(rng.integers(-self.most, self.most + 1))
+        shift = int(rng.integers(-self.max_shift, self.max_shift + 1))
         rows = np.clip(np.arange(part.samples) + shift, 0, part.samples - 1)
         return replace(part, inputs=part.inputs[rows])
 

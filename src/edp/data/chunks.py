@@ -31,7 +31,8 @@ class ChunkSpec:
         burn_in: samples after a reset that give no loss (chunk regime).
         consecutive: windows that end at consecutive samples and are drawn together, for terms of the loss that
             compare neighbours (window regime).
-        carried: chunks that a stream is carried on before it starts again (chunk regime); where the data do not fill
+        reset_after_chunks: chunks that a stream is carried on before it starts again (chunk regime); where the data do
+        not fill
             all lanes they are walked again, cut elsewhere. 0: at least 8, and at most an even share of a lane.
 
     Raises:
@@ -43,7 +44,7 @@ class ChunkSpec:
     batch: int = 16
     burn_in: int = 50
     consecutive: int = 1
-    carried: int = 0
+    reset_after_chunks: int = 0
 
     def __post_init__(self) -> None:
         if self.regime not in ("chunk", "window"):
@@ -55,22 +56,22 @@ class ChunkSpec:
             batch=integer(1, MAX_BATCH),
             burn_in=integer(0, MOST_TICKS),
             consecutive=integer(1, MAX_BATCH),
-            carried=integer(0, MAX_BATCH),
+            reset_after_chunks=integer(0, MAX_BATCH),
         )
         if self.batch % self.consecutive:
             raise ConfigError(
                 f"chunks: consecutive = {self.consecutive}, batch = {self.batch}; consecutive of at least 1 and a "
                 "batch that is a multiple of it must hold"
             )
-        if self.carried and self.regime == "window":
+        if self.reset_after_chunks and self.regime == "window":
             raise ConfigError(
-                f"chunks: carried = {self.carried} with regime = '{self.regime}'; at least 0, and 0 for windows, which "
-                "all start anew, must hold"
+                f"chunks: reset_after_chunks = {self.reset_after_chunks} with regime = '{self.regime}'; expected 0, "
+                "since each window starts from a reset"
             )
-        if self.carried and self.carried * self.length <= self.burn_in:
+        if self.reset_after_chunks and self.reset_after_chunks * self.length <= self.burn_in:
             raise ConfigError(
-                f"chunks: carried = {self.carried} chunks of {self.length} ticks are no longer than burn_in = "
-                f"{self.burn_in}, so no tick would have a loss; make one of them longer"
+                f"chunks: reset_after_chunks = {self.reset_after_chunks} chunks of {self.length} ticks are no longer "
+                f"than burn_in = {self.burn_in}, so no tick would have a loss; make one of them longer"
             )
         if self.consecutive > 1 and self.regime == "chunk":
             raise ConfigError(
@@ -175,9 +176,9 @@ class ChunkSampler:
         # At least a few chunks per piece, and twice the burn-in: a piece that is no longer than it would never end.
         least = max(8, -(-2 * self.spec.burn_in // length))
         # At most an even share of a lane.
-        piece = (self.spec.carried or max(least, -(-total // (lanes * length * 4)))) * length
+        piece = (self.spec.reset_after_chunks or max(least, -(-total // (lanes * length * 4)))) * length
         pieces = list(self._pieces(rng, piece))
-        while self.spec.carried and len(pieces) < lanes:  # Short data are walked again, cut elsewhere.
+        while self.spec.reset_after_chunks and len(pieces) < lanes:  # Short data are walked again, cut elsewhere.
             pieces += self._pieces(rng, piece)
         queue = [pieces[i] for i in rng.permutation(len(pieces))]
         plan: list[list[tuple[int, int, int]]] = [[] for _ in range(lanes)]
@@ -296,7 +297,7 @@ def _ticks(lane: list[tuple[int, int, int]]) -> int:
 
 
 def stack(rows: list[Piece], resets: list[bool]) -> Batch:
-    """Return the pieces side by side."""
+    """Return the segments side by side."""
     *columns, strategy_columns = zip(*rows, strict=True)
     inputs, future, valid = (np.stack(parts) for parts in columns)
     return Batch(

@@ -79,8 +79,8 @@ def is_even(
 
 def _shares(split: ByRecording | ByTime | ByBlocks) -> dict[str, float]:
     """Return the fraction of the data for training, validation and test."""
-    test = 1 / split.every if isinstance(split, ByBlocks) else split.test_share
-    validation = split.validation_share * (1 - test if isinstance(split, ByBlocks) else 1)
+    test = 1 / split.every if isinstance(split, ByBlocks) else split.test_fraction
+    validation = split.validation_fraction * (1 - test if isinstance(split, ByBlocks) else 1)
     return {"train": 1 - validation - test, "validation": validation, "test": test}
 
 

@@ -1,4 +1,4 @@
-"""Feature sets as TOML files, written by `edp screen` or by the user and read by `task.features`."""
+"""Feature sets as TOML files, written by `edp data screen` or by the user and read by `task.features`."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def set_text(
     for derived in features.derived:
         facts = {"name": derived.name, "source": derived.source, "how": derived.how, "kind": str(derived.kind)}
         lines += ["", "[[derived]]", *(f"{key} = {_text(value)}" for key, value in facts.items())]
-        lines += [] if derived.seconds is None else [f"seconds = {derived.seconds!r}"]
+        lines += [] if derived.span_s is None else [f"span_s = {derived.span_s!r}"]
     lines += ["", *(_comment(line) for line in tail)] if tail else []
     return "\n".join(lines) + "\n"
 

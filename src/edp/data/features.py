@@ -66,30 +66,30 @@ class Derived:
         source: the logged channel that it comes from.
         how: a registered derivation.
         kind: physical quantity.
-        seconds: span that it looks back, for derivations that take one; rounded to ticks of the task's rate.
+        span_s: span that it looks back, for derivations that take one; rounded to ticks of the task's rate.
     """
 
     name: str
     source: str
     how: str = "difference"
     kind: Kind = Kind.GENERIC
-    seconds: float | None = None
+    span_s: float | None = None
 
     def __post_init__(self) -> None:
         least = DERIVATIONS[self.how].least_ticks  # an unknown name fails here, with the closest one
-        if least and self.seconds is None:
+        if least and self.span_s is None:
             raise ConfigError(
-                f"derived '{self.name}': how = '{self.how}' looks back over a span; give it, for example seconds = 0.1"
+                f"derived '{self.name}': how = '{self.how}' looks back over a span; give it, for example span_s = 0.1"
             )
-        if not least and self.seconds is not None:
+        if not least and self.span_s is not None:
             timed = [f"'{name}'" for name in DERIVATIONS if DERIVATIONS[name].least_ticks]
             raise ConfigError(
-                f"derived '{self.name}': seconds = {setting_text(self.seconds)} came with how = '{self.how}', which "
+                f"derived '{self.name}': span_s = {setting_text(self.span_s)} came with how = '{self.how}', which "
                 "has no span; "
                 f"leave it out, or take {' or '.join(timed)}"
             )
-        if self.seconds is not None:
-            check_bounds(f"derived '{self.name}'", self, seconds=above(0.0, MAX_SECONDS))
+        if self.span_s is not None:
+            check_bounds(f"derived '{self.name}'", self, span_s=above(0.0, MAX_SECONDS))
 
     def ticks(self, rate_hz: float) -> int:
         """Return how many ticks it looks back at a rate, n of its derivation; 1 where it takes no span.
@@ -97,13 +97,13 @@ class Derived:
         Raises:
             ConfigError: a span shorter than the derivation allows, or longer than `MAX_LAG`.
         """
-        if self.seconds is None:
+        if self.span_s is None:
             return 1
-        exact, least = self.seconds * rate_hz, DERIVATIONS[self.how].least_ticks
+        exact, least = self.span_s * rate_hz, DERIVATIONS[self.how].least_ticks
         # A hair below, so that 0.03 s at 100 Hz, which floats make 2.9999 ticks, are 3.
         if exact < least - ROUNDING or round(exact) > MAX_LAG:
             raise ConfigError(
-                f"derived '{self.name}': seconds = {setting_text(self.seconds)} are {typed(exact)} ticks at "
+                f"derived '{self.name}': span_s = {setting_text(self.span_s)} are {typed(exact)} ticks at "
                 f"{typed(rate_hz)} Hz; from "
                 f"{least} to {MAX_LAG} ticks must hold for how = '{self.how}': choose from {typed(least / rate_hz)} "
                 "to "
@@ -125,23 +125,23 @@ class FeatureSet:
         channels: logged channels, in order; these are the inputs of a bundle, in SI units.
         derived: channels computed inside the predictor, appended in order.
         hidden: logged channels that only serve as sources of derived ones; inputs, but not features.
-        starting: logged channels that are read in the first ticks after a reset only, so that a free run starts from
-            a measured state; with them comes the feature `STARTING`, 1 while they are read and 0 from then on.
-        starting_ticks: number of samples for which the start-up channels are read.
+        init_channels: logged channels that are read in the first ticks after a reset only, so that a free run starts
+            from a measured state; with them comes the feature `STARTING`, 1 while they are read and 0 from then on.
+        init_samples: number of samples for which the start-up channels are read.
     """
 
     name: str
     channels: tuple[str, ...]
     derived: tuple[Derived, ...] = ()
     hidden: tuple[str, ...] = ()
-    starting: tuple[str, ...] = ()
-    starting_ticks: int = 5
+    init_channels: tuple[str, ...] = ()
+    init_samples: int = 5
 
     def __post_init__(self) -> None:
-        check_bounds(f"feature set '{self.name}'", self, starting_ticks=integer(1, MOST_TICKS))
-        for part in ("channels", "derived", "hidden", "starting"):
+        check_bounds(f"feature set '{self.name}'", self, init_samples=integer(1, MOST_TICKS))
+        for part in ("channels", "derived", "hidden", "init_channels"):
             check_count(f"feature set '{self.name}'", part, getattr(self, part), MAX_NAMES)
-        names = [*self.channels, *self.starting, *self.hidden, *(d.name for d in self.derived)]
+        names = [*self.channels, *self.init_channels, *self.hidden, *(d.name for d in self.derived)]
         twice = sorted(name for name, count in Counter(names).items() if count > 1)
         if twice:
             raise ConfigError(f"feature set '{self.name}' names {', '.join(twice)} twice; keep one entry each")
@@ -156,13 +156,13 @@ class FeatureSet:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Logged channels that are read at each sample; channels of `starting` are used in the first samples only."""
-        return self.channels + self.hidden + self.starting
+        """Logged channels that are read at each sample; those of `init_channels` count in the first samples only."""
+        return self.channels + self.hidden + self.init_channels
 
     @property
     def features(self) -> tuple[str, ...]:
         """Features in network order: channels, derived channels, initialisation inputs."""
-        return self.lasting + self.starting + ((STARTING,) if self.starting else ())
+        return self.lasting + self.init_channels + ((STARTING,) if self.init_channels else ())
 
     @property
     def lasting(self) -> tuple[str, ...]:

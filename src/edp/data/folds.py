@@ -60,7 +60,7 @@ def make_block_folds(lengths: Sequence[int], folds: int, gap: int, pieces: int =
     if total < folds * FEWEST_ROWS:
         raise DataError(
             f"cross-validation: {total} rows for {folds} folds; each fold needs {FEWEST_ROWS}: record longer, or, "
-            "where training.bagging.folds is among your settings, take fewer folds"
+            "where training.ensemble.folds is among your settings, take fewer folds"
         )
     # Contiguous: rows drawn one by one would share history and future with those that are left out.
     piece = np.arange(total) * (folds * pieces) // total

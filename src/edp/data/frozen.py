@@ -47,37 +47,38 @@ class ByFrozen:
 
     Attributes:
         test: frozen sessions that test: the first sealed test set of the search.
-        second: frozen sessions of the second sealed test set, for what is compressed; left out of all parts otherwise.
+        second_test: frozen sessions of the second sealed test set, for what is compressed; left out of all parts
+            otherwise.
         validation: development sessions that validate.
         train: development sessions that train.
         study: folder of the search, whose ledger records each look at the second sealed test set.
-        missing: action if a frozen session is not among the recordings: ``refuse``, or ``draw`` for other data.
+        on_missing: action if a frozen session is not among the recordings: ``error``, or ``resample`` for other data.
             ``draw`` tests on a fraction of the remaining recordings, and also validates on them if no session of
             `validation` is present.
-        validation_share: share that is drawn to validate.
-        test_share: share that is drawn to test.
+        validation_fraction: share that is drawn to validate.
+        test_fraction: share that is drawn to test.
         seed: random seed of the draw.
 
     Raises:
-        ConfigError: a session in two parts, or an unknown `missing`.
+        ConfigError: a session in two parts, or an unknown `on_missing`.
     """
 
     test: tuple[Session, ...] = ()
-    second: tuple[Session, ...] = ()
+    second_test: tuple[Session, ...] = ()
     validation: tuple[Session, ...] = ()
     train: tuple[Session, ...] = ()
     study: str = ""
-    missing: str = "refuse"
-    validation_share: float = 0.15
-    test_share: float = 0.2
+    on_missing: str = "error"
+    validation_fraction: float = 0.15
+    test_fraction: float = 0.2
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_bounds("split", self, seed=SEED, validation_share=PART, test_share=PART)
-        if self.missing not in ("refuse", "draw"):
-            raise ConfigError(f"split: missing = {shown(self.missing)}; 'refuse' or 'draw' must hold")
+        check_bounds("split", self, seed=SEED, validation_fraction=PART, test_fraction=PART)
+        if self.on_missing not in ("error", "resample"):
+            raise ConfigError(f"split: on_missing = {shown(self.on_missing)}; expected 'error' or 'resample'")
         part_of: dict[str, str] = {}
-        for part in ("test", "second", "validation", "train"):
+        for part in ("test", "second_test", "validation", "train"):
             for session in getattr(self, part):
                 other = part_of.setdefault(session.digest, part)
                 if other != part:
@@ -88,7 +89,7 @@ class ByFrozen:
     @property
     def frozen(self) -> dict[str, str]:
         """Names of all frozen sessions by digest."""
-        return {session.digest: session.name for session in (*self.test, *self.second)}
+        return {session.digest: session.name for session in (*self.test, *self.second_test)}
 
     def opened(self) -> ByFrozen:
         """Return the split with the second sealed test set in place of the test sessions.
@@ -96,9 +97,9 @@ class ByFrozen:
         Raises:
             ConfigError: the search set no second sealed test set apart.
         """
-        if not self.second:
+        if not self.second_test:
             raise ConfigError("split: the search set no second sealed test set apart, so it cannot be opened")
-        return replace(self, test=self.second, second=self.test)
+        return replace(self, test=self.second_test, second_test=self.test)
 
     def split(self, recordings: Sequence[Recording], gap: int) -> Split:
         """Divide by content; `gap` is not needed between whole recordings.
@@ -122,7 +123,7 @@ class ByFrozen:
         free = [
             i for i, recording in enumerate(recordings) if recording.digest not in self.frozen and i not in validation
         ]
-        if self.missing == "draw" or not validation:
+        if self.on_missing == "resample" or not validation:
             return self._draw_parts(recordings, free, test, validation, gap)
         return _whole(recordings, {"train": free, "validation": validation, "test": test})
 
@@ -134,8 +135,8 @@ class ByFrozen:
         # The second sealed test set stays out of the draw.
         names = {i: recordings[i].name for i in (*free, *validation, *test)}
         rule = ByRecording(
-            validation_share=self.validation_share,
-            test_share=self.test_share,
+            validation_fraction=self.validation_fraction,
+            test_fraction=self.test_fraction,
             seed=self.seed,
             validation=tuple(names[i] for i in validation),
             test=tuple(names[i] for i in test),
@@ -151,7 +152,7 @@ class ByFrozen:
     def _check_there(self, recordings: Sequence[Recording], there: Mapping[str, int]) -> None:
         """Refuse data that lack a frozen session, unless other data are expected."""
         lacking = {digest: name for digest, name in self.frozen.items() if digest not in there}
-        if self.missing == "draw" or not lacking:
+        if self.on_missing == "resample" or not lacking:
             return
         by_name = {recording.name: recording for recording in recordings}
         changed = [name for name in lacking.values() if name in by_name]
@@ -160,7 +161,7 @@ class ByFrozen:
             f"split: {len(lacking)} of {len(self.frozen)} frozen sessions of the search are missing: "
             f"{', '.join(sorted(lacking.values()))}; {how} (hash {next(iter(lacking))} is wanted for "
             f"'{next(iter(lacking.values()))}'). What was changed could train unseen: restore the recordings and read "
-            "them with the same signal map, or, for other data, --set split.missing=draw"
+            "them with the same signal map, or, for other data, --set split.on_missing=draw"
         )
 
 
@@ -198,7 +199,7 @@ def keep_frozen(before: SplitSpec, after: SplitSpec) -> None:
     if lost:
         raise ConfigError(
             f"the run comes from a search, and --set split lets go of {len(lost)} of its frozen sessions; they stay "
-            "frozen: leave the change out, or, for other data, --set split.missing=draw"
+            "frozen: leave the change out, or, for other data, --set split.on_missing=draw"
         )
 
 
@@ -241,7 +242,7 @@ def _whole(recordings: Sequence[Recording], parts: Mapping[str, Sequence[int]]) 
         if not places:
             raise DataError(
                 f"split: no recording is left for {part}; {len(recordings)} recording(s) given. Give the recordings of "
-                "the search, or, for other data, --set split.missing=draw"
+                "the search, or, for other data, --set split.on_missing=draw"
             )
     stretches = {
         part: tuple(Stretch(i, 0, recordings[i].samples) for i in sorted(places)) for part, places in parts.items()

@@ -178,7 +178,7 @@ def read_stored_columns(
     places = [recording.index(name) for name in sources]
     if all(name not in entries for name in names):
         return on_demand(recording.values[slice(*rows)], places)
-    spans = [entries[name].seconds is not None for name in names if name in entries]
+    spans = [entries[name].span_s is not None for name in names if name in entries]
     if any(spans):
         columns = [
             derive(entries[name], recording.column(source), recording.rate_hz)

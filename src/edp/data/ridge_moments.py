@@ -76,7 +76,7 @@ def moments_of(series: Sequence[Series], task: LagTask, standard: Standard) -> R
     check_setting(
         4 * 8 * (lags * inputs) ** 2,  # the matrix, its corrections and two halves, as doubles
         f"a regression on {lags:,} ticks of {inputs:,} inputs",
-        "take fewer taps of linear_bypass or a shorter judge.history, or fewer channels",
+        "take fewer taps of linear_bypass or a shorter evaluation.history, or fewer channels",
     )
     first = np.zeros((lags, inputs + task.outputs, inputs))
     edges = np.zeros(((lags - 1) * inputs, (lags - 1) * inputs))

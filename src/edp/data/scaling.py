@@ -52,7 +52,7 @@ def least_spread(kind: Kind, largest: float) -> float:
 def feature_matrix(task: Task, series: Series) -> NDArray[np.float32]:
     """Return the features of a whole segment, ``(time, feature)``, with initialisation inputs at every sample."""
     inputs = task.features.inputs
-    if not task.features.derived and not task.features.starting:
+    if not task.features.derived and not task.features.init_channels:
         return series.inputs[:, : len(task.features.channels)]
     own = len(task.features.channels)
     # Filled in place: columns that are stacked one by one take five times as long.
@@ -60,9 +60,9 @@ def feature_matrix(task: Task, series: Series) -> NDArray[np.float32]:
     features[:, :own] = series.inputs[:, :own]
     for column, entry in enumerate(task.features.derived, own):
         features[:, column] = derive(entry, series.inputs[:, inputs.index(entry.source)], task.rate_hz)
-    for column, name in enumerate(task.features.starting, len(task.features.lasting)):
+    for column, name in enumerate(task.features.init_channels, len(task.features.lasting)):
         features[:, column] = series.inputs[:, inputs.index(name)]
-    if task.features.starting:
+    if task.features.init_channels:
         features[:, -1] = 1.0
     return features
 

@@ -66,22 +66,23 @@ class ByRecording:
     Simulated recordings, whose meta has an ``excitation``, are drawn so that each part has its share of every family.
 
     Attributes:
-        validation_share: share of the recordings that validate (when not named).
-        test_share: share that tests.
+        validation_fraction: share of the recordings that validate (when not named).
+        test_fraction: share that tests.
         seed: random seed of the draw.
-        validation: names of recordings that validate; `test` likewise. A recording named in neither trains.
-        tail_share: share of every training recording, at its end, that validates where no recording does.
+        validation: names of recordings that validate. A recording that is named in no part trains.
+        test: names of recordings that test.
+        tail_fraction: share of every training recording, at its end, that validates where no recording does.
     """
 
-    validation_share: float = 0.15
-    test_share: float = 0.2
+    validation_fraction: float = 0.15
+    test_fraction: float = 0.2
     seed: int = 0
     validation: tuple[str, ...] = ()
     test: tuple[str, ...] = ()
-    tail_share: float = 0.2
+    tail_fraction: float = 0.2
 
     def __post_init__(self) -> None:
-        shares = dict.fromkeys(("validation_share", "test_share", "tail_share"), PART)
+        shares = dict.fromkeys(("validation_fraction", "test_fraction", "tail_fraction"), PART)
         check_bounds("split", self, seed=SEED, **shares)
 
     def split(self, recordings: Sequence[Recording], gap: int) -> Split:
@@ -97,10 +98,10 @@ class ByRecording:
         families = self._families(recordings)
         drawn = _spread(self._shuffle_names(free), families)
         if not test:
-            test, drawn = _take(drawn, self.test_share, len(names))
+            test, drawn = _take(drawn, self.test_fraction, len(names))
             drawn = _spread(drawn, families)
         if not validation and len(drawn) >= 3:
-            validation, drawn = _take(drawn, self.validation_share, len(names))
+            validation, drawn = _take(drawn, self.validation_fraction, len(names))
         whole = [Stretch(i, 0, recording.samples) for i, recording in enumerate(recordings)]
         parts = {
             "train": [s for s in whole if names[s.recording] in drawn],
@@ -108,7 +109,7 @@ class ByRecording:
             "test": [s for s in whole if names[s.recording] in test],
         }
         if not parts["validation"]:
-            parts = _hold_tail(parts, self.tail_share, gap)
+            parts = _hold_tail(parts, self.tail_fraction, gap)
         return _check_parts(parts, recordings, gap)
 
     def _families(self, recordings: Sequence[Recording]) -> dict[str, str]:
@@ -149,20 +150,21 @@ class ByTime:
     """Split by time: the beginning of every recording for training, then validation, then test, with gaps between.
 
     Attributes:
-        validation_share: share of each recording.
-        test_share: share of each recording.
-        whole_short: recordings of which a part would be no longer than the gap train as a whole, in place of an error.
+        validation_fraction: share of each recording.
+        test_fraction: share of each recording.
+        train_short_recordings: recordings of which a part would be no longer than the gap train as a whole, in place
+            of an error.
     """
 
-    validation_share: float = 0.15
-    test_share: float = 0.2
-    whole_short: bool = False
+    validation_fraction: float = 0.15
+    test_fraction: float = 0.2
+    train_short_recordings: bool = False
 
     def __post_init__(self) -> None:
-        check_bounds("split", self, validation_share=PART, test_share=PART)
-        if self.validation_share + self.test_share >= 1:
+        check_bounds("split", self, validation_fraction=PART, test_fraction=PART)
+        if self.validation_fraction + self.test_fraction >= 1:
             raise ConfigError(
-                f"split: validation_share = {self.validation_share}, test_share = {self.test_share}; "
+                f"split: validation_fraction = {self.validation_fraction}, test_fraction = {self.test_fraction}; "
                 "validation_share + test_share must be below 1"
             )
 
@@ -172,9 +174,9 @@ class ByTime:
         for i, recording in enumerate(recordings):
             n = recording.samples
             # The end tests: a model is used later than it was trained.
-            test = n - round(n * self.test_share)
-            validation = test - round(n * self.validation_share)
-            if self.whole_short and min(validation - gap, test - gap - validation, n - test) <= gap:
+            test = n - round(n * self.test_fraction)
+            validation = test - round(n * self.validation_fraction)
+            if self.train_short_recordings and min(validation - gap, test - gap - validation, n - test) <= gap:
                 parts["train"].append(Stretch(i, 0, n))
                 continue
             parts["train"].append(Stretch(i, 0, validation - gap))
@@ -194,12 +196,12 @@ class ByBlocks:
     Attributes:
         block_s: duration of a block in seconds.
         every: a block out of so many tests.
-        validation_share: share of the other blocks, taken as whole blocks, that validate.
+        validation_fraction: share of the other blocks, taken as whole blocks, that validate.
     """
 
     block_s: float = 20.0
     every: int = 3
-    validation_share: float = 0.2
+    validation_fraction: float = 0.2
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -207,7 +209,7 @@ class ByBlocks:
             self,
             block_s=above(0.0, MAX_BLOCK_S),
             every=integer(2, MAX_NAMES),
-            validation_share=PART,
+            validation_fraction=PART,
         )
 
     def split(self, recordings: Sequence[Recording], gap: int) -> Split:
@@ -240,9 +242,9 @@ class ByBlocks:
         if number % self.every == self.every - 1:
             return "test"
         other = next(turn)
-        if self.validation_share <= 0:
+        if self.validation_fraction <= 0:
             return "train"
-        return "validation" if other % max(2, round(1 / self.validation_share)) == 0 else "train"
+        return "validation" if other % max(2, round(1 / self.validation_fraction)) == 0 else "train"
 
 
 @SPLITS.register("machines")
@@ -255,15 +257,16 @@ class ByMachine:
     Simulated recordings say their machine in their meta, a data-set file says it of each log (``machine = "..."``).
 
     Attributes:
-        validation_share: share of the machines that validate (when not named).
-        test_share: share that tests (when neither named nor chosen by mass).
+        validation_fraction: share of the machines that validate (when not named).
+        test_fraction: share that tests (when neither named nor chosen by mass).
         seed: random seed of the draw.
-        validation: names of machines that validate; `test` likewise.
+        validation: names of machines that validate.
+        test: names of machines that test.
         test_masses: machines from the first to the second mass, in t, test too; their size is never trained on.
     """
 
-    validation_share: float = 0.1
-    test_share: float = 0.15
+    validation_fraction: float = 0.1
+    test_fraction: float = 0.15
     seed: int = 0
     validation: tuple[str, ...] = ()
     test: tuple[str, ...] = ()
@@ -273,8 +276,8 @@ class ByMachine:
         check_bounds(
             "split",
             self,
-            validation_share=PART,
-            test_share=PART,
+            validation_fraction=PART,
+            test_fraction=PART,
             seed=SEED,
             test_masses=span(0.0, MAX_MASS_T),
         )
@@ -309,9 +312,9 @@ class ByMachine:
         free = [name for name in machines if name not in {*validation, *test}]
         drawn = [free[i] for i in np.random.default_rng(self.seed).permutation(len(free))]
         if not test:
-            test, drawn = _take(drawn, self.test_share, len(machines))
+            test, drawn = _take(drawn, self.test_fraction, len(machines))
         if not validation:
-            validation, drawn = _take(drawn, self.validation_share, len(machines))
+            validation, drawn = _take(drawn, self.validation_fraction, len(machines))
         machines_by_part = {"train": set(drawn), "validation": set(validation), "test": set(test)}
         whole = [Stretch(i, 0, recording.samples) for i, recording in enumerate(recordings)]
         parts = {part: [s for s in whole if owners[s.recording] in names] for part, names in machines_by_part.items()}

@@ -103,7 +103,7 @@ class CompressionResult(ResultFile):
 
     NAME: ClassVar[str] = "compression.json"
     SCHEMA: ClassVar[int] = 2
-    ADVICE: ClassVar[str] = "run edp compress again: it reads the finished networks"
+    ADVICE: ClassVar[str] = "run edp compress search again: it reads the finished networks"
 
     budget: Budget
     task: ComparedTask
@@ -149,5 +149,5 @@ def read_compression(folder: str | Path) -> CompressionResult:
     """
     file = Path(folder) / CompressionResult.NAME
     if not is_file_at(file):
-        raise StorageError(f"'{folder}' holds no {file.name}; give the folder of edp compress")
+        raise StorageError(f"'{folder}' holds no {file.name}; give the folder of edp compress search")
     return CompressionResult.from_file(file)

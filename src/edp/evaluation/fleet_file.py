@@ -86,7 +86,7 @@ class FleetFile(ResultFile):
     NAME = "fleet.json"
     SCHEMA = 1
     WHAT = "fleet"
-    ADVICE = "remove the folder and run edp finetune --fleet"
+    ADVICE = "remove the folder and run edp train finetune --fleet"
 
     edp: str
     base: str

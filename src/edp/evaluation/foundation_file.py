@@ -70,7 +70,7 @@ class FoundationFile(ResultFile):
     NAME = "foundation.json"
     SCHEMA = 1
     WHAT = "pretraining"
-    ADVICE = "remove the run folder and run edp pretrain"
+    ADVICE = "remove the run folder and run edp train pretrain"
 
     edp: str
     method: str

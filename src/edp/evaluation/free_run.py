@@ -51,37 +51,39 @@ class FreeRunJudgeSpec:
     """Evaluation settings of a twin.
 
     Attributes:
-        seconds: length of a free run; cut to what the longest recording has.
+        duration_s: length of a free run; cut to what the longest recording has.
         starts: free runs in each recording, evenly spread.
         at_s: times after the start at which strokes are compared.
-        floors: formulations that are fitted to the same recordings and evaluated beside it; one that does not suit them
-            is left out.
+        baselines: formulations that are fitted to the same recordings and evaluated beside it; one that does not suit
+            them is left out.
         coverage: share of free runs that an interval is meant to hold.
-        covered_at_s: times after the start at which coverage is counted.
+        coverage_at_s: times after the start at which coverage is counted.
         calibration_starts: free runs in each validation recording that calibrate the intervals.
-        ahead_ticks: horizon of k-step-ahead predictions from measured outputs, with given commands.
+        horizon: horizon of k-step-ahead predictions from measured outputs, with given commands.
 
     Raises:
         ConfigError: a value out of range.
     """
 
-    seconds: float = 60.0
+    duration_s: float = 60.0
     starts: int = 4
     at_s: tuple[float, ...] = (1.0, 5.0, 10.0, 30.0, 60.0)
-    floors: tuple[str, ...] = ("static", "arx", "n4sid")
+    baselines: tuple[str, ...] = ("static", "arx", "n4sid")
     coverage: float = 0.9
-    covered_at_s: tuple[float, ...] = (0.1, 1.0, 10.0, 60.0)
+    coverage_at_s: tuple[float, ...] = (0.1, 1.0, 10.0, 60.0)
     calibration_starts: int = 16
-    ahead_ticks: int = 10
+    horizon: int = 10
 
     def __post_init__(self) -> None:
         length = above(0.0, MAX_SECONDS)
         count = integer(1, MAX_BATCH)
-        check_bounds("judge", self, seconds=length, at_s=length, starts=count, calibration_starts=count)
-        check_bounds("judge", self, covered_at_s=length, coverage=between(0.0, 1.0), ahead_ticks=integer(1, MOST_TICKS))
-        check_count("judge", "at_s", self.at_s, MAX_NAMES, least=1)
-        check_count("judge", "covered_at_s", self.covered_at_s, MAX_NAMES, least=1)
-        check_count("judge", "floors", self.floors, MAX_NAMES)
+        check_bounds("evaluation", self, duration_s=length, at_s=length, starts=count, calibration_starts=count)
+        check_bounds(
+            "evaluation", self, coverage_at_s=length, coverage=between(0.0, 1.0), horizon=integer(1, MOST_TICKS)
+        )
+        check_count("evaluation", "at_s", self.at_s, MAX_NAMES, least=1)
+        check_count("evaluation", "coverage_at_s", self.coverage_at_s, MAX_NAMES, least=1)
+        check_count("evaluation", "baselines", self.baselines, MAX_NAMES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,11 +239,11 @@ def calibrated(unseen: Sequence[tuple[Twin, Sequence[Series]]], spec: FreeRunJud
     Raises:
         DataError: no segment has a tick behind the prefix.
     """
-    whole = _unseen_runs(unseen, spec.seconds, spec.calibration_starts)
+    whole = _unseen_runs(unseen, spec.duration_s, spec.calibration_starts)
     errors = [whole.answers - whole.truth]
     rate, longest = whole.channels.rate_hz, whole.truth.shape[1]
     # Runs as long as a short stretch all begin at its first tick: shorter ones tell short horizons by more starts.
-    for ticks in (longest // share for share in SHORTER if longest < round(spec.seconds * rate)):
+    for ticks in (longest // share for share in SHORTER if longest < round(spec.duration_s * rate)):
         if ticks < 1:
             break
         runs = _unseen_runs(unseen, ticks / rate, spec.calibration_starts)
@@ -289,7 +291,7 @@ def free_run_scores(
 
 def coverage_of(runs: FreeRuns, spec: FreeRunJudgeSpec, intervals: FreeRunIntervals) -> IntervalCoverage:
     """Return the fraction of free runs inside the interval at each horizon, by kind of channel, and the half widths."""
-    channels, ticks = runs.channels, _ticks(runs, spec.covered_at_s)
+    channels, ticks = runs.channels, _ticks(runs, spec.coverage_at_s)
     rows = []
     for at, tick in ticks:
         half = intervals.at(np.array([tick]))[0]

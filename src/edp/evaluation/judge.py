@@ -58,18 +58,18 @@ class JudgeSpec:
     Attributes:
         baselines: names of registered baselines.
         history: samples of history that baselines may use.
-        skip: first ticks of each segment that are not scored; None leaves out a whole window (start-up), and as many
-            as baselines need of history: all are measured on the same ticks.
+        warmup_samples: first ticks of each segment that are not scored; None leaves out a whole window (start-up), and
+            as many as baselines need of history: all are measured on the same ticks.
         seed: seed of the baselines' row sampling and initial weights.
     """
 
     baselines: tuple[str, ...] = tuple(BASELINES)
     history: int = 50
-    skip: int | None = None
+    warmup_samples: int | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_bounds("judge", self, history=integer(1, MOST_TICKS), skip=SKIP, seed=SEED)
+        check_bounds("evaluation", self, history=integer(1, MOST_TICKS), warmup_samples=SKIP, seed=SEED)
         for name in self.baselines:
             _ = BASELINES[name]
 
@@ -206,10 +206,10 @@ def check_scored(data: Prepared, spec: JudgeSpec) -> None:
         ConfigError: no segment of the test part is longer.
     """
     longest = max((part.samples for part in data.test), default=0) - data.task.max_horizon
-    if spec.skip is not None and data.test and spec.skip >= longest:
+    if spec.warmup_samples is not None and data.test and spec.warmup_samples >= longest:
         raise ConfigError(
-            f"judge.skip: got {spec.skip:,}, expected fewer than the {longest:,} samples of the longest test stretch "
-            "that can be evaluated; give a smaller one, or longer recordings"
+            f"evaluation.warmup_samples: got {spec.warmup_samples:,}, expected fewer than the {longest:,} samples of "
+            "the longest test segment that can be evaluated; give a smaller one, or longer recordings"
         )
 
 
@@ -218,9 +218,9 @@ def first_scored(predictor: Predictor, data: Prepared, spec: JudgeSpec) -> int:
     # A whole window from reset: before that the network's memory is not filled. Baselines lack history for longer
     # than the preset `auto` waits: without the rows in which sensors settle a rival looks far better than it is.
     history = baseline_task(data, spec).history if spec.baselines else 0
-    first = max(predictor.spec.window, history) if spec.skip is None else spec.skip
+    first = max(predictor.spec.window, history) if spec.warmup_samples is None else spec.warmup_samples
     # While the start is read there is nothing to predict.
-    return max(first, data.task.features.starting_ticks) if data.task.features.starting else first
+    return max(first, data.task.features.init_samples) if data.task.features.init_channels else first
 
 
 class ModelBench:

@@ -197,7 +197,7 @@ class StudyFile:
         for phase, second in (("synthesis", False), ("compression", True)):
             indices = [index for index, row in enumerate(self.history) if row.phase == phase]
             counts = [len(one.judged) for one in self.openings if (one.test_set == SECOND_TEST_SET) == second]
-            # Openings by edp compress trained nothing here.
+            # Openings by edp compress search trained nothing here.
             sealed = counts[-1:] if second else counts
             tested |= set(indices[len(indices) - sum(sealed) :] if sum(sealed) else ())
         return frozenset(tested)

@@ -91,7 +91,7 @@ class TransferFile(ResultFile):
     NAME = "transfer.json"
     SCHEMA = 2
     WHAT = "transfer"
-    ADVICE = "run edp finetune again"
+    ADVICE = "run edp train finetune again"
 
     edp: str | None = None
     method: str

@@ -57,7 +57,7 @@ class TuningFile(ResultFile):
     NAME = "tuning.json"
     SCHEMA = 1
     WHAT = "tuning"
-    ADVICE = "remove the run folder and run edp tune"
+    ADVICE = "remove the run folder and run edp loop tune"
 
     controller: str
     gains: Mapping[str, float]

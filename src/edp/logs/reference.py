@@ -51,7 +51,7 @@ def reference_page() -> str:
             "## Kinds",
             "",
             "A channel's `kind` says what it measures. Values are stored in the SI unit and shown in the unit of",
-            "reports. Beyond the plausible limits `edp inspect` warns.",
+            "reports. Beyond the plausible limits `edp data check` warns.",
             "",
             *_table(("kind", "SI unit", "in reports", "plausible, SI", "is"), _kinds()),
             "",

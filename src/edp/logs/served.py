@@ -253,7 +253,7 @@ def check_plain(path: Path, arrays: Sequence[NDArray[Any]]) -> None:
 
 
 def _parts(table: ColumnTable, keys: Sequence[str], start: int, stop: int) -> Iterator[list[NDArray[Any]]]:
-    """Return the pieces, cut where a message would be too long."""
+    """Return the segments, cut where a message would be too long."""
     for columns in table.pieces(keys, start, stop):
         row = sum(column.itemsize for column in columns)
         rows = max(MESSAGE_BYTES // max(row, 1), 1)

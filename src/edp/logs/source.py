@@ -324,14 +324,15 @@ class DataSource:
         """Refuse `at_most` for logs in a bucket, since each command would download them again."""
         if self.address:
             raise ConfigError(
-                f"'{self.address}' holds logs and no store; read them once with `edp store build {self.address} --out "
+                f"'{self.address}' holds logs and no store; read them once with `edp data store build "
+                f"{self.address} --out "
                 "store`, and give this command the store"
             )
         if self.at_most_h is not None:
             raise ConfigError(
                 f"--at-most {setting_text(self.at_most_h)} came with '{self.path}', which is no store; read the logs "
                 "once "
-                "with `edp store build LOGS --out STORE`, and give this command the store"
+                "with `edp data store build LOGS --out STORE`, and give this command the store"
             )
 
     def check_store_options(self) -> None:
@@ -344,7 +345,7 @@ class DataSource:
         if options:
             raise ConfigError(
                 f"{' and '.join(options)} came with the store '{self.path}', whose logs were mapped and repaired when "
-                "it was built; give them to `edp store build`"
+                "it was built; give them to `edp data store build`"
             )
 
 
@@ -370,7 +371,8 @@ class Log:
         """Read and return the recording."""
         if self.remote is not None:
             raise ConfigError(
-                f"'{self.remote.address}' lies in a bucket; read the data set once with `edp store build`, and give "
+                f"'{self.remote.address}' lies in a bucket; read the data set once with `edp data store build`, "
+                f"and give "
                 "the store"
             )
         recording = read_recording(self.path, self.signal_map, name=self.name, rows=self.rows, repair=self.repair)

@@ -59,7 +59,7 @@ class ChainSpec:
         folds: parts into which sessions are dealt, at most as many as there are; what evaluates a session was fitted
             without its part. Of few parts each lacks much of what the monitor itself is fitted to: limits are too high.
         drift_per_hour: maximum drift per hour of a summary level that is followed, in healthy standard deviations.
-        most_drift: maximum total drift, in healthy standard deviations.
+        max_drift: maximum total drift, in healthy standard deviations.
         tolerance: share by which numbers of machines of the series may lie off that of the logs. The sessions that set
             the limit are seen as those of such machines, a machine each, by the residuals that know what a machine is
             made of; 0 watches this one machine, and sees smaller faults of it.
@@ -76,7 +76,7 @@ class ChainSpec:
     watches: tuple[WatchSpec, ...] = field(default_factory=default_watches)
     folds: int = 10
     drift_per_hour: float = 0.05
-    most_drift: float = 0.5
+    max_drift: float = 0.5
     tolerance: float = 0.0
     doubtful: float = 8.0
 
@@ -89,7 +89,7 @@ class ChainSpec:
             clip=above(0.0, 1e3),
             folds=integer(2, 100),
             drift_per_hour=below(0.0, 1e3),
-            most_drift=below(0.0, 1e3),
+            max_drift=below(0.0, 1e3),
             tolerance=below(0.0, 0.2),
             doubtful=above(0.0, 1e6),
         )
@@ -217,7 +217,7 @@ def fit_from_blocks(
     """Fit a chain like `fit_chain`, given the blocks of the sessions."""
     remaining, doubtful = _drop_doubtful(spec, blocks, settle)
     blocks_per_s = rate_hz / summaries.block
-    drift = SlowDrift(spec.drift_per_hour / 3600.0 / blocks_per_s, spec.most_drift)
+    drift = SlowDrift(spec.drift_per_hour / 3600.0 / blocks_per_s, spec.max_drift)
     folds = min(spec.folds, len(remaining))
     jobs = [_Part(spec, remaining, drift, blocks_per_s, settle, fold, folds) for fold in (NO_FOLD, *range(folds))]
     white: list[Array] = [np.zeros(0)] * len(remaining)

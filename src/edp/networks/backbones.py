@@ -256,13 +256,16 @@ class CommitteeSpec:
         activations: ``tanh``, ``relu`` or both; each has its own group of members. None leaves the linear model.
         dropout: rate after each hidden layer, in training.
         centres: radial basis functions on all columns; a training on folds places them.
-        near: additional perceptrons that read the present values and the changes over one span only. Each entry selects
+        local_lags: additional perceptrons that read the present values and the changes over one span only. Each entry
+            selects
             the span among `lags`; 0 selects present values alone. With few rows, perceptrons of few inputs generalise
             better.
         trees: regression trees for each predicted number; their sums join the representation. A training on folds
             fits them.
-        tree_depth: comparisons from the root of a tree to a leaf.
-        bounded: whether present values and changes far outside what a training on folds saw are held at limits around
+        tree_depth: comparisons from the root of a tree to a
+            leaf.
+        clip_inputs: whether present values and changes far outside what a training on folds saw are held at limits
+            around
             it. An axis that first moves on the machine, or a sensor that jumps, is then no multiple of what trained.
     """
 
@@ -275,10 +278,10 @@ class CommitteeSpec:
     activations: tuple[str, ...] = ("tanh", "relu")
     dropout: float = 0.0
     centres: int = 0
-    near: tuple[int, ...] = ()
+    local_lags: tuple[int, ...] = ()
     trees: int = 0
     tree_depth: int = 4
-    bounded: bool = False
+    clip_inputs: bool = False
 
     def __post_init__(self) -> None:
         check_count("backbone", "lags", self.lags, MAX_LEVELS, least=1)
@@ -288,7 +291,7 @@ class CommitteeSpec:
         check_bounds("backbone", self, members=integer(1, MAX_NAMES), units=UNITS, layers=LAYERS, dropout=DROPOUT)
         check_bounds("backbone", self, trees=integer(0, MAX_TREES), tree_depth=integer(1, MAX_DEPTH))
         check_bounds("backbone", self, centres=integer(0, MAX_CENTRES))
-        check_near(self.near, self.lags, self.centres)
+        check_near(self.local_lags, self.lags, self.centres)
         for name in self.activations:
             if name not in NON_LINEAR or self.activations.count(name) > 1:
                 raise ConfigError(
@@ -312,18 +315,18 @@ class CommitteeSpec:
 
     def parts(self) -> tuple[str, ...]:
         """Return the members and the radial basis functions; differences and trees are not trained by gradients."""
-        return ("groups", *(["radial"] if self.centres else []), *(["near"] if self.near else []))
+        return ("groups", *(["radial"] if self.centres else []), *(["local_lags"] if self.local_lags else []))
 
     def build(self, features: int, window: int, blocks: Blocks, outputs: int = 1) -> tuple[Streaming, int]:
         """Build the bank of differences, and the members and trees on it."""
-        bank = LagBank(features, self.lags, self.smoothed, self.bounded)
+        bank = LagBank(features, self.lags, self.smoothed, self.clip_inputs)
         groups = [
             Members(bank.columns, self.members, self.units, self.layers, name, self.dropout)
             for name in self.activations
         ]
         trees = Trees(bank.columns, outputs, self.trees, self.tree_depth) if self.trees else None
         radial = RadialFeatures(bank.columns, self.centres) if self.centres else None
-        near = [RadialFeatures(bank.columns, self.centres, bank.columns_over(span)) for span in self.near]
+        near = [RadialFeatures(bank.columns, self.centres, bank.columns_over(span)) for span in self.local_lags]
         net = Committee(bank, groups, radial, near, trees)
         return net, net.width
 

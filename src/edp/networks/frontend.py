@@ -62,8 +62,8 @@ class FrontEnd(Streaming):
         self.inputs = len(task.inputs)
         self.sources = len(inputs)
         self.rate_hz = task.rate_hz
-        self.starting = [inputs.index(name) for name in task.features.starting]
-        self.starting_ticks = task.features.starting_ticks if self.starting else 1
+        self.init_channels = [inputs.index(name) for name in task.features.init_channels]
+        self.init_samples = task.features.init_samples if self.init_channels else 1
         self.lasting = len(task.features.lasting)
         derived = task.features.derived
         self.derived = [inputs.index(entry.source) for entry in derived]
@@ -89,10 +89,10 @@ class FrontEnd(Streaming):
         before = torch.cat([first, x[:, :-1]], dim=1)
         derived, rings = self._derive(x, x - before, rings)
         columns = [x[..., : self.logged], *derived]
-        if self.starting:
-            columns += self._start(x[..., self.starting], age)
+        if self.init_channels:
+            columns += self._start(x[..., self.init_channels], age)
         # Age is counted no further than needed, so that it stays exact in float32 over hours.
-        age = (age + x.shape[1]).clamp(max=self.starting_ticks)
+        age = (age + x.shape[1]).clamp(max=self.init_samples)
         return torch.cat(columns, dim=-1), (x[:, -1:], age, rings)
 
     def _derive(self, x: Tensor, change: Tensor, rings: tuple[State, ...]) -> tuple[list[Tensor], tuple[State, ...]]:
@@ -111,9 +111,9 @@ class FrontEnd(Streaming):
 
     def _start(self, x: Tensor, age: Tensor) -> list[Tensor]:
         """Return the channels of the start ``(batch, time, channel)``, and whether they are read at a tick."""
-        read = age + torch.arange(x.shape[1], device=x.device).view(1, -1, 1) < self.starting_ticks
+        read = age + torch.arange(x.shape[1], device=x.device).view(1, -1, 1) < self.init_samples
         # Behind its ticks a channel of the start is replaced by its mean, which is zero after scaling.
-        mean = self.offset[self.lasting : self.lasting + len(self.starting)]
+        mean = self.offset[self.lasting : self.lasting + len(self.init_channels)]
         return [torch.where(read, x, mean), read.to(x)]
 
     def scale(self, features: Tensor) -> Tensor:
@@ -125,10 +125,10 @@ class FrontEnd(Streaming):
         parts = [build.pick("logged", x, range(self.logged))]
         if self.derived:
             parts.append(self._lower_derived(build, x))
-        if self.starting:
-            mean = self.offset[self.lasting : self.lasting + len(self.starting)]
-            read = build.pick("start", x, self.starting)
-            parts.append(build.add(Starting, "starting", read, mean=mean, ticks=self.starting_ticks))
+        if self.init_channels:
+            mean = self.offset[self.lasting : self.lasting + len(self.init_channels)]
+            read = build.pick("start", x, self.init_channels)
+            parts.append(build.add(Starting, "starting", read, mean=mean, ticks=self.init_samples))
         return build.join("features", *parts)
 
     def _lower_derived(self, build: Builder, x: str) -> str:

@@ -34,7 +34,7 @@ def usual_range(predictor: Predictor) -> tuple[Array, Array]:
         change = width[logged + number] / entry.gain(predictor.task.rate_hz)
         if source >= logged:
             spread[source] = min(spread[source], change)
-    first, count = logged + hidden, len(features.starting)
+    first, count = logged + hidden, len(features.init_channels)
     at = slice(front.lasting, front.lasting + count)
     centre[first : first + count], spread[first : first + count] = offset[at], width[at]
     if predictor.physics is not None:

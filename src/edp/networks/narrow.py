@@ -53,7 +53,7 @@ def student(model: ModelSpec, units: int, levels: int | None = None) -> ModelSpe
                 "tables already, export it as it is"
             )
         # Many members and nearness to typical rows steady what is fitted to noise; what a teacher says has none.
-        changed |= {"members": 1, "centres": 0, "near": ()}
+        changed |= {"members": 1, "centres": 0, "local_lags": ()}
     if "channels" in names:
         channels = model.backbone.channels  # type: ignore[attr-defined]
         if levels is None:

@@ -14,7 +14,7 @@ MOST_PARAMETERS = 50_000_000
 MAX_STATE = 100_000_000
 NO_WIDTHS = (
     *("kernel", "layers", "window", "ticks", "taps", "heads", "reduction", "first_dilations"),
-    *("lags", "smoothed", "near"),
+    *("lags", "smoothed", "local_lags"),
 )
 """Options that are integers, but not the width of anything."""
 
@@ -61,7 +61,7 @@ def size_at_most(spec: Any, task: Task) -> tuple[int, int]:
     # A tree has two numbers a node and one a leaf.
     tables = targets * len(task.horizons) * max(0, most("trees")) * 3 * 2 ** most("tree_depth") if spans else 0
     # Those on few columns read twice the features at most, and every output reads each of them.
-    near = sum(key == "near" for key, _ in options) * most("centres") * (2 * features + 2 + targets * values)
+    near = sum(key == "local_lags" for key, _ in options) * most("centres") * (2 * features + 2 + targets * values)
     spans_state = sum(2 * entry.ticks(task.rate_hz) for entry in task.features.derived)
     parameters = squares * width**2 + ends + small + tables + near
     return parameters, spans_state + 4 * reach * stacks * (levels + layers + 2) * width

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Any
@@ -36,6 +36,8 @@ MAX_SEED = 2**32 - 1
 MAX_WEIGHT = 1e6
 MIN_POSITIVE = 1.2e-38
 """Least number that counts as above zero: the smallest normal number of float32, whose inverse is finite."""
+_checked: dict[type, dict[str, Bound]] = {}
+"""Bounds by class of settings, recorded when an object is checked; the reference of settings is made from them."""
 MAX_SHOWN = 60
 """Characters of a value that a message repeats."""
 
@@ -130,6 +132,7 @@ def check_bounds(what: str, spec: object, **bounds: Bound) -> None:
         ConfigError: every one that is out, with its bound.
     """
     wrong = []
+    _checked.setdefault(type(spec), {}).update(bounds)
     for name, bound in bounds.items():
         value = getattr(spec, name)
         entries = value if isinstance(value, tuple | list) else () if value is None else (value,)
@@ -137,6 +140,11 @@ def check_bounds(what: str, spec: object, **bounds: Bound) -> None:
             wrong.append(f"{name} = {shown(value)}; {bound.rule(name)} must hold{bound.note(value)}")
     if wrong:
         raise ConfigError(f"{what}: {'; '.join(wrong)}")
+
+
+def bounds_of(cls: type) -> Mapping[str, Bound]:
+    """Return the bounds of a settings class by attribute, as far as an object of the class was made in this process."""
+    return dict(_checked.get(cls, {}))
 
 
 def check_count(what: str, name: str, entries: Sequence[object], most: int, least: int = 0) -> None:

@@ -22,6 +22,7 @@ from edp import storage
 from edp.errors import ConfigError, closest
 from edp.registry import Registry
 from edp.settings.bounds import shown
+from edp.settings.earlier_keys import common_renames, note_earlier, present_keys
 from edp.storage.reading import Table as Table
 
 Change = str | Mapping[str, object]
@@ -218,10 +219,56 @@ class SettingsTree:
         Raises:
             ConfigError: names every unknown key, wrong type and impossible value at once.
         """
-        table = merged({} if path is None else read_toml(path), options or {})
-        table = merged(table, combined([override(text) for text in overrides]))
+        table = merged({} if path is None else self.renamed(cls, read_toml(path)), options or {})
+        table = merged(table, combined([self.renamed(cls, override(text)) for text in overrides]))
         where = of if path is None else f"'{path}'"
         return self.build(cls, table, where + (" with --set" if overrides else ""))
+
+    def renamed(self, cls: type, table: Mapping[str, object], path: str = "") -> dict[str, object]:
+        """Return a table that a user gave with the keys of this version, before it is merged with other tables.
+
+        Tables need not be complete: where a part does not name its kind, all kinds count. Earlier keys are recorded
+        for a notice.
+
+        Args:
+            cls: dataclass of the table.
+            table: plain values by key.
+            path: key of the table in messages.
+
+        Raises:
+            ConfigError: a key is given by its earlier and by its present name.
+        """
+        return self._renamed([cls], table, path)
+
+    def _renamed(self, classes: Sequence[type], table: Mapping[str, object], path: str) -> dict[str, object]:
+        known = [_settings_of(cls) for cls in classes]
+        renames = common_renames(classes, {key for keys in known for key in keys})
+        result: dict[str, object] = {}
+        for key, value in table.items():
+            name = renames.get(key, key)
+            where = _join(path, str(name))
+            if name != key:
+                if name in table:
+                    raise ConfigError(f"'{_join(path, key)}' is now '{where}', and both are given; give the second")
+                note_earlier(_join(path, key), where)
+            hints = [keys[name].hint for keys in known if name in keys]
+            result[name] = self._renamed_value(str(name), hints, value, where)
+        return result
+
+    def _renamed_value(self, name: str, hints: Sequence[Any], value: Any, path: str) -> Any:
+        if isinstance(value, list):
+            return [self._renamed_value(name, hints, entry, path) for entry in value]
+        if not isinstance(value, Mapping) or not hints:
+            return value
+        if name in self.parts:
+            kind = value.get("kind")
+            registry = self.parts[name]
+            named = isinstance(kind, str) and kind in registry
+            classes = [registry[str(kind)]] if named else list(registry.values())
+        else:
+            forms = [_form(_strip_optional(hint)) for hint in hints]
+            classes = [cls for form in forms for cls in (form.table, form.item) if cls is not None]
+        return self._renamed(classes, value, path) if classes else value
 
     def _build(
         self, cls: type, table: Any, path: str, problems: list[str], beside: Mapping[str, type] | None = None
@@ -235,6 +282,11 @@ class SettingsTree:
             return None
         settings_of_class = _settings_of(cls)
         before = len(problems)
+        try:
+            table = present_keys(cls, table, path)
+        except ConfigError as error:
+            problems.append(str(error))
+            return None
         for key in table:
             if key not in settings_of_class:
                 hint = _kinds_with(key, beside or {}) or closest(_key(key), list(settings_of_class))

@@ -31,7 +31,12 @@ class LogFileSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ScenarioFile(DataSetSpec):
-    """Content of a scenario file: data set, write options in ``[files]``, limit settings in ``[limit]``."""
+    """Content of a scenario file: data set, write options in ``[files]``, limit settings in ``[limit]``.
+
+    Attributes:
+        files: format, layout and truth of the files that are written.
+        limit: settings of the limit of predictability.
+    """
 
     files: LogFileSettings = field(default_factory=LogFileSettings)
     limit: LimitSpec = field(default_factory=LimitSpec)

@@ -44,7 +44,7 @@ def main_effects(
     covariates: ArrayLike | None = None,
     pass_at: float = PASS_AT,
 ) -> tuple[MainEffect, ...]:
-    """Regress the scores on all factors at once, and on covariates such as randomised rates.
+    """Return the regress the scores on all factors at once, and on covariates such as randomised rates.
 
     Args:
         levels: ``(run, factor)``, True where on; a repeated design is stacked.

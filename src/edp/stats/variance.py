@@ -107,7 +107,7 @@ def _difference_interval(first: _MeanSquare, second: _MeanSquare, tail: float) -
 
 
 def seed_correlation(module: ArrayLike, baseline: ArrayLike) -> float:
-    """Return the correlation of two arms over the seeds of a split: the benefit of common random numbers.
+    """Return the correlation of two arms over the seeds of a split: the benefit of common random values.
 
     The variance of a paired difference is ``2 s^2 (1 - rho)``, not ``2 s^2``.
 

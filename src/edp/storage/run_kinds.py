@@ -33,18 +33,18 @@ RUN_KINDS: Mapping[str, RunKind] = {
     kind.name: kind
     for kind in (
         RunKind("twin", "edp twin", TWIN, TWIN),
-        RunKind("control", "edp control", CONTROLLER, CONTROLLER),
-        RunKind("tuning", "edp tune", "tuning.json"),
+        RunKind("control", "edp loop run", CONTROLLER, CONTROLLER),
+        RunKind("tuning", "edp loop tune", "tuning.json"),
         RunKind("search", "edp search", "study.json", lock="ledger/.lock"),
         RunKind("auto", "edp train --preset auto", "auto.json", BUNDLE),
-        RunKind("pretraining", "edp pretrain", "foundation.json", BUNDLE),
+        RunKind("pretraining", "edp train pretrain", "foundation.json", BUNDLE),
         RunKind("adaptation", "edp adapt", "adaptation.json", BUNDLE),
-        RunKind("transfer", "edp finetune", "transfer.json", BUNDLE),
-        RunKind("compression", "edp compress", "compression.json"),
+        RunKind("transfer", "edp train finetune", "transfer.json", BUNDLE),
+        RunKind("compression", "edp compress search", "compression.json"),
         RunKind("monitor run", "edp monitor run", "alarms.jsonl"),
         RunKind("monitor", "edp monitor fit", "monitor.json", "monitor.json"),
-        RunKind("identification", "edp identify", "identification.json"),
-        RunKind("fleet", "edp finetune --fleet", "fleet.json"),
+        RunKind("identification", "edp calibrate", "identification.json"),
+        RunKind("fleet", "edp train finetune --fleet", "fleet.json"),
         RunKind("network", "edp train", BUNDLE, BUNDLE),
     )
 }

@@ -35,7 +35,7 @@ def bench_grey_box(**options: Any) -> GreyBox:
         pumps=(PumpElement(name="pump", pressure="line"),),
         inertia_degree=1,
         potential_degree=2,
-        stretches=5,
+        curve_segments=5,
         **options,
     )
 

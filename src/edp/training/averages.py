@@ -17,7 +17,7 @@ class AverageSpec(Protocol):
         """Share of the way to the weights that the average goes after `update` of `updates`; 1 takes them over."""
         ...
 
-    def factor(self, factor: float, update: int, updates: int) -> float:
+    def rate_factor(self, factor: float, update: int, updates: int) -> float:
         """Return the fraction of the base learning rate at an update, from the schedule's fraction."""
         ...
 
@@ -38,7 +38,7 @@ class NoAverage:
         """Take the weights over."""
         return 1.0
 
-    def factor(self, factor: float, update: int, updates: int) -> float:
+    def rate_factor(self, factor: float, update: int, updates: int) -> float:
         """Return the schedule's fraction."""
         return factor
 
@@ -71,7 +71,7 @@ class Exponential:
         # A young average would otherwise hold on to the random start.
         return 1.0 - min(self.decay, (1 + update) / (10 + update))
 
-    def factor(self, factor: float, update: int, updates: int) -> float:
+    def rate_factor(self, factor: float, update: int, updates: int) -> float:
         """Return the schedule's fraction."""
         return factor
 
@@ -88,30 +88,30 @@ class Stochastic:
     Before, the weights themselves are validated. A training with it is not stopped early.
 
     Attributes:
-        share: fraction of all updates, at the end, that are averaged.
-        rate: learning rate while averaging, as a share of the base rate; 0 leaves it to the schedule.
+        fraction: fraction of all updates, at the end, that are averaged.
+        lr_ratio: learning rate while averaging, as a share of the base rate; 0 leaves it to the schedule.
 
     Raises:
         ConfigError: share outside ]0, 1], or rate outside [0, 1].
     """
 
-    share: float = 0.2
-    rate: float = 0.3
+    fraction: float = 0.2
+    lr_ratio: float = 0.3
 
     def __post_init__(self) -> None:
-        check_bounds("swa", self, share=above(0.0, 1.0), rate=SHARE)
+        check_bounds("swa", self, fraction=above(0.0, 1.0), lr_ratio=SHARE)
 
     def _begin(self, updates: int) -> int:
         # At least one update, so that the mean exists at the end of a short training.
-        return updates - max(1, round(self.share * updates))
+        return updates - max(1, round(self.fraction * updates))
 
     def step(self, update: int, updates: int) -> float:
         """Return the step of the mean: ``1 / n`` for the n-th averaged update."""
         return 1.0 / max(1, update - self._begin(updates))
 
-    def factor(self, factor: float, update: int, updates: int) -> float:
+    def rate_factor(self, factor: float, update: int, updates: int) -> float:
         """Return the constant rate during averaging."""
-        return self.rate if self.rate and update > self._begin(updates) else factor
+        return self.lr_ratio if self.lr_ratio and update > self._begin(updates) else factor
 
     def may_stop(self) -> bool:
         """Return whether the average is complete."""

@@ -67,7 +67,7 @@ def fit(
     """
     torch.set_num_threads(thread_count(spec))
     tell = on_event or (lambda event: None)
-    if spec.bagging is not None and strategy is None:
+    if spec.ensemble is not None and strategy is None:
         return fit_in_folds(data, model, spec, run.folder if run else None, tell)
     if isinstance(strategy, DirectFit):
         direct = strategy.fit_network(data, model, spec, tell)
@@ -207,7 +207,7 @@ class Loop:
         }
         return Diverged(
             f"{what} is {value} at update {progress.updates} (epoch {facts['epoch']}): the training diverged; {saved}. "
-            "Lower the learning rate or clip_norm, or look for outliers with edp inspect",
+            "Lower the learning rate or clip_norm, or look for outliers with edp data check",
             self._make_result() if math.isfinite(progress.best_score) else None,
             facts,
         )
@@ -304,8 +304,8 @@ class Loop:
     def _factor(self) -> float:
         """Share of the base learning rate at the coming update."""
         done, total = self.progress.updates, self.updates * self.spec.epochs
-        factor = self.spec.schedule.factor(done / total, self.progress.schedule)
-        return self.spec.average.factor(factor, done + 1, total)
+        factor = self.spec.schedule.rate_factor(done / total, self.progress.schedule)
+        return self.spec.average.rate_factor(factor, done + 1, total)
 
     def _follow(self) -> None:
         """Move the average towards the weights."""

@@ -66,15 +66,15 @@ class FreeRunSpec:
 
     Attributes:
         seed: seed of the weights, the starts and the measured ports.
-        lanes: free runs side by side in an update.
+        batch: free runs side by side in an update.
         lengths_s: lengths of the free runs, stage after stage.
         updates: updates of each stage.
-        measured_share: share of the batch that are measured throughout, as a filter is.
-        mixed_share: share of the batch in which each port is measured or free by chance, as with missing sensors.
+        measured_fraction: share of the batch that are measured throughout, as a filter is.
+        mixed_fraction: share of the batch in which each port is measured or free by chance, as with missing sensors.
         stroke_weight: weight of a standardised stroke error relative to a velocity error; small errors accumulate.
         pressure_weight: weight of a standardised pressure error.
         delta: weighted error above which the Huber loss is linear, in standard deviations.
-        clip: bound on the norm of a gradient.
+        clip_norm: bound on the norm of a gradient.
         optimizer: optimiser; its learning rate rises over `warmup` and falls to zero by a cosine.
         warmup: share of all updates.
         validate_every: updates from one validation to the next.
@@ -86,16 +86,16 @@ class FreeRunSpec:
     """
 
     seed: int = 0
-    lanes: int = 64
+    batch: int = 64
     lengths_s: tuple[float, ...] = (0.1, 0.3, 1.0, 3.0)
     updates: tuple[int, ...] = (1500, 2000, 3000, 500)
     # More of them cost accuracy in free runs, and gave none where ports are measured (docs/journal).
-    measured_share: float = 0.05
-    mixed_share: float = 0.1
+    measured_fraction: float = 0.05
+    mixed_fraction: float = 0.1
     stroke_weight: float = 10.0
     pressure_weight: float = 0.3
     delta: float = 0.1
-    clip: float = 1.0
+    clip_norm: float = 1.0
     # On M22 its free runs were off by 5.95 mm/s after 160 processor s, those of AdamW (4e-3) by 6.44 after 202.
     optimizer: OptimizerSpec = field(default_factory=lambda: Soap(learning_rate=3e-3))
     warmup: float = 0.02
@@ -104,9 +104,15 @@ class FreeRunSpec:
     patience: int = 8
 
     def __post_init__(self) -> None:
-        bounds = {"seed": SEED, "lanes": integer(1, MAX_BATCH), "updates": integer(1, MAX_UPDATES)}
+        bounds = {"seed": SEED, "batch": integer(1, MAX_BATCH), "updates": integer(1, MAX_UPDATES)}
         bounds |= {"lengths_s": above(0.0, MAX_LENGTH_S), "validation_s": above(0.0, MAX_LENGTH_S)}
-        bounds |= {"measured_share": SHARE, "mixed_share": SHARE, "warmup": SHARE, "clip": WEIGHT, "delta": WEIGHT}
+        bounds |= {
+            "measured_fraction": SHARE,
+            "mixed_fraction": SHARE,
+            "warmup": SHARE,
+            "clip_norm": WEIGHT,
+            "delta": WEIGHT,
+        }
         bounds |= {"stroke_weight": WEIGHT, "pressure_weight": WEIGHT}
         bounds |= {"validate_every": integer(1, MAX_UPDATES), "patience": integer(0, MAX_UPDATES)}
         check_bounds("free runs", self, **bounds)
@@ -116,10 +122,10 @@ class FreeRunSpec:
                 f"free runs: {len(self.lengths_s)} lengths_s and {len(self.updates)} updates; one number of updates "
                 "for each length must hold"
             )
-        if self.measured_share + self.mixed_share >= 1.0:
+        if self.measured_fraction + self.mixed_fraction >= 1.0:
             raise ConfigError(
-                f"free runs: measured_share = {setting_text(self.measured_share)} and mixed_share = "
-                f"{setting_text(self.mixed_share)} leave no "
+                f"free runs: measured_fraction = {setting_text(self.measured_fraction)} and mixed_share = "
+                f"{setting_text(self.mixed_fraction)} leave no "
                 "lane that runs free; a sum below 1 must hold"
             )
 
@@ -130,8 +136,8 @@ def draw_measured_ports(spec: FreeRunSpec, shape: tuple[int, int, int], prefix: 
     kind = rng.random(lanes)
     ports = np.zeros(shape, np.float32)
     ports[:prefix] = 1.0
-    ports[:, kind < spec.measured_share] = 1.0
-    mixed = (kind >= spec.measured_share) & (kind < spec.measured_share + spec.mixed_share)
+    ports[:, kind < spec.measured_fraction] = 1.0
+    mixed = (kind >= spec.measured_fraction) & (kind < spec.measured_fraction + spec.mixed_fraction)
     # A sensor that is missing is missing in the prefix, too, but for the tick that a run starts from.
     ports[1:, mixed] = (rng.random((lanes, answers)) < 0.5)[mixed]
     return ports
@@ -194,7 +200,7 @@ def _fit_stages(
             f"no stretch is longer than prefix and free run, {typed(longest / rate)} s; give longer recordings, or "
             "shorter free runs (training.lengths_s)"
         )
-    judge = FreeRunValidation(twin, validation, round(spec.validation_s * rate), spec.lanes)
+    judge = FreeRunValidation(twin, validation, round(spec.validation_s * rate), spec.batch)
     optimizer = spec.optimizer.build(network.named_parameters())
     rates = [group["lr"] for group in optimizer.param_groups]
     weight = torch.from_numpy(answer_weights(twin, spec))
@@ -271,7 +277,7 @@ def _update(
     """Run one update on scaled segments and return the loss; `now`: ticks of the free run, updates done before."""
     ticks, done = now
     rng = np.random.default_rng([spec.seed, done])
-    windows = random_windows(train, twin.prefix_ticks + ticks, spec.lanes, rng)
+    windows = random_windows(train, twin.prefix_ticks + ticks, spec.batch, rng)
     drawn = MeasuredWindows.read(windows, twin.prefix_ticks + ticks)
     driven, truth = (np.ascontiguousarray(values.swapaxes(0, 1)) for values in (drawn.commands, drawn.outputs))
     ports = draw_measured_ports(spec, truth[1:].shape, twin.prefix_ticks, rng)
@@ -280,7 +286,7 @@ def _update(
     loss = huber((answers - torch.from_numpy(truth[1:])) * weight, spec.delta).mean()
     optimizer.zero_grad()
     loss.backward()
-    norm = torch.nn.utils.clip_grad_norm_(twin.network.parameters(), spec.clip)
+    norm = torch.nn.utils.clip_grad_norm_(twin.network.parameters(), spec.clip_norm)
     if not torch.isfinite(norm):
         raise FreeRunDiverged(
             f"the gradient of update {done + 1} is not finite; lower optimizer.learning_rate or the lengths of the runs"

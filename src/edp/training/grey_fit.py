@@ -163,7 +163,7 @@ def fit_grey_box(
     """
     spec = twin.spec.fit
     history = FitHistory(sum(spec.rounds) + (spec.starts - 1) * spec.rounds[0] + spec.final_rounds, on_event)
-    if parametrisation is not None or twin.spec.stretches or not spec.final_rounds:
+    if parametrisation is not None or twin.spec.curve_segments or not spec.final_rounds:
         return _Stages(GreyProblem(twin, train, parametrisation), validation, seed, history).fit()
     coarse = GreyProblem(twin.with_stretches(STRETCHES[0]), train)
     begin = best = _Stages(coarse, validation, seed, history).fit(final=False)
@@ -260,7 +260,7 @@ class _Path:
         """Run one round on free runs of a length."""
         problem, spec = self.problem, self.problem.twin.spec.fit
         ticks = max(1, round(length_s * problem.twin.channels.rate_hz))
-        lanes = max(8, min(spec.lanes, (spec.final_ticks if final else spec.ticks) // ticks))
+        lanes = max(8, min(spec.batch, (spec.final_ticks if final else spec.ticks) // ticks))
         windows = problem.draw(ticks, lanes, self.rng)
         descent = descend(
             lambda theta, full: problem.normal_equations(theta, windows, full),

@@ -37,7 +37,7 @@ def residual_spec(form: Residual, training: FreeRunSpec) -> FreeRunSpec:
     """Return the training settings of the network: common twin settings with changes for this formulation."""
     return replace(
         training,
-        lanes=form.lanes,
+        batch=form.batch,
         lengths_s=form.lengths_s,
         updates=form.updates,
         validate_every=form.validate_every,
@@ -70,7 +70,7 @@ def fit_residual(
     """
     spec = residual_spec(form, training)
     ticks = round(spec.validation_s * twin.channels.rate_hz)
-    grey_error = FreeRunValidation(twin.drop_network(), validation, ticks, spec.lanes).error()
+    grey_error = FreeRunValidation(twin.drop_network(), validation, ticks, spec.batch).error()
     fitted = fit_free_runs(twin, train, validation, spec, on_event, run)
     error = min(row["validation"] for row in fitted.history)
     chosen = twin if error < grey_error else twin.drop_network()

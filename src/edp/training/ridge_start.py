@@ -36,7 +36,7 @@ def start_bypass(predictor: Predictor, train: Sequence[Series], validation: Sequ
         DataError: no training segment is as long as the taps plus the largest horizon.
     """
     bypass, task = predictor.bypass, predictor.task
-    if not isinstance(bypass, Bypass) or bypass.spec.start == "zero":
+    if not isinstance(bypass, Bypass) or bypass.spec.init == "zero":
         return False
     read = _columns(task)
     # A target that is no feature has no level to start from: the regression then finds it from the features.
@@ -54,7 +54,7 @@ def start_bypass(predictor: Predictor, train: Sequence[Series], validation: Sequ
             f"than its {bypass.spec.taps} taps plus the horizon of {task.max_horizon}; give longer recordings "
             "or fewer taps"
         )
-    crossed = bypass.spec.start == "crossed"
+    crossed = bypass.spec.init == "cross_validated"
     solution = (
         cross_validate_ridge(series_of_parts[0] + series_of_parts[1], lags)
         if crossed

@@ -22,7 +22,7 @@ class ScheduleState:
 class ScheduleSpec(Protocol):
     """Options of a schedule."""
 
-    def factor(self, progress: float, state: ScheduleState) -> float:
+    def rate_factor(self, progress: float, state: ScheduleState) -> float:
         """Share of the base learning rate at `progress` in [0, 1] of the run."""
         ...
 
@@ -53,7 +53,7 @@ class Constant:
     def __post_init__(self) -> None:
         check_bounds("schedule", self, warmup=SHARE)
 
-    def factor(self, progress: float, state: ScheduleState) -> float:
+    def rate_factor(self, progress: float, state: ScheduleState) -> float:
         return _ramp(progress, self.warmup)
 
     def observe(self, validation: float, state: ScheduleState) -> None:
@@ -63,26 +63,26 @@ class Constant:
 @SCHEDULES.register("cosine")
 @dataclass(frozen=True, kw_only=True)
 class Cosine:
-    """Half a cosine from the base rate to the fraction `floor`, after a warm-up.
+    """Half a cosine from the base rate to the fraction `min_lr_ratio`, after a warm-up.
 
     Attributes:
         warmup: share of the run in which the rate rises from zero.
-        floor: share of the base rate at the end.
+        min_lr_ratio: share of the base rate at the end.
     """
 
     # A short warm-up: moments of the optimiser are unreliable in the first updates.
     warmup: float = 0.03
-    floor: float = 0.01
+    min_lr_ratio: float = 0.01
 
     def __post_init__(self) -> None:
-        check_bounds("schedule", self, warmup=SHARE, floor=SHARE)
+        check_bounds("schedule", self, warmup=SHARE, min_lr_ratio=SHARE)
 
-    def factor(self, progress: float, state: ScheduleState) -> float:
+    def rate_factor(self, progress: float, state: ScheduleState) -> float:
         if progress < self.warmup:
             return _ramp(progress, self.warmup)
         # The guard serves a warm-up of the whole run, where the cosine has no length.
         done = (progress - self.warmup) / max(1e-9, 1.0 - self.warmup)
-        return self.floor + (1.0 - self.floor) * 0.5 * (1.0 + math.cos(math.pi * min(1.0, done)))
+        return self.min_lr_ratio + (1.0 - self.min_lr_ratio) * 0.5 * (1.0 + math.cos(math.pi * min(1.0, done)))
 
     def observe(self, validation: float, state: ScheduleState) -> None:
         """Ignore the validation error."""
@@ -91,25 +91,30 @@ class Cosine:
 @SCHEDULES.register("one_cycle")
 @dataclass(frozen=True, kw_only=True)
 class OneCycle:
-    """Rise from fraction `start` to the base rate over `rise` of the run, then fall to `floor`, both along a cosine.
+    """Learning rate that rises along a cosine, then falls along a cosine.
+
+    It rises from the fraction `start_lr_ratio` to the base rate over the fraction `warmup` of the run, then falls to
+    `min_lr_ratio`.
 
     Attributes:
-        rise: share of the run that rises.
-        start: share of the base rate at the beginning.
-        floor: share of the base rate at the end.
+        warmup: share of the run that rises.
+        start_lr_ratio: share of the base rate at the beginning.
+        min_lr_ratio: share of the base rate at the end.
     """
 
-    rise: float = 0.3
-    start: float = 0.04
-    floor: float = 1e-3
+    warmup: float = 0.3
+    start_lr_ratio: float = 0.04
+    min_lr_ratio: float = 1e-3
 
     def __post_init__(self) -> None:
-        check_bounds("schedule", self, rise=SHARE, start=SHARE, floor=SHARE)
+        check_bounds("schedule", self, warmup=SHARE, start_lr_ratio=SHARE, min_lr_ratio=SHARE)
 
-    def factor(self, progress: float, state: ScheduleState) -> float:
-        if progress < self.rise:
-            return _interpolate_cosine(self.start, 1.0, progress / self.rise)
-        return _interpolate_cosine(1.0, self.floor, min(1.0, (progress - self.rise) / max(1e-9, 1.0 - self.rise)))
+    def rate_factor(self, progress: float, state: ScheduleState) -> float:
+        if progress < self.warmup:
+            return _interpolate_cosine(self.start_lr_ratio, 1.0, progress / self.warmup)
+        return _interpolate_cosine(
+            1.0, self.min_lr_ratio, min(1.0, (progress - self.warmup) / max(1e-9, 1.0 - self.warmup))
+        )
 
     def observe(self, validation: float, state: ScheduleState) -> None:
         """Ignore the validation error."""
@@ -118,26 +123,31 @@ class OneCycle:
 @SCHEDULES.register("plateau")
 @dataclass(frozen=True, kw_only=True)
 class Plateau:
-    """Multiply the rate by `shrink` when the validation score has not improved for `patience` epochs.
+    """Multiply the rate by `factor` when the validation score has not improved for `patience` epochs.
 
     Attributes:
-        shrink: factor of each reduction.
+        factor: factor of each reduction.
         patience: epochs without improvement before a reduction.
         threshold: relative improvement that counts.
-        floor: smallest share of the base rate.
+        min_lr_ratio: smallest share of the base rate.
     """
 
-    shrink: float = 0.5
+    factor: float = 0.5
     patience: int = 5
     threshold: float = 1e-4
-    floor: float = 1e-3
+    min_lr_ratio: float = 1e-3
 
     def __post_init__(self) -> None:
         check_bounds(
-            "schedule", self, shrink=SHARE, patience=integer(0, MAX_EPOCHS), threshold=below(0.0, 1.0), floor=SHARE
+            "schedule",
+            self,
+            factor=SHARE,
+            patience=integer(0, MAX_EPOCHS),
+            threshold=below(0.0, 1.0),
+            min_lr_ratio=SHARE,
         )
 
-    def factor(self, progress: float, state: ScheduleState) -> float:
+    def rate_factor(self, progress: float, state: ScheduleState) -> float:
         return state.factor
 
     def observe(self, validation: float, state: ScheduleState) -> None:
@@ -148,7 +158,7 @@ class Plateau:
             return
         state.waited += 1
         if state.waited > self.patience:  # epochs without gain, then one step down
-            state.factor, state.waited = max(self.floor, state.factor * self.shrink), 0
+            state.factor, state.waited = max(self.min_lr_ratio, state.factor * self.factor), 0
 
 
 def _interpolate_cosine(start: float, end: float, share: float) -> float:

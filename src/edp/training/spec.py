@@ -63,7 +63,7 @@ class TrainingSpec:
         refit: train again on training and validation segments together, for short data: ``best`` for as many epochs as
             were best before, ``whole`` for all of them, to the end of the schedule, ``none`` not at all. The
             calibration of intervals stays that of the first training.
-        bagging: train a committee on folds, by rows and not by chunks; of the other settings only `loss`, `seed` and
+        ensemble: train a committee on folds, by rows and not by chunks; of the other settings only `loss`, `seed` and
             `threads` then count. None trains in chunks, and so does what begins with given weights or a teacher.
         clip_norm: largest global gradient norm.
         seed: root of every random choice.
@@ -90,7 +90,7 @@ class TrainingSpec:
     # Some epochs of patience: noise of the validation score alone must not end a training.
     patience: int = 8
     refit: str = "none"
-    bagging: BaggingSpec | None = None
+    ensemble: BaggingSpec | None = None
     # Recurrent networks have rare steep gradients; the norm of 1 bounds the step that these cause.
     clip_norm: float = 1.0
     seed: int = 0
@@ -138,12 +138,12 @@ def to_gradient_training(spec: TrainingSpec) -> TrainingSpec:
 
     Chunks and updates an epoch are those of a committee where the spec leaves its defaults; all else stays.
     """
-    if spec.bagging is None:
+    if spec.ensemble is None:
         return spec
     chunks = ChunkSpec(length=GRADIENT_CHUNK, batch=GRADIENT_LANES, burn_in=0)
     return replace(
         spec,
-        bagging=None,
+        ensemble=None,
         chunks=chunks if spec.chunks == ChunkSpec() else spec.chunks,
         updates=spec.updates or GRADIENT_UPDATES,
     )
@@ -179,8 +179,8 @@ def check_training(task: Task, model: ModelSpec, spec: TrainingSpec) -> None:
             f"adaptive.blend = {spec.adaptive.blend} weighs outputs against one another, but the task has one target "
             f"('{task.targets[0]}'); set it to 0"
         )
-    if spec.bagging is not None:
-        reasons += _list_bagging_conflicts(model, spec, spec.bagging)
+    if spec.ensemble is not None:
+        reasons += _list_bagging_conflicts(model, spec, spec.ensemble)
     if reasons:
         raise ConfigError("training: " + "; ".join(reasons))
 
@@ -192,15 +192,15 @@ def check_fitted_parts(model: ModelSpec, spec: TrainingSpec) -> None:
         ConfigError: it has trees, which no gradient reaches, or limits that only such a training sets.
     """
     backbone = model.backbone
-    if spec.bagging is None and isinstance(backbone, CommitteeSpec) and backbone.bounded:
+    if spec.ensemble is None and isinstance(backbone, CommitteeSpec) and backbone.clip_inputs:
         raise ConfigError(
-            "training: model.backbone.bounded = true, but only a training on folds sets limits (a table "
-            "training.bagging, as in the preset 'committee'); take one, or set bounded = false"
+            "training: model.backbone.clip_inputs = true, but only a training on folds sets limits (a table "
+            "training.ensemble, as in the preset 'ensemble'); take one, or set clip_inputs = false"
         )
-    if spec.bagging is None and isinstance(backbone, CommitteeSpec) and backbone.trees:
+    if spec.ensemble is None and isinstance(backbone, CommitteeSpec) and backbone.trees:
         raise ConfigError(
             f"training: model.backbone.trees = {backbone.trees}, but no gradient reaches trees; train on folds (a "
-            "table training.bagging, as in the preset 'committee'), or set trees = 0"
+            "table training.ensemble, as in the preset 'ensemble'), or set trees = 0"
         )
 
 
@@ -211,8 +211,8 @@ def _list_bagging_conflicts(model: ModelSpec, spec: TrainingSpec, bagging: Baggi
         reasons.append(
             "bagging trains model.backbone = 'committee' with model.head = 'linear'; take these, or leave it"
         )
-    elif model.backbone.members % (bagging.folds * (2 if bagging.robust_width else 1)):
-        twice = "twice " if bagging.robust_width else ""
+    elif model.backbone.members % (bagging.folds * (2 if bagging.huber_delta else 1)):
+        twice = "twice " if bagging.huber_delta else ""
         reasons.append(
             f"bagging.folds = {bagging.folds} with {model.backbone.members} members; a multiple of {twice}the folds "
             f"must hold{' with bagging.robust_width' if twice else ''}"

@@ -17,9 +17,9 @@ from edp.workflows.twin import train_twin
 
 RECORDINGS = 5
 """Number of simulated recordings: three for training, one each for validation and test."""
-JUDGED = ("judge.seconds=2", "judge.starts=1", "judge.at_s=[1]")
+JUDGED = ("evaluation.duration_s=2", "evaluation.starts=1", "evaluation.at_s=[1]")
 TWINS = {
-    "greybox": ("twin.stretches=5", "twin.fit.lengths_s=[0.1]", "twin.fit.rounds=[1]", "twin.fit.starts=1",
+    "greybox": ("twin.curve_segments=5", "twin.fit.lengths_s=[0.1]", "twin.fit.rounds=[1]", "twin.fit.starts=1",
                 "twin.fit.steps=1", "twin.fit.final_rounds=0", "twin.fit.ticks=100", "twin.fit.validation_s=0.5"),
     "recurrent": ("twin.units=2", "training.updates=[1]", "training.lengths_s=[0.2]", "training.validation_s=0.5"),
 }  # fmt: skip

@@ -110,7 +110,9 @@ def quantise_twin(bundle: Bundle, calibration: DataSource) -> Bundle:
     """
     plant = bundle.predictor
     if not isinstance(plant, TwinPlant):
-        raise ConfigError("only a twin is brought into W8A16 while it is exported; a network by edp quantise RUN")
+        raise ConfigError(
+            "only a twin is brought into W8A16 while it is exported; a network by edp compress quantise RUN"
+        )
     channels, rows = plant.twin.channels, []
     for recording in calibration.read():
         series = channels.task().series(matched(channels, recording))

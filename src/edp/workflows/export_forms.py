@@ -89,7 +89,7 @@ def _follower(order: ExportOrder) -> list[Path]:
 
 RUN_FORMS: Mapping[str, RunForm] = {
     "controller": RunForm(
-        "C99, float32: the controller of a run of edp control, with model and solver", "machine", _controller
+        "C99, float32: the controller of a run of edp loop run, with model and solver", "machine", _controller
     ),
     "follower": RunForm(
         "C99, float64: a grey box that follows the machine, and moves a network's predictions",

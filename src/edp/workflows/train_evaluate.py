@@ -139,7 +139,7 @@ def train(
     """
     check_claimable(out, "network")
     # The judge changes no weights: the same run may be judged in several ways.
-    settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
+    settings = {part: values for part, values in plain_tree(experiment).items() if part != "evaluation"}
     if experiment.model.physics is not None:  # an unknown machine is reported before recordings are read
         # The machine's numbers are part of the key: its file may change under the same name.
         settings["machine"] = experiment.model.physics.digest()
@@ -148,7 +148,7 @@ def train(
     taught = {} if strategy_factory is None else {"strategy": dict(strategy_factory.facts)}
     frozen = {} if strategy_factory is None else strategy_factory.frozen
     data = data or prepare_data(source, experiment, frozen)
-    check_scored(data, experiment.judge)
+    check_scored(data, experiment.evaluation)
     key = run_key(settings | taught, data.digest)
     with Run.create(out, "network", key, experiment_toml(experiment)) as run:
         _refuse_diverged(run)
@@ -255,8 +255,8 @@ def evaluate(
         target = make_folder(folder / f"on_{source.short_name}")
     data, drawn = judged_data(bundle, data, others, at_most_h)
     judged += [part.name for part in data.test] if drawn else []
-    chosen = experiment.judge if baselines is None else replace(experiment.judge, baselines=tuple(baselines))
-    settings = plain_tree(replace(experiment, judge=chosen))["judge"]
+    chosen = experiment.evaluation if baselines is None else replace(experiment.evaluation, baselines=tuple(baselines))
+    settings = plain_tree(replace(experiment, evaluation=chosen))["evaluation"]
     # Settings may leave the first tick to what models need, which versions have seen differently.
     how = {"judge": settings, "first": first_scored(bundle.predictor, data, chosen)}
     key = run_key(how | {"weights": weights_digest(bundle.predictor)}, " ".join(judged))

@@ -15,7 +15,7 @@ TINY = {
     "training.chunks": {"regime": "chunk", "length": 32, "batch": 4, "burn_in": 10},
     "model.backbone": {"kind": "hybrid", "channels": [4], "kernel": 3, "units": 4},
     "model.window": 12,
-    "judge.history": 5,
+    "evaluation.history": 5,
 }
 
 

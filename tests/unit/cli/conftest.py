@@ -31,7 +31,7 @@ SMALL = (
     'model.backbone={kind="hybrid",channels=[6],kernel=3,units=6}',
     "model.head.hidden=6",
     "model.window=12",
-    "judge.history=5",
+    "evaluation.history=5",
 )
 
 
@@ -51,7 +51,7 @@ class Ended:
 
 @pytest.fixture
 def edp(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Ended]:
-    """Run a command line: ``edp("inspect", folder)``."""
+    """Run a command line: ``edp("data", "check", folder)``."""
     monkeypatch.setenv("TERM", "dumb")
 
     def run(*args: object) -> Ended:

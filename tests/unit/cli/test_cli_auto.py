@@ -24,7 +24,7 @@ def test_train_says_what_it_chose_and_why(edp, logs, tmp_path):
     assert facts["minutes"] == 0.01
     again = edp("train", logs, "--out", run, *SETTINGS, "--json")
     assert again.json["sentence"] == facts["sentence"]
-    chunks = edp("distil", run, "--units", "4", "--out", tmp_path / "small", "--set", "training.epochs=3")
+    chunks = edp("compress", "distil", run, "--units", "4", "--out", tmp_path / "small", "--set", "training.epochs=3")
     assert chunks.code == 1
     reasons = {"linear": "has no width", "committee": "training.epochs: the student of a committee learns on rows"}
     assert reasons[facts["chosen"]] in chunks.err
@@ -112,7 +112,7 @@ def test_one_recording_is_divided_by_time(edp, tmp_path):
     ended = edp("train", *log(tmp_path, 900), "--out", tmp_path / "run", "--set", "task.horizons=[2]")
     assert ended.code == 0, ended.err
     split = tomllib.loads((tmp_path / "run" / "config.toml").read_text())["split"]
-    assert split == {"kind": "time", "validation_share": 0.15, "test_share": 0.2, "whole_short": False}
+    assert split == {"kind": "time", "validation_fraction": 0.15, "test_fraction": 0.2, "train_short_recordings": False}
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,10 @@ import sys
 
 import numpy as np
 import pytest
+from typer.main import get_command
 
 from edp import __version__
-from edp.cli import app, demo
+from edp.cli import PANELS, app, demo
 from edp.cli import train as train_command
 from edp.cli.console import duration
 from edp.logs import read_recording
@@ -19,26 +20,50 @@ from edp.training import load_bundle
 from edp.workflows.parity import record_case
 
 LIMIT = [w for s in ("moments=4", "branches=4", "horizons=[1,10]") for w in ("--set", f"limit.{s}")]
-COMMANDS = [command.name for command in app.registered_commands]
-EXPECTED = [
-    *("demo", "simulate", "inspect", "screen", "animate", "train", "evaluate", "distil", "compress", "footprint"),
-    *("quantise", "export", "parity", "pretrain", "finetune", "adapt", "replay", "report", "twin", "rollout"),
-    *("identify", "control", "tune", "init", "runs", "doctor", "compare", "live", "forecast"),
-]
+EXPECTED = {
+    *("init", "demo", "doctor", "data check", "data screen", "data animate", "data add-forecasts", "data store build"),
+    *("data store verify", "train run", "train finetune", "train pretrain", "twin", "search run", "search status"),
+    *("search report", "search export", "evaluate", "compare", "report", "runs", "rollout", "compress distil"),
+    *("compress quantise", "compress search", "compress estimate", "export", "verify", "adapt run", "adapt replay"),
+    *("simulate", "calibrate", "loop run", "loop tune", "monitor fit", "monitor run", "monitor report", "live"),
+    *("fleet report", "fleet network", "registry add", "registry list", "registry show"),
+}
+DIRECT = ("train", "search", "adapt")
+"""Groups that take data directly."""
+
+
+def leaves(node, words=()):
+    below = getattr(node, "commands", None)
+    if below is None:
+        yield " ".join(words)
+    else:
+        for name, inner in below.items():
+            yield from leaves(inner, (*words, name))
+
+
+COMMANDS = list(leaves(get_command(app)))
 
 
 def test_all_commands_are_known_here():
-    assert sorted(COMMANDS) == sorted(EXPECTED)
+    assert set(COMMANDS) == EXPECTED
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_shows_an_example_and_the_json_option(edp, command):
-    ended = edp(command, "--help")
+def test_help_shows_an_example_the_exit_codes_and_the_json_option(edp, command):
+    ended = edp(*command.split(), "--help")
     assert ended.code == 0
     words = " ".join(ended.out.split())
     assert "Example: " in words
-    assert f"edp {command}" in words
+    group = command.removesuffix(" run")
+    assert f"edp {group if group in DIRECT else command}" in words
+    assert "Exit codes:" in words
     assert "--json" in words
+
+
+def test_panels_stand_in_the_order_of_the_work(edp):
+    shown = edp("--help").out
+    places = [shown.index(f" {panel} ") for panel, _ in PANELS]
+    assert places == sorted(places)
 
 
 def test_version_and_an_unknown_command(edp):
@@ -60,7 +85,7 @@ def test_whole_path_from_the_simulator_to_the_page(edp, tmp_path, small):
     assert made["recordings"] == 4
     assert len(list(data.glob("*.parquet"))) == 4
 
-    seen = edp("inspect", data, "--json")
+    seen = edp("data", "check", data, "--json")
     assert (seen.code, seen.json["errors"], len(seen.json["recordings"])) == (0, 0, 4)
 
     trained = edp("train", data, "--out", run, *small, "--json").json
@@ -75,7 +100,7 @@ def test_whole_path_from_the_simulator_to_the_page(edp, tmp_path, small):
     # Five updates make a network that may lose to a line, which the headline then says.
     assert "ahead" in page["headline"] or "less error than the network" in page["headline"]
 
-    counts = edp("footprint", run / "bundle", "--json").json
+    counts = edp("compress", "estimate", run / "bundle", "--json").json
     assert counts["parameters"] == trained["parameters"]
 
     kept = edp("simulate", data, "--minutes", 0.8, "--recordings", 4, "--seed", 3)
@@ -86,13 +111,13 @@ def test_whole_path_from_the_simulator_to_the_page(edp, tmp_path, small):
 
 
 def test_output_for_people_names_the_next_command(edp, logs, trained, tmp_path, small):
-    assert f"edp train {logs}" in edp("inspect", logs, "--no-details").out
+    assert f"edp train {logs}" in edp("data", "check", logs, "--no-details").out
     assert "edp evaluate" in edp("train", logs, "--out", tmp_path / "run", *small).out
     judged = edp("evaluate", trained, "--baselines", "persistence").out
     assert "100 ms ahead (k = 10)" in judged
     assert f"edp report {trained}" in judged
     assert "report.html" in edp("report", trained).out
-    assert "MACs per tick" in edp("footprint", trained).out
+    assert "MACs per tick" in edp("compress", "estimate", trained).out
     assert "read predictor.h first" in edp("export", trained, "--to", "c", "--out", tmp_path / "c").out
 
 
@@ -150,7 +175,7 @@ def test_report_refuses_a_file_that_is_no_budget(edp, trained, tmp_path, content
 def test_demo_runs_its_four_steps(edp, tmp_path, monkeypatch, small):
     monkeypatch.setattr(demo, "MINUTES", 0.8)
     monkeypatch.setattr(demo, "RECORDINGS", 4)
-    whole, fewer = train_command.run, 'judge.baselines=["persistence", "ridge_arx"]'
+    whole, fewer = train_command.run, 'evaluation.baselines=["persistence", "ridge_arx"]'
 
     def shorter(data, run, *, preset, changes, quiet):
         return whole(data, run, preset=preset, changes=[*changes, *small[3::2], fewer], quiet=quiet)
@@ -168,7 +193,7 @@ def test_demo_runs_its_four_steps(edp, tmp_path, monkeypatch, small):
 def test_inspection_of_a_faulty_log_ends_with_code_3(edp, tmp_path):
     log = tmp_path / "drive.csv"
     log.write_text("time,CylVels_1\n0,1\n0.01,\n0.02,2\n0.03,2\n")
-    ended = edp("inspect", log, "--json")
+    ended = edp("data", "check", log, "--json")
     assert ended.code == 3
     assert ended.json["errors"] == 1
     assert "--repair" in ended.err
@@ -269,20 +294,20 @@ def test_soil_family_and_format_of_the_command_line_go_before_the_scenario_file(
 
 def test_inspect_shows_and_draws_what_the_data_cover(edp, logs, tmp_path):
     page = tmp_path / "coverage.html"
-    shown = edp("inspect", logs, "--details", "--split", "time", "--page", page)
+    shown = edp("data", "check", logs, "--details", "--split", "time", "--page", page)
     assert shown.code == 0
     assert "smallest singular value" in shown.out
     assert "test to train, median" in shown.out
     assert "not met" in shown.out
     assert page.read_text(encoding="utf-8").lower().startswith("<!doctype html>")
-    plain = edp("inspect", logs, "--json").json
+    plain = edp("data", "check", logs, "--json").json
     assert plain["coverage"]["recordings"] == len(plain["recordings"])
     assert not all(figure["met"] for figure in plain["coverage"]["wanted"])
-    assert edp("inspect", logs, "--no-coverage", "--json").json["coverage"] is None
-    wrong = edp("inspect", logs, "--inputs", "BmUpp")
+    assert edp("data", "check", logs, "--no-coverage", "--json").json["coverage"] is None
+    wrong = edp("data", "check", logs, "--inputs", "BmUpp")
     assert wrong.code == 1
     assert "did you mean 'BmUp'" in wrong.err
-    assert "did you mean 'time'" in edp("inspect", logs, "--split", "tme").err
+    assert "did you mean 'time'" in edp("data", "check", logs, "--split", "tme").err
 
 
 def test_the_report_says_the_limit_of_a_simulated_data_set(edp, tmp_path, small):
@@ -296,14 +321,14 @@ def test_the_report_says_the_limit_of_a_simulated_data_set(edp, tmp_path, small)
 
 
 def test_parity_holds_every_form_against_pytorch(edp, trained, logs):
-    found = json.loads(edp("parity", trained, "--form", "torch_ticks", "--form", "c", "--ticks", 80, "--json").out)
+    found = json.loads(edp("verify", trained, "--form", "torch_ticks", "--form", "c", "--ticks", 80, "--json").out)
     assert found["failed"] == []
     assert {row["verdict"] for row in found["rows"]} <= {"same", "not run"}
-    shown = edp("parity", trained, "--form", "torch_ticks", "--data", logs, "--ticks", 60).out
+    shown = edp("verify", trained, "--form", "torch_ticks", "--data", logs, "--ticks", 60).out
     assert "60 ticks against PyTorch" in shown
 
 
 def test_distil_says_how_to_give_the_width_of_the_student(edp, tmp_path):
-    refused = edp("distil", tmp_path, "--out", tmp_path / "small")
+    refused = edp("compress", "distil", tmp_path, "--out", tmp_path / "small")
     assert refused.code == 1
     assert "the width of the student is missing; give it with --units, such as --units 64" in refused.err

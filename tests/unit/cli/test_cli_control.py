@@ -1,4 +1,4 @@
-"""``edp control`` and ``edp tune``: run folders, pages, plants exchanged by one option, and what is refused."""
+"""``edp loop run`` and ``edp loop tune``: run folders, pages, plants exchanged by one option, and what is refused."""
 
 import json
 
@@ -24,7 +24,7 @@ def twin_run(tmp_path_factory):
 
 def test_a_run_says_its_score_first_and_leaves_results_recordings_and_a_page(edp, tmp_path):
     run = tmp_path / "run"
-    ended = edp("control", run, "--task", "grade", "--machine", "M22", "--controller", "pi", "--seeds", 2, *LINE)
+    ended = edp("loop", "run", run, "--task", "grade", "--machine", "M22", "--controller", "pi", "--seeds", 2, *LINE)
     assert ended.code == 0
     first = ended.out.splitlines()[0]
     assert first.startswith("pi keeps the bucket tip")
@@ -42,7 +42,7 @@ def test_a_run_says_its_score_first_and_leaves_results_recordings_and_a_page(edp
 
 
 def test_a_twin_is_the_plant_with_one_option(edp, tmp_path, twin_run):
-    ended = edp("control", tmp_path / "run", "--seeds", 1, "--plant", twin_run, *LINE, "--json")
+    ended = edp("loop", "run", tmp_path / "run", "--seeds", 1, "--plant", twin_run, *LINE, "--json")
     assert ended.code == 0
     assert ended.json["plant"] == "the twin"
     assert ended.json["summary"]["energy_kj"] is None
@@ -58,7 +58,7 @@ def test_the_controller_may_use_a_twin(edp, tmp_path, twin_run):
 
 def test_a_controller_that_was_run_is_exported(edp, tmp_path, twin_run):
     run = tmp_path / "run"
-    assert edp("control", run, "--seeds", 1, *LINE).code == 0
+    assert edp("loop", "run", run, "--seeds", 1, *LINE).code == 0
     ended = edp("export", run, "--to", "controller", "--out", tmp_path / "c")
     assert ended.code == 0
     assert "read machine_control.h first" in ended.out
@@ -70,7 +70,7 @@ def test_a_controller_that_was_run_is_exported(edp, tmp_path, twin_run):
     for words, text in (
         ((run, "--w8a16", run), "only twins are brought into W8A16"),
         ((run, "--set", "tangent=true"), "no such option"),
-        ((twin_run,), "give a folder that edp control wrote"),
+        ((twin_run,), "give a folder that edp loop run wrote"),
     ):
         refused = edp("export", *words, "--to", "controller", "--out", tmp_path / "e")
         assert refused.code
@@ -81,7 +81,7 @@ def test_a_controller_that_was_run_is_exported(edp, tmp_path, twin_run):
 def test_gains_are_tuned_on_a_twin_and_judged_on_the_simulator(edp, tmp_path, twin_run):
     run = tmp_path / "tuned"
     words = ("--on", twin_run, "--trials", 3, "--loops", 1, "--seeds", 3)
-    ended = edp("tune", run, "--controller", "pi", *words, *LINE, "--json")
+    ended = edp("loop", "tune", run, "--controller", "pi", *words, *LINE, "--json")
     assert ended.code in (0, 6)
     judged = ended.json["judged_mm"]
     assert len(judged["by_reference"]) == 3
@@ -96,7 +96,7 @@ def test_gains_are_tuned_on_a_twin_and_judged_on_the_simulator(edp, tmp_path, tw
     assert tuned.controller.proportional == pytest.approx(best["proportional"], abs=1e-6)
     # The present gains are the first ones that are tried.
     assert ended.json["trials"][0]["gains"]["proportional"] == load_control_experiment().controller.proportional
-    again = edp("control", tmp_path / "run", "--config", run / "tuned.toml", "--json")
+    again = edp("loop", "run", tmp_path / "run", "--config", run / "tuned.toml", "--json")
     assert again.json["summary"]["position_rms_mm"] == pytest.approx(ended.json["judged_mm"]["after"])
 
 
@@ -122,16 +122,16 @@ def test_gains_are_tuned_on_a_twin_and_judged_on_the_simulator(edp, tmp_path, tw
     ],
 )
 def test_mistakes_end_in_one_message(edp, tmp_path, words, message):
-    ended = edp("control", tmp_path / "run", "--seeds", 1, *words)
+    ended = edp("loop", "run", tmp_path / "run", "--seeds", 1, *words)
     assert ended.code == 1
     assert ended.err.count("error:") == 1
     assert message in " ".join(ended.err.split())
 
 
 def test_a_twin_of_another_rate_or_a_soil_is_refused(edp, tmp_path, twin_run):
-    ended = edp("control", tmp_path / "a", "--plant", twin_run, "--seeds", 1, "--set", "rate_hz=50")
+    ended = edp("loop", "run", tmp_path / "a", "--plant", twin_run, "--seeds", 1, "--set", "rate_hz=50")
     assert "100 Hz" in ended.err
-    ended = edp("control", tmp_path / "b", "--plant", twin_run, "--seeds", 1, "--task", "dig")
+    ended = edp("loop", "run", tmp_path / "b", "--plant", twin_run, "--seeds", 1, "--task", "dig")
     assert "a twin knows no soil" in " ".join(ended.err.split())
 
 
@@ -141,7 +141,7 @@ def test_a_twin_of_another_machine_is_refused(edp, tmp_path):
     )
     save_twin(bundle, tmp_path / "c14" / "twin")
     for words in (("--controller", "inversion", "--twin"), ("--plant",)):
-        ended = edp("control", tmp_path / "run", "--seeds", 1, *LINE, *words, tmp_path / "c14")
+        ended = edp("loop", "run", tmp_path / "run", "--seeds", 1, *LINE, *words, tmp_path / "c14")
         assert ended.code == 1
         said = " ".join(ended.err.split())
         assert "strokes of 1.000, 1.000, 0.915 m, those of M22 have 1.260, 1.504, 1.104 m" in said
@@ -152,7 +152,7 @@ def test_a_plan_shorter_than_the_machine_takes_to_answer_is_refused_before_anyth
     pytest.importorskip("daqp", reason="the solver is an optional package")
     save_twin(sample_grey_box(), tmp_path / "grey" / "twin")
     words = ("--controller", "nmpc", "--twin", tmp_path / "grey", "--set", "controller.blocks=[3,2]")
-    ended = edp("control", tmp_path / "run", "--seeds", 1, *LINE, *words)
+    ended = edp("loop", "run", tmp_path / "run", "--seeds", 1, *LINE, *words)
     assert ended.code == 1
     assert "controller.blocks = [3, 2] plans 50 ms ahead" in " ".join(ended.err.split())
     assert not (tmp_path / "run").exists()
@@ -160,9 +160,9 @@ def test_a_plan_shorter_than_the_machine_takes_to_answer_is_refused_before_anyth
 
 def test_a_folder_of_other_settings_is_left_as_it_is(edp, tmp_path):
     run = tmp_path / "run"
-    assert edp("control", run, "--seeds", 1, *LINE).code == 0
+    assert edp("loop", "run", run, "--seeds", 1, *LINE).code == 0
     before = (run / "results.json").read_bytes()
-    ended = edp("control", run, "--seeds", 2, *LINE)
+    ended = edp("loop", "run", run, "--seeds", 2, *LINE)
     assert ended.code == 1
     assert "another run" in ended.err
     assert (run / "results.json").read_bytes() == before
@@ -198,6 +198,6 @@ def test_what_was_refused_does_not_keep_the_corrected_command_out_of_its_folder(
 
 def test_a_table_of_scores_fits_into_a_usual_terminal(edp, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    ended = edp("control", tmp_path / "run", "--seeds", 1, *LINE)
+    ended = edp("loop", "run", tmp_path / "run", "--seeds", 1, *LINE)
     assert "\u2026" not in ended.out
     assert "path, mm" in ended.out

@@ -143,7 +143,7 @@ def test_unknown_preset_machine_format_and_paths(edp, logs, tmp_path):
     refused(edp("train", tmp_path / "none", "--out", run), "none", "does not exist")
     refused(edp("evaluate", tmp_path), "not a bundle", "edp train")
     refused(edp("report", tmp_path), str(tmp_path))
-    refused(edp("footprint", tmp_path / "none.toml"), "none.toml")
+    refused(edp("compress", "estimate", tmp_path / "none.toml"), "none.toml")
     refused(edp("export", tmp_path, "--to", "c", "--out", run), "not a bundle", "edp train")
     refused(
         edp("export", tmp_path, "--to", "see", "--out", run),
@@ -161,7 +161,7 @@ def test_unknown_preset_machine_format_and_paths(edp, logs, tmp_path):
 
 def test_settings_that_are_not_toml(edp, tmp_path):
     (tmp_path / "bad.toml").write_text("[task\n")
-    refused(edp("footprint", tmp_path / "bad.toml"), "bad.toml", "not valid TOML", "line 1")
+    refused(edp("compress", "estimate", tmp_path / "bad.toml"), "bad.toml", "not valid TOML", "line 1")
 
 
 def test_an_unknown_baseline(edp, trained):
@@ -172,13 +172,13 @@ def test_a_bundle_of_a_newer_schema(edp, trained):
     header = trained / "bundle" / "bundle.json"
     held = json.loads(header.read_text())
     header.write_text(json.dumps(held | {"schema": held["schema"] + 3}))
-    refused(edp("footprint", trained), f"schema {held['schema'] + 3}", "reads 8 to 10", "newer EDP")
+    refused(edp("compress", "estimate", trained), f"schema {held['schema'] + 3}", "reads 8 to 10", "newer EDP")
 
 
 def test_damaged_weights(edp, trained):
     (file,) = (trained / "bundle").glob("weights-*")
     file.write_bytes(file.read_bytes()[:-5])
-    refused(edp("footprint", trained), file.name, "digest")
+    refused(edp("compress", "estimate", trained), file.name, "digest")
 
 
 def test_recordings_that_changed_after_training(edp, trained, recording_of, logs, tmp_path):
@@ -219,4 +219,4 @@ def test_a_folder_that_may_not_be_written(edp, trained, monkeypatch):
 def test_a_scenario_file_is_no_data_set_file(edp, tmp_path):
     file = tmp_path / "set.toml"
     file.write_text("recordings = 3")
-    refused(edp("inspect", file), "recordings = 3", "--scenario")
+    refused(edp("data", "check", file), "recordings = 3", "--scenario")

@@ -1,4 +1,4 @@
-"""``edp identify``: from logs to a machine file that ``edp simulate`` takes, and what it refuses."""
+"""``edp calibrate``: from logs to a machine file that ``edp simulate`` takes, and what it refuses."""
 
 import re
 import shutil
@@ -25,11 +25,11 @@ SMALL = (
     *("twin.fit.final_rounds=1", "twin.fit.final_ticks=600"),
     *("twin.fit.validation_s=1", "twin.fit.validation_runs=2", "twin.inertia_degree=1"),
     *(
-        "judge.seconds=2",
-        "judge.starts=3",
-        "judge.at_s=[1, 2]",
-        "judge.calibration_starts=2",
-        'judge.floors=["static"]',
+        "evaluation.duration_s=2",
+        "evaluation.starts=3",
+        "evaluation.at_s=[1, 2]",
+        "evaluation.calibration_starts=2",
+        'evaluation.baselines=["static"]',
     ),
 )
 WORDS = [word for change in SMALL for word in ("--set", change)]
@@ -46,7 +46,7 @@ def logs(tmp_path_factory):
 
 def test_a_machine_file_is_written_that_simulates_and_says_what_is_told(edp, logs, tmp_path):
     file = tmp_path / "mine.toml"
-    ended = edp("identify", logs, "--out", file, *LINKED, "--json")
+    ended = edp("calibrate", logs, "--out", file, *LINKED, "--json")
     # The guess is the machine of these logs, and nothing is nearer to them: it is said, and scripts see it.
     assert (ended.code, ended.json["beaten_by"]) == (6, "machine M22"), ended.err
     machine = load_machine(str(file))
@@ -82,7 +82,7 @@ def test_a_run_of_a_grey_box_is_taken_and_one_of_another_kind_refused(edp, logs,
     for kind, file in (("greybox", "grey"), ("static", "map")):
         settings = [f"twin.kind={kind}", *(word for word in SMALL if kind == "greybox" or "twin." not in word)]
         train_twin(DataSource.from_path(logs), load_twin_experiment(None, settings), tmp_path / file)
-    ended = edp("identify", logs, "--out", tmp_path / "mine.toml", "--run", tmp_path / "grey")
+    ended = edp("calibrate", logs, "--out", tmp_path / "mine.toml", "--run", tmp_path / "grey")
     assert ended.code == 6, ended.err
     assert "machine M22 has" in ended.out.splitlines()[0]
     assert "less error than the machine file" in " ".join(ended.out.split())
@@ -94,11 +94,11 @@ def test_a_run_of_a_grey_box_is_taken_and_one_of_another_kind_refused(edp, logs,
     rows = [row for row in facts["numbers"] if row["label"].startswith("bodies")]
     assert len(rows) == 9
     assert all(row["value"] == row["low"] == row["high"] == row["base"] and not row["excited"] for row in rows)
-    ended = edp("identify", logs, "--out", tmp_path / "other.toml", "--run", tmp_path / "map")
+    ended = edp("calibrate", logs, "--out", tmp_path / "other.toml", "--run", tmp_path / "map")
     assert ended.code == 1
     assert "holds a twin of kind 'static'" in ended.err
     assert not (tmp_path / "other.toml").exists()
-    ended = edp("identify", logs, "--out", tmp_path / "other.toml", "--run", tmp_path / "grey", *WORDS)
+    ended = edp("calibrate", logs, "--out", tmp_path / "other.toml", "--run", tmp_path / "grey", *WORDS)
     assert "a run keeps its own" in " ".join(ended.err.split())
 
 
@@ -120,7 +120,7 @@ def test_logs_and_machines_that_do_not_fit_are_refused_and_nothing_is_written(ed
         ((logs, "--out", tmp_path / "a.toml", "--machine", "M23"), "unknown machine 'M23'"),
     ]
     for words, message in cases:
-        ended = edp("identify", *words, *WORDS)
+        ended = edp("calibrate", *words, *WORDS)
         assert ended.code == 1
         assert message in " ".join(ended.err.split())
     assert not [path for path in tmp_path.iterdir() if path.suffix]
@@ -132,12 +132,12 @@ def test_logs_and_machines_that_do_not_fit_are_refused_and_nothing_is_written(ed
         ("twin.kind=residual", "twin.kind = 'residual' came"),
         ('twin.motors=[{name="swing", velocity="rate"}]', "the grey box has motors; a machine of the simulator has"),
         ("twin.linkage=c14", "the linkage is that of --machine (M22): leave twin.linkage out"),
-        ('twin.without=["play"]', "twin.without = ['play'] leaves out numbers that a machine file has"),
+        ('twin.omit=["play"]', "twin.omit = ['play'] leaves out numbers that a machine file has"),
     ],
 )
 def test_what_is_no_whole_grey_box_is_refused_before_any_fit(edp, logs, tmp_path, change, message):
     kind = () if "kind" in change else ("--set", "twin.kind=greybox")
-    ended = edp("identify", logs, "--out", tmp_path / "mine.toml", *kind, "--set", change)
+    ended = edp("calibrate", logs, "--out", tmp_path / "mine.toml", *kind, "--set", change)
     assert ended.code == 1
     assert message in " ".join(ended.err.split())
     assert not list(tmp_path.glob("mine*"))
@@ -147,7 +147,7 @@ def test_what_is_no_whole_grey_box_is_refused_before_any_fit(edp, logs, tmp_path
 def test_no_file_is_written_over(edp, logs, tmp_path, there):
     """Nor the machine file that the guess comes from; said before any fit."""
     (tmp_path / there).write_text("what a tape measure told")
-    ended = edp("identify", logs, "--out", tmp_path / "mine.toml")
+    ended = edp("calibrate", logs, "--out", tmp_path / "mine.toml")
     assert ended.code == 1
     assert "is there already and is not written over" in " ".join(ended.err.split())
     assert (tmp_path / there).read_text() == "what a tape measure told"
@@ -168,10 +168,10 @@ def test_a_twin_with_a_linkage_is_another_one_once_its_machine_file_changes(edp,
     file.write_text(longer)
     assert edp(*words).code == 1
     # Lengths of one machine and bodies of another are no machine.
-    ended = edp("identify", logs, "--out", tmp_path / "mine.toml", "--run", run, "--machine", file)
+    ended = edp("calibrate", logs, "--out", tmp_path / "mine.toml", "--run", run, "--machine", file)
     assert ended.code == 1
     assert "which is not that of --machine (M22): give the same machine" in " ".join(ended.err.split())
-    ended = edp("identify", logs, "--out", tmp_path / "mine.toml", "--run", run)
+    ended = edp("calibrate", logs, "--out", tmp_path / "mine.toml", "--run", run)
     assert ended.code in (0, 6), ended.err  # the guess is the machine of these logs, and may be nearer
     assert load_machine(str(tmp_path / "mine.toml")).bodies != load_machine("M22").bodies
 

@@ -67,7 +67,7 @@ def test_every_command_that_init_prints_and_a_search_run_on_its_files(edp, tmp_p
     found = edp("search", data, *files, "--study", tmp_path / "study", *SEARCH, "--json")
     assert found.code == 0, found.err
     assert found.json["decisions"][0]["facts"]["features"] == "proposed"
-    assert edp("screen", data, *files, "--out", tmp_path / "screen", "--no-pictures").code == 0
+    assert edp("data", "screen", data, *files, "--out", tmp_path / "screen", "--no-pictures").code == 0
     sessions = tmp_path / "study/sessions.toml"
     assert sessions.exists() == (logs < 5)
     if sessions.exists():

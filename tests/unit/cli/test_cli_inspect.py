@@ -1,4 +1,4 @@
-"""`edp inspect` of logs that nobody described, and of many logs: a line each first."""
+"""`edp data check` of logs that nobody described, and of many logs: a line each first."""
 
 import csv
 import time
@@ -26,25 +26,25 @@ def log(path, seed=0, header=("t", "u [V]", "p [bar]", "gain")):
 @pytest.mark.parametrize("header", [("t", "u [V]", "p [bar]", "gain"), None])
 def test_any_columns_are_inspected_without_a_map(edp, tmp_path, header):
     path = log(tmp_path / "x.csv", header=header)
-    ended = edp("inspect", path, "--json")
+    ended = edp("data", "check", path, "--json")
     assert ended.code == 0
     report = ended.json["recordings"][0]
     assert report["proposed"]
     assert (report["rate_hz"], report["samples"], len(report["channels"])) == (50.0, 600, 3)
     assert {channel["unit"] for channel in report["channels"]} == ({"V", "bar", "1"} if header else {"1"})
-    shown = edp("inspect", path).out
+    shown = edp("data", "check", path).out
     assert f"next: edp init {path}" in shown
     assert "edp init writes a map to check" in shown
 
 
 def test_what_needs_a_map_says_so(edp, tmp_path):
-    ended = edp("inspect", log(tmp_path / "x.csv"), "--split", "time")
+    ended = edp("data", "check", log(tmp_path / "x.csv"), "--split", "time")
     assert ended.code == 1
     assert "edp init proposes one (--map)" in ended.err
 
 
 def test_nearly_known_names_are_still_answered_with_the_names(edp, tmp_path):
-    ended = edp("inspect", log(tmp_path / "x.csv", header=("t", "CylVel_1", "CylVel_2", "b")))
+    ended = edp("data", "check", log(tmp_path / "x.csv", header=("t", "CylVel_1", "CylVel_2", "b")))
     assert ended.code == 3
     assert "did you mean 'CylVels_1'" in ended.out
 
@@ -61,19 +61,19 @@ def excavator(folder, count):
 
 def test_many_logs_have_a_line_each_and_details_on_demand(edp, tmp_path):
     folder = excavator(tmp_path / "logs", 6)
-    short = edp("inspect", folder, "--no-coverage").out
+    short = edp("data", "check", folder, "--no-coverage").out
     assert len(short.splitlines()) < 50
     assert [line.split()[0] for line in short.splitlines()[1:7]] == [f"run_{i}" for i in range(6)]
     # One kind of finding stands once, with the logs that have it.
     assert short.count("CylAcc_1: constant") == 1
     assert "in 6 of 6 logs: run_0, run_1, run_2, run_3, ..." in short
-    assert len(edp("inspect", folder, "--no-coverage", "--details").out.splitlines()) > 200
+    assert len(edp("data", "check", folder, "--no-coverage", "--details").out.splitlines()) > 200
 
 
 def test_tables_fit_into_the_terminal_with_whole_names(edp, tmp_path, monkeypatch):
     folder = excavator(tmp_path / "logs", 1)
     monkeypatch.setenv("COLUMNS", "80")
-    shown = edp("inspect", folder, "--details", "--no-coverage").out
+    shown = edp("data", "check", folder, "--details", "--no-coverage").out
     tables = [line for line in shown.splitlines() if line.startswith(("Cyl", "channel", "Bm", "Am", "Bkt"))]
     assert max(map(len, tables)) <= 80
     for name in TABLE_A1:

@@ -1,4 +1,4 @@
-"""What `edp inspect` says of logs with breaks, and of logs whose channels have no kind."""
+"""What `edp data check` says of logs with breaks, and of logs whose channels have no kind."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def test_gaps_are_one_finding_and_a_repair_of_the_data_set_makes_them_a_warning(
     save(logs / "a.csv", whole)
     save(logs / "gap.csv", np.concatenate([whole[:300], whole[300:700] + 0.3]), 1)
     save(logs / "late.csv", np.concatenate([[0.0], whole[:600] + 25.0]), 2)
-    assert edp("inspect", logs).out.count("error:") == 1
+    assert edp("data", "check", logs).out.count("error:") == 1
     write_proposal(propose(logs), tmp_path / "here")
-    shown = edp("inspect", tmp_path / "here" / DATA).out
+    shown = edp("data", "check", tmp_path / "here" / DATA).out
     assert "error:" not in shown
     assert "repaired when it is read: gaps = cut" in shown
     # What comes next has the settings that lie beside the data-set file.

@@ -29,23 +29,28 @@ pytestmark = [pytest.mark.long, pytest.mark.processes]
 LINE = ("--set", "task.length_m=[0.4,0.5]", "--set", "task.hold_s=0.2")
 RIG = ("BmUp", "CylVels_1", "CylStroke_1", "CylPressures_1", "CylPressures_5")
 TRIALS = (
-    *("trials.random=1", "training.epochs=1", "training.updates=2", "screen.max_lag=20", "screen.pieces=4"),
-    *("screen.information_samples=200", "screen.rank_samples=200", "screen.piece_samples=100"),
-    *("screen.forest.trees=5", "screen.forest.samples=200", "screen.forest.tests=100", "screen.forest.repeats=2"),
+    *("trials.random_sets=1", "training.epochs=1", "training.updates=2", "screen.max_lag=20", "screen.min_segments=4"),
+    *("screen.information_samples=200", "screen.rank_samples=200", "screen.segment_samples=100"),
+    *(
+        "screen.forest.trees=5",
+        "screen.forest.samples=200",
+        "screen.forest.test_samples=100",
+        "screen.forest.repeats=2",
+    ),
 )
 TWIN = (
-    *("twin.kind=recurrent", "twin.units=6", "twin.members=3", "twin.prefix_ticks=20", "training.lanes=4"),
-    *("training.lengths_s=[0.2]", "training.updates=[6]", "training.validate_every=3", "judge.seconds=4"),
-    *("judge.starts=2", "judge.at_s=[1, 4]"),
+    *("twin.kind=recurrent", "twin.units=6", "twin.members=3", "twin.prefix_ticks=20", "training.batch=4"),
+    *("training.lengths_s=[0.2]", "training.updates=[6]", "training.validate_every=3", "evaluation.duration_s=4"),
+    *("evaluation.starts=2", "evaluation.at_s=[1, 4]"),
 )
 AUTO = (
     "auto.candidates=['linear','recurrent']",
     "task.targets=['CylVels_1']",
     "task.horizons=[5]",
-    "judge.baselines=[]",
+    "evaluation.baselines=[]",
 )
 LIMIT = ("limit.moments=4", "limit.branches=4")
-FLEET = ("finetune.rounds=2", "finetune.batch=4", "finetune.check_signs=false")
+FLEET = ("finetune.single_phase_epochs=2", "finetune.batch=4", "finetune.check_signs=false")
 
 
 def settings(values):
@@ -72,37 +77,39 @@ LONG_COMMANDS = {
     "simulate": Divided(
         (
             "{out}",
-            "--minutes",
-            "0.4",
+            "--duration",
+            "24s",
             "--recordings",
             "4",
             "--limit",
             *settings(LIMIT),
         )
     ),
-    "store build": Divided(("{logs}", "--out", "{out}")),
-    "inspect": Divided(("{logs}", "--json"), writes=False),
-    "screen": Divided(("{logs}", "--out", "{out}", "--no-pictures", "--trials", *settings(TRIALS)), True),
+    "data store build": Divided(("{logs}", "--out", "{out}")),
+    "data check": Divided(("{logs}", "--json"), writes=False),
+    "data screen": Divided(("{logs}", "--out", "{out}", "--no-pictures", "--trials", *settings(TRIALS)), True),
     "evaluate": Divided(("{run}", "--baselines", "persistence,ridge_arx,small_mlp")),
-    "finetune": Divided(("{run}", "{log}", "--out", "{out}", "--baselines", "low_rank", *settings(FLEET)), True),
+    "train finetune": Divided(("{run}", "{log}", "--out", "{out}", "--baselines", "low_rank", *settings(FLEET)), True),
     "fleet report": Divided(("{run}", "{fleet}", "--out", "{out}")),
-    "train": Divided(("{logs}", "--out", "{out}", "--minutes", "0.02", *settings(AUTO)), True),
+    "train run": Divided(("{logs}", "--out", "{out}", "--time-budget", "1.2s", *settings(AUTO)), True),
     "twin": Divided(("{actuators}", "--out", "{out}", *settings(TWIN)), True),
-    "monitor fit": Divided(("{rig}", "--out", "{out}", "--hours-per-false-alarm", "0.06", "--minutes", "0.05"), True),
+    "monitor fit": Divided(("{rig}", "--out", "{out}", "--hours-per-false-alarm", "0.06", "--time-budget", "3s"), True),
     "monitor run": Divided(("{monitor}", "{rig}", "--out", "{out}")),
-    "control": Divided(("{out}", "--task", "grade", "--controller", "pi", "--seeds", "3", *LINE)),
-    "tune": Divided(("{out}", "--controller", "pi", "--seeds", "2", "--trials", "3", "--loops", "2", *LINE), True),
+    "loop run": Divided(("{out}", "--task", "grade", "--controller", "pi", "--loops", "3", *LINE)),
+    "loop tune": Divided(
+        ("{out}", "--controller", "pi", "--evaluation-loops", "2", "--trials", "3", "--tuning-loops", "2", *LINE), True
+    ),
 }
 """Commands with a loop that is divided."""
 WHOLE = {
-    "pretrain": "one training: a node of a cluster does it, several processes would have nothing to do",
-    "distil": "one training",
-    "compress": "each stage begins with what the stage before chose",
-    "identify": "stages of one fit, each of which begins where the one before ended",
-    "adapt": "one recursive fit along the logs, in their order",
-    "replay": "one pass along the logs, in their order",
+    "train pretrain": "one training: a node of a cluster does it, several processes would have nothing to do",
+    "compress distil": "one training",
+    "compress search": "each stage begins with what the stage before chose",
+    "calibrate": "stages of one fit, each of which begins where the one before ended",
+    "adapt run": "one recursive fit along the logs, in their order",
+    "adapt replay": "one pass along the logs, in their order",
     "rollout": "one pass along a log",
-    "forecast": "one pass along a log",
+    "data add-forecasts": "one pass along a log",
     "doctor": "compiles, once for an installation",
     "init": "reads heads of logs, which takes seconds",
     "search run": "trainings, which `tests/unit/search` divides and kills",
@@ -111,7 +118,7 @@ WHOLE = {
     "search export": "writes a copy of a study",
     "monitor report": "writes a page",
     "fleet network": "writes one bundle",
-    "store check": "reads samples as fast as the disk gives them",
+    "data store verify": "reads samples as fast as the disk gives them",
 }
 """Commands that report progress, or stand beside one that does, and why their loop is not divided here."""
 TIMES = {
@@ -136,14 +143,14 @@ def leaves(node=None, words=()):
 def test_every_command_with_progress_is_divided_or_says_why_not():
     modules = {name: source_of.getsource(source_of.getmodule(node.callback)) for name, node in leaves()}
     long = {name for name, text in modules.items() if "show_progress(" in text}
-    long |= {"screen", "search run"}  # displays of their own
+    long |= {"data screen", "search run"}  # displays of their own
     assert long <= {*LONG_COMMANDS, *WHOLE}
     assert not LONG_COMMANDS.keys() & WHOLE.keys()
     for name, node in leaves():
         options = {option for parameter in node.params for option in parameter.opts}
         if name in LONG_COMMANDS:
             assert {"--workers", "--cluster", "--open-cluster"} <= options, name
-        elif name not in ("pretrain", "search run"):
+        elif name not in ("train pretrain", "search run"):
             assert not {"--workers", "--cluster"} & options, name
 
 
@@ -257,7 +264,7 @@ def run(edp):
     return call
 
 
-FAST = ("inspect", "control", "evaluate")
+FAST = ("data check", "loop run", "evaluate")
 REFUSED = re.compile("changed since|match its hash")
 READ_AGAIN = (
     "report {run}",

@@ -45,13 +45,13 @@ def test_export_tells_a_monitor_by_its_folder(edp, monitor, tmp_path):
 
 
 def test_footprint_counts_networks_and_what_stands_behind_them(edp, monitor):
-    ended = edp("footprint", monitor, "--json")
+    ended = edp("compress", "estimate", monitor, "--json")
     assert ended.code == 0, ended.err
     facts = json.loads(ended.out)
     assert len(facts["networks"]) >= 2
     assert facts["chain"]["most"] > facts["chain"]["mean"] > 0
     assert {row["what"] for row in facts["verdict"]} == {"cycles per tick", "parameters", "RAM", "flash"}
-    shown = edp("footprint", monitor)
+    shown = edp("compress", "estimate", monitor)
     assert "behind the residuals, in double precision" in shown.out
 
 

@@ -44,7 +44,7 @@ def edp(tmp_path, monkeypatch, capsys):
     return run
 
 
-VALUES = {"delta_kb": "16", "units": "16", "repair": "nan=hold", "split": "time", "most": "5"}
+VALUES = {"delta_kb": "16", "units": "16", "repair": "nan=hold", "split": "time", "max_runs": "5"}
 """Values of parameters that take no path."""
 
 
@@ -57,7 +57,7 @@ def called(command, *names):
             words += [option_word(parameter)] if option else []
             if not getattr(parameter, "is_flag", False):
                 words.append(
-                    {"delta_kb": "16", "units": "16", "repair": "nan=hold", "split": "time", "most": "5"}.get(
+                    {"delta_kb": "16", "units": "16", "repair": "nan=hold", "split": "time", "max_runs": "5"}.get(
                         name, "there"
                     )
                 )
@@ -105,41 +105,47 @@ def test_an_option_beside_one_that_takes_its_effect_is_refused(command, name, ot
 
 FREE_RUNS = {"twin/twin.json": "{}", "free_run.json": "{}"}
 LINES = {
-    ("animate", "horizon"): "animate there --horizon 3",
+    ("data animate", "horizon"): "data animate there --horizon 3",
     **{
         ("evaluate", name): f"evaluate twin_run {option}"
         for name, option in {
             "baselines": "--baselines ridge",
-            "minutes": "--minutes 5",
-            "at_most": "--at-most 2",
+            "time_budget": "--time-budget 5min",
+            "max_hours": "--max-hours 2",
             "channel_importance": "--channel-importance",
             "workers": "--workers 2",
             "cluster": "--cluster there:1",
         }.items()
     },
     ("evaluate", "predictor"): "evaluate run --predictor there",
-    ("monitor fit", "minutes"): """monitor fit there --out new --minutes 3 --set 'residuals=[{kind="balances"}]'""",
-    ("parity", "interpreters"): "parity run --form c --onnxruntime there",
-    ("pretrain", "changes.pretrain"): "pretrain there --out new --set pretrain.shots=4",
+    (
+        "monitor fit",
+        "time_budget",
+    ): """monitor fit there --out new --time-budget 3min --set 'residuals=[{kind="balances"}]'""",
+    ("verify", "interpreters"): "verify run --format c --onnxruntime there",
+    ("train pretrain", "changes.pretrain"): "train pretrain there --out new --set pretrain.shots=4",
     ("report", "limit"): "report twin_run --limit there",
     ("report", "budget"): "report twin_run --budget there",
-    **{("screen", f"changes.{table}"): f"screen there --out new --set {table}.any=1" for table in TRIAL_TABLES},
-    ("search run", "budget"): "search there --study new --budget budget.toml --set search.compression.on=false",
+    **{
+        ("data screen", f"changes.{table}"): f"data screen there --out new --set {table}.any=1"
+        for table in TRIAL_TABLES
+    },
+    ("search run", "budget"): "search there --out new --budget budget.toml --set search.compression.on=false",
     ("simulate", "changes.limit"): "simulate new --set limit.moments=60",
-    ("train", "minutes"): "train there --out new --preset quick --minutes 5",
-    ("train", "workers"): "train there --out new --preset quick --workers 2",
-    ("train", "cluster"): "train there --out new --preset quick --cluster there:1",
-    ("twin", "minutes"): "twin there --out new --set twin.kind=recurrent --minutes 5",
+    ("train run", "time_budget"): "train there --out new --preset quick --time-budget 5min",
+    ("train run", "workers"): "train there --out new --preset quick --workers 2",
+    ("train run", "cluster"): "train there --out new --preset quick --cluster there:1",
+    ("twin", "time_budget"): "twin there --out new --set twin.kind=recurrent --time-budget 5min",
     ("twin", "workers"): "twin there --out new --set twin.kind=static --workers 2",
     ("twin", "cluster"): "twin there --out new --set twin.kind=static --cluster there:1",
 }
 """A command line for each option of `DEPENDENT`, with settings or files by which it has no effect."""
 MORE_LINES = [
-    (("evaluate", "minutes"), "evaluate run --minutes 5 --workers 2"),
-    (("evaluate", "minutes"), "evaluate run --minutes 5 --baselines none"),
+    (("evaluate", "time_budget"), "evaluate run --time-budget 5min --workers 2"),
+    (("evaluate", "time_budget"), "evaluate run --time-budget 5min --baselines none"),
     (("simulate", "changes.limit"), "simulate new --set seed=3 --set limit={moments=4}"),
-    (("train", "workers"), "train there --out new --workers 2 --set training.epochs=3"),
-    (("twin", "minutes"), "twin there --out new --start there --minutes 5"),
+    (("train run", "workers"), "train there --out new --workers 2 --set training.epochs=3"),
+    (("twin", "time_budget"), "twin there --out new --start there --time-budget 5min"),
     (("twin", "workers"), "twin there --out new --set ground=drag --start there --workers 2"),
     (("twin", "workers"), "twin there --out new --set twin.kind=greybox --workers 2"),
 ]
@@ -170,7 +176,7 @@ def test_an_option_without_effect_by_settings_or_files_is_refused(option, line, 
 
 
 @pytest.mark.parametrize("kind", list(CONTROLLERS))
-@pytest.mark.parametrize("command", ["control new", "tune new", "live --loop grade"])
+@pytest.mark.parametrize("command", ["loop run new", "loop tune new", "live --loop grade"])
 def test_a_model_that_no_part_of_the_controller_uses_is_refused(kind, command, edp):
     """Every registered controller: each model that it does not need, and the second of two alternatives."""
     needs = " ".join(CONTROLLERS[kind].needs).split()
@@ -194,7 +200,7 @@ def test_a_map_and_repairs_belong_to_logs_in_every_command():
 
 FREE = {
     "live": "each source declares its options",
-    "animate": "its log is one of several paths",
+    "data animate": "its log is one of several paths",
     "monitor fit": "its logs are the last of several paths",
-    "finetune": "refused beside --fleet by the command",
+    "train finetune": "refused beside --fleet by the command",
 }

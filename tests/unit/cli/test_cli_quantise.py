@@ -1,4 +1,4 @@
-"""``edp quantise``: a run in integers is judged and exported as such."""
+"""``edp compress quantise``: a run in integers is judged and exported as such."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from edp.training.bundle import INTEGER_SCHEMA
 
 def test_a_quantised_run_is_judged_and_exported_in_whole_numbers(edp, trained, tmp_path):
     whole = tmp_path / "whole"
-    found = edp("quantise", trained, "--out", whole, "--ticks", 1000, "--json").json
+    found = edp("compress", "quantise", trained, "--out", whole, "--ticks", 1000, "--json").json
     assert 0 < found["integer"] < 1.2 * found["float"]
     (listed,) = edp("runs", whole, "--json").json["runs"]
     assert listed["state"] == "finished"
@@ -31,7 +31,7 @@ def test_a_quantised_run_is_judged_and_exported_in_whole_numbers(edp, trained, t
     header = json.loads((whole / "bundle" / "bundle.json").read_text())
     assert (header["schema"], header["number_format"]) == (INTEGER_SCHEMA, "w8a16")
     assert load_bundle(whole).scores
-    counts = [edp("footprint", run, "--json").json for run in (whole, trained)]
+    counts = [edp("compress", "estimate", run, "--json").json for run in (whole, trained)]
     assert counts[0] == counts[1]
     made = edp("export", whole, "--to", "c", "--out", tmp_path / "c", "--json").json
     assert any(file.endswith("edp_integer.c") for file in made["files"])
@@ -39,11 +39,11 @@ def test_a_quantised_run_is_judged_and_exported_in_whole_numbers(edp, trained, t
 
 def test_what_cannot_be_quantised_is_said(edp, trained, tmp_path):
     whole = tmp_path / "whole"
-    edp("quantise", trained, "--out", whole, "--ticks", 1000)
-    again = edp("quantise", whole, "--out", tmp_path / "twice")
+    edp("compress", "quantise", trained, "--out", whole, "--ticks", 1000)
+    again = edp("compress", "quantise", whole, "--out", tmp_path / "twice")
     assert again.code == 1
     assert "computes in w8a16 already; give the float run" in again.err
-    over = edp("quantise", trained, "--out", trained)
+    over = edp("compress", "quantise", trained, "--out", trained)
     assert over.code == 1
     assert "holds another run" in over.err
     assert not (tmp_path / "twice").exists()

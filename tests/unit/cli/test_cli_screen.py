@@ -1,4 +1,4 @@
-"""``edp screen`` and what it leaves, up to a training on the proposed set."""
+"""``edp data screen`` and what it leaves, up to a training on the proposed set."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ QUICK = [
         "pieces=6",
         "information_samples=400",
         "rank_samples=800",
-        "piece_samples=200",
+        "segment_samples=200",
         "forest.trees=5",
         "forest.samples=800",
         "forest.tests=400",
@@ -59,8 +59,8 @@ def logs(tmp_path_factory):
 
 def test_screen_proposes_and_a_training_uses_it(edp, logs, tmp_path, small):
     out = tmp_path / "screen"
-    options = ["--horizon", "5", "--set", "screen.trusted=['lever']", "--no-pictures"]
-    ended = edp("screen", logs, "--out", out, *options, *QUICK)
+    options = ["--horizon", "5", "--set", "screen.measured=['lever']", "--no-pictures"]
+    ended = edp("data", "screen", logs, "--out", out, *options, *QUICK)
     assert ended.code == 0, ended.err
     assert "read: log 1 of 4, drive_0.csv" in ended.err
     assert "screen: " in ended.err
@@ -105,22 +105,22 @@ def test_screen_tries_the_sets_and_draws(edp, logs, tmp_path, monkeypatch):
     (tmp_path / "tiny.toml").write_text(
         "[training]\nepochs = 1\nupdates = 3\n"
         '[training.chunks]\nregime = "chunk"\nlength = 32\nbatch = 4\nburn_in = 10\n'
-        '[model.backbone]\nkind = "lstm"\nunits = 4\n[judge]\nhistory = 5\n'
+        '[model.backbone]\nkind = "lstm"\nunits = 4\n[evaluation]\nhistory = 5\n'
     )
     out = tmp_path / "screen"
     trials = [
         "--set",
-        "screen.trusted=['lever']",
+        "screen.measured=['lever']",
         "--trials",
         "--set",
-        "trials.random=1",
+        "trials.random_sets=1",
         "--config",
         tmp_path / "tiny.toml",
         "--features",
         tmp_path / "mine.toml",
     ]
     monkeypatch.setattr("edp.cli.screen.Steps", lambda quiet: Steps(quiet, every_s=0.0))
-    first = edp("screen", logs, "--out", out, "--exclude", "oracle,dead", *QUICK, *trials)
+    first = edp("data", "screen", logs, "--out", out, "--exclude", "oracle,dead", *QUICK, *trials)
     assert first.code == 0, first.err
     lines = [line for line in first.err.splitlines() if line.startswith("trials: ")]
     assert lines[0] == "trials: proposed, training 1 of 5, 0.0 %"
@@ -134,7 +134,7 @@ def test_screen_tries_the_sets_and_draws(edp, logs, tmp_path, monkeypatch):
 
     # What is trained already is not trained again.
     kept = (out / "trials" / "trials.json").read_bytes()
-    ended = edp("screen", logs, "--out", out, "--exclude", "oracle,dead", "--json", *QUICK, *trials)
+    ended = edp("data", "screen", logs, "--out", out, "--exclude", "oracle,dead", "--json", *QUICK, *trials)
     assert ended.code == 0, ended.err
     assert (out / "trials" / "trials.json").read_bytes() == kept
     facts = ended.json
@@ -205,6 +205,6 @@ def test_time_left_is_told_once_there_is_something_to_judge_it_by(monkeypatch):
     ],
 )
 def test_mistakes_are_told(edp, logs, tmp_path, args, says):
-    ended = edp("screen", logs, "--out", tmp_path / "x", "--no-pictures", *args)
+    ended = edp("data", "screen", logs, "--out", tmp_path / "x", "--no-pictures", *args)
     assert (ended.code, says in ended.err) == (1, True), ended.err
     assert not (tmp_path / "x" / "report.html").exists()

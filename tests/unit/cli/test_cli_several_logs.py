@@ -71,7 +71,7 @@ def logs(tmp_path):
 
 def test_a_folder_and_files_are_inspected_together_and_each_log_once(logs):
     chosen = [str(logs / "a"), str(logs / "b" / "three.csv"), str(logs / "a" / "one.csv")]
-    result = CliRunner().invoke(app, ["inspect", *chosen, "--json", "--no-coverage"])
+    result = CliRunner().invoke(app, ["data", "check", *chosen, "--json", "--no-coverage"])
     assert result.exit_code == 0, result.output
     assert len(json.loads(result.stdout)["recordings"]) == 3
 

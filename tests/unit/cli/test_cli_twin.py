@@ -29,8 +29,14 @@ from edp.training.bundle import make_bundle, save_bundle
 from edp.training.twin_bundle import load_twin
 
 SMALL = (
-    *("twin.kind=recurrent", "twin.units=6", "twin.prefix_ticks=20", "training.lanes=4", "training.lengths_s=[0.2]"),
-    *("training.updates=[6]", "training.validate_every=3", "judge.seconds=4", "judge.starts=2", "judge.at_s=[1, 4]"),
+    *("twin.kind=recurrent", "twin.units=6", "twin.prefix_ticks=20", "training.batch=4", "training.lengths_s=[0.2]"),
+    *(
+        "training.updates=[6]",
+        "training.validate_every=3",
+        "evaluation.duration_s=4",
+        "evaluation.starts=2",
+        "evaluation.at_s=[1, 4]",
+    ),
 )
 WORDS = [word for change in SMALL for word in ("--set", change)]
 
@@ -356,7 +362,7 @@ def test_several_logs_another_rate_and_no_twin_are_refused(edp, logs, trained, t
     write_recording(replace(recording, rate_hz=25.0), slow)
     assert "has 25 Hz, the task 50 Hz" in " ".join(edp("rollout", trained, slow).err.split())
     assert "is not a twin: it has no twin.json" in " ".join(edp("rollout", logs, logs / "log_1.parquet").err.split())
-    assert "holds a twin, not a network" in " ".join(edp("footprint", trained).err.split())
+    assert "holds a twin, not a network" in " ".join(edp("compress", "estimate", trained).err.split())
 
 
 def test_a_log_of_positions_alone_of_two_kinds_has_a_table_an_actuator(edp, tmp_path):

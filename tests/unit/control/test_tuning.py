@@ -48,7 +48,7 @@ def test_settings_are_drawn_from_the_space_by_their_seed():
 
 def test_a_bench_gives_equal_gains_equal_costs_and_worse_ones_higher(bench):
     good = CONTROLLERS["pi"]()
-    slack = replace(good, proportional=0.0, integral=0.0, lead_s=0.0, rest_m_s=1.0)
+    slack = replace(good, proportional=0.0, integral=0.0, lead_s=0.0, standstill_m_s=1.0)
     costs = costs_of(bench, [good, slack, good])
     assert costs[0] == costs[2] < costs[1]
 

@@ -33,8 +33,8 @@ SETTINGS = (
     'model.backbone={kind="lstm",units=4}',
     "model.head.hidden=4",
     "model.window=20",
-    "judge.history=10",
-    'judge.baselines=["persistence","ridge_arx","small_mlp"]',
+    "evaluation.history=10",
+    'evaluation.baselines=["persistence","ridge_arx","small_mlp"]',
 )
 ORDER = SimulationOrder(minutes=1.8, recordings=6, seed=5, family=3)
 
@@ -128,7 +128,9 @@ def test_every_command_survives_a_killed_node_with_the_results_of_one_process(no
     assert _scores(scored) == _scores(one / "run")
     plug.mend()
 
-    tuned = FinetuneRequest(spec=FinetuneSpec(rounds=2, batch=4), method="full", baselines=("low_rank", "linear_probe"))
+    tuned = FinetuneRequest(
+        spec=FinetuneSpec(single_phase_epochs=2, batch=4), method="full", baselines=("low_rank", "linear_probe")
+    )
     logs = DataSource.from_path(paths[0])
     started = threading.Thread(target=_pull_when, args=(tmp_path / "tuned" / "config.toml", plug))
     started.start()

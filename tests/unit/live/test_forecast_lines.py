@@ -64,7 +64,7 @@ def test_the_animation_of_a_run_and_a_log_shows_both(tiny, run, tmp_path):
     _, folder = run
     log, page = tmp_path / "log.parquet", tmp_path / "page.html"
     write_recording(recording_of(tiny), log)
-    done = CliRunner().invoke(app, ["animate", str(folder), str(log), "--out", str(page), "--json"])
+    done = CliRunner().invoke(app, ["data", "animate", str(folder), str(log), "--out", str(page), "--json"])
     assert done.exit_code == 0, done.output
     data = re.search(r'<script type="application/json" id="scene">(.*?)</script>', page.read_text(), re.DOTALL)
     scene = json.loads(data[1])
@@ -73,7 +73,7 @@ def test_the_animation_of_a_run_and_a_log_shows_both(tiny, run, tmp_path):
     assert line["predicted"][0] is None
     assert len(line["predicted"]) == len(line["measured"]) == len(scene["angles"][0])
     assert np.isfinite(line["predicted"][len(line["predicted"]) // 2 :]).all()
-    alone = CliRunner().invoke(app, ["animate", str(log), "--out", str(page)])
+    alone = CliRunner().invoke(app, ["data", "animate", str(log), "--out", str(page)])
     assert alone.exit_code == 0, alone.output
     assert '"forecasts":[]' in page.read_text()
 
@@ -87,6 +87,6 @@ def test_what_cannot_be_shown_is_one_error(tiny, run, tmp_path):
         ((log, "--horizon", "1"), "--horizon: it has no effect without a run before the log"),
         ((folder, log, log), "3 paths were given"),
     ):
-        done = CliRunner().invoke(app, ["animate", *map(str, words)])
+        done = CliRunner().invoke(app, ["data", "animate", *map(str, words)])
         assert done.exit_code != 0
         assert text in str(done.exception) + done.output

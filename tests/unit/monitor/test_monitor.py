@@ -139,7 +139,7 @@ def test_too_few_hours_name_the_rate_that_they_support(healthy):
     ("changes", "message"),
     [
         (("chain.block_s=15",), "too few for an operating point"),
-        (("chain.block_s=1.1", "chain.folds=2", "train_share=0.8"), "too few for a covariance"),
+        (("chain.block_s=1.1", "chain.folds=2", "train_fraction=0.8"), "too few for a covariance"),
         (
             ("dictionary.machine=M22", "chain.block_s=0.8"),
             "0 stretches of 40 healthy blocks are too few",

@@ -18,7 +18,7 @@ def sessions():
 
 @pytest.fixture(scope="module")
 def source(sessions):
-    spec = VirtualSensorsSpec(every=EVERY, units=4, lags_s=(0.01, 0.06), least=-0.9)
+    spec = VirtualSensorsSpec(every=EVERY, units=4, lags_s=(0.01, 0.06), min_explained=-0.9)
     material = FitMaterial(sessions[:4], sessions[4:], sessions[0].channels, 100.0, minutes=0.01)
     return spec.fit(material)
 

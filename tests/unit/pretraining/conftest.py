@@ -29,7 +29,7 @@ SETTINGS = (
     "model.head.hidden=6",
     "model.blocks=[]",
     "model.window=10",
-    'judge.baselines=["persistence"]',
+    'evaluation.baselines=["persistence"]',
 )
 
 

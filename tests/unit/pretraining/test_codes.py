@@ -35,7 +35,7 @@ def fleet(machines, experiment, tmp_path_factory):
 
 
 def test_a_code_alone_learns_and_makes_an_unseen_machine_better(fleet, machines, tmp_path):
-    spec = FinetuneSpec(rounds=15, batch=4, check_signs=False)
+    spec = FinetuneSpec(single_phase_epochs=15, batch=4, check_signs=False)
     logs = dataclasses.replace(machines, path=machines.path / "press4_0.parquet")
     finetune(fleet, logs, FinetuneRequest(spec=spec, method="code"), tmp_path / "own")
     base, own = load_bundle(fleet).predictor, load_bundle(tmp_path / "own").predictor
@@ -98,7 +98,9 @@ def test_a_stream_has_the_code_of_its_machine_or_none_from_its_start_to_its_end(
     strategy.begin(network, experiment.training)
     block, seen = find_coded_block(network), set()
     table = block.table.detach().view(strategy.machines, -1)
-    sampler = ChunkSampler(series, data.task.horizons, dataclasses.replace(experiment.training.chunks, carried=3), 0)
+    sampler = ChunkSampler(
+        series, data.task.horizons, dataclasses.replace(experiment.training.chunks, reset_after_chunks=3), 0
+    )
     unknown = None
     for batch in (batch for number in range(40) for batch in sampler.epoch(number)):
         numbers, reset = torch.from_numpy(batch.strategy_columns), torch.from_numpy(batch.reset)

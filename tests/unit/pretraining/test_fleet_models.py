@@ -33,7 +33,9 @@ from edp.workflows.transfer import FinetuneSpec
 pytestmark = pytest.mark.processes
 
 HERE = Workers()
-ORDER = PersonalOrder(spec=FinetuneSpec(rounds=3, batch=4, rate=2e-2, patience=0, check_signs=False))
+ORDER = PersonalOrder(
+    spec=FinetuneSpec(single_phase_epochs=3, batch=4, learning_rate=2e-2, patience=0, check_signs=False)
+)
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +104,7 @@ def test_machines_whose_logs_do_not_go_are_told_and_the_others_go_on(run, store,
         return real(base, logs, *others)
 
     monkeypatch.setattr(personal, "target_data", picky)
-    order = PersonalOrder(spec=FinetuneSpec(rounds=1, batch=4, check_signs=False))
+    order = PersonalOrder(spec=FinetuneSpec(single_phase_epochs=1, batch=4, check_signs=False))
     rows = finetune_fleet(HERE, run, store, order, tmp_path / "own").machines
     assert rows[1].failed == "lever has another unit"
     assert [row.delta is not None for row in rows] == [True, False, True, True, True, True]

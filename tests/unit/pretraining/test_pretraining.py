@@ -30,7 +30,7 @@ from edp.workflows.transfer import FinetuneRequest, FinetuneSpec, finetune
 
 pytestmark = pytest.mark.processes
 
-META = MetaSpec(inner_rate=0.1, inner_steps=2, shots=2)
+META = MetaSpec(inner_learning_rate=0.1, inner_steps=2, shots=2)
 
 
 class Pulled(Exception):
@@ -96,7 +96,7 @@ def test_the_report_shows_the_machines_that_were_never_seen(made, tmp_path):
     for row in found.unseen.contexts:
         assert f"<td>{number(row.mae)}</td>" in page
     (copied / "foundation.json").write_text('{"label": "Joint"}')
-    with pytest.raises(StorageError, match="edp pretrain"):
+    with pytest.raises(StorageError, match="edp train pretrain"):
         build_report(copied)
     (copied / "foundation.json").unlink()
     assert '<section id="unseen">' not in build_report(copied).read_text()
@@ -119,7 +119,7 @@ def test_a_stopped_pretraining_goes_on_to_the_same_bits(made, machines, experime
 
 
 def test_few_steps_take_rate_and_head_of_the_meta_learning(machines, experiment, tmp_path):
-    meta = dataclasses.replace(META, inner_rate=0.07, head_only=True)
+    meta = dataclasses.replace(META, inner_learning_rate=0.07, head_only=True)
     pretrain(machines, experiment, Pretrain(method="fomaml", meta=meta), tmp_path / "meta")
     spec = FinetuneSpec(inner_steps=3, batch=4, check_signs=False)
     finetune(tmp_path / "meta", machines, FinetuneRequest(spec=spec, method="few_steps"), tmp_path / "tuned")

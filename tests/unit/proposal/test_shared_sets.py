@@ -126,7 +126,7 @@ def test_a_folder_of_logs_with_other_columns_names_them():
     proposal = proposed("hydraulic_bench_mataveid")
     assert [path.name for path in proposal.group.paths] == ["HangingLoad.csv"]
     assert sum("other columns" in note for note in proposal.notes) == 2
-    assert proposal.commands(Path("here"))[0] == "edp inspect here/data.toml --inputs column_4"
+    assert proposal.commands(Path("here"))[0] == "edp data check here/data.toml --inputs column_4"
 
 
 def test_no_time_is_said():

@@ -110,11 +110,11 @@ def test_films(recording, tmp_path, ending):
 
 def test_the_command(recording, tmp_path):
     log = write_recording(only(recording, "Cyl", "Joint", source="sim:M22"), tmp_path / "one.parquet")
-    done = CliRunner().invoke(app, ["animate", str(log), "--seconds", "1", "--json"])
+    done = CliRunner().invoke(app, ["data", "animate", str(log), "--seconds", "1", "--json"])
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["animation"].endswith("one.html")
     assert (tmp_path / "one.html").stat().st_size > 10_000
-    wrong = CliRunner().invoke(app, ["animate", str(log), "--out", str(tmp_path / "a.avi")])
+    wrong = CliRunner().invoke(app, ["data", "animate", str(log), "--out", str(tmp_path / "a.avi")])
     assert isinstance(wrong.exception, ConfigError)
     assert ".mp4" in str(wrong.exception)
 

@@ -24,7 +24,7 @@ from edp.storage import read_json, write_json
 from edp.workflows.twin.judge_twin import describe_channels, select_shown_runs, write_scores
 
 HOSTILE = "</script><img src=x onerror=alert(1)>"
-SPEC = FreeRunJudgeSpec(at_s=(0.2, 1.0), covered_at_s=(0.2, 1.0))
+SPEC = FreeRunJudgeSpec(at_s=(0.2, 1.0), coverage_at_s=(0.2, 1.0))
 
 
 def judged(strokes=True, name="boom", swing=False, kind=Kind.VELOCITY):

@@ -187,7 +187,7 @@ def test_every_two_members_of_a_cluster_go_together() -> None:
 def test_pieces_follow_from_recordings(sessions: list) -> None:
     spec = ScreeningSpec(max_lag=40)
     assert [p.name for p in build_table(sessions, spec).pieces] == [r.name for r in sessions]
-    assert len(build_table(sessions[:1], ScreeningSpec(max_lag=40, pieces=4)).pieces) >= 4
+    assert len(build_table(sessions[:1], ScreeningSpec(max_lag=40, min_segments=4)).pieces) >= 4
     many = build_table([s.rows(i * 500, (i + 1) * 500) for s in sessions for i in range(6)], spec)
     assert len(many.pieces) <= 24
     assert many.samples == 30_000

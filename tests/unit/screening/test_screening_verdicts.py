@@ -13,12 +13,12 @@ from edp.recording import Recording
 pytestmark = pytest.mark.long
 
 SPEC = ScreeningSpec(
-    trusted=("lever_a", "lever_b", "pressure"),
+    measured=("lever_a", "lever_b", "pressure"),
     max_lag=60,
     information_samples=1500,
     rank_samples=1500,
-    piece_samples=500,
-    forest=ForestSpec(trees=10, samples=3000, tests=1500, repeats=2),
+    segment_samples=500,
+    forest=ForestSpec(trees=10, samples=3000, test_samples=1500, repeats=2),
 )
 
 
@@ -165,4 +165,4 @@ def test_wrong_options_are_refused(wrong: dict, said: str) -> None:
     with pytest.raises(ConfigError, match=r"screening\.forest: trees = 0"):
         ForestSpec(trees=0)
     with pytest.raises(ConfigError, match=r"0 < held_out <= 0\.8"):
-        ForestSpec(held_out=0.9)
+        ForestSpec(test_fraction=0.9)

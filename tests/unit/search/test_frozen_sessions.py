@@ -257,7 +257,7 @@ def test_other_data_are_drawn_only_when_that_is_said(study, run, six_sessions, t
     other = DataSource.from_path(tmp_path)
     with pytest.raises(DataError, match=r"2 of 2 frozen sessions.*split\.missing=draw"):
         prepare_data(other, load_experiment(study.teacher, "quick"))
-    drawn = prepare_data(other, load_experiment(study.teacher, "quick", ["split.missing=draw"]))
+    drawn = prepare_data(other, load_experiment(study.teacher, "quick", ["split.on_missing=draw"]))
     assert (len(drawn.train), len(drawn.validation), len(drawn.test)) == (4, 1, 1)
     with pytest.raises(ConfigError, match="lets go of 2 of its frozen sessions"):
         distil(run, DistilRequest(spec=DistilSpec(units=2), changes=("split.kind=time",)), tmp_path / "student")
@@ -296,7 +296,7 @@ def test_a_split_that_contradicts_itself_is_refused():
     with pytest.raises(ConfigError, match="'a' is in test and in train"):
         ByFrozen(test=(session,), train=(session,))
     with pytest.raises(ConfigError, match="missing = 'maybe'"):
-        ByFrozen(missing="maybe")
+        ByFrozen(on_missing="maybe")
     with pytest.raises(ConfigError, match="names no test sessions"):
         ByFrozen().split([], 1)
     with pytest.raises(ConfigError, match="no second sealed test set"):

@@ -208,7 +208,7 @@ def test_the_same_session_twice_is_refused_before_anything_is_trained(six_sessio
 
 
 def test_fewer_sessions_than_folds_and_a_test_session_that_is_not_there(six_sessions, plan, tmp_path):
-    many = replace(plan.spec, folds=5, isolation=IsolationSpec(runs=10), planning=PlanningSpec(most_runs=10))
+    many = replace(plan.spec, folds=5, isolation=IsolationSpec(runs=10), planning=PlanningSpec(max_runs=10))
     named = replace(plan.spec, test=("s9",))
     # A store cannot be divided into more sessions.
     six_sessions.store(tmp_path / "store")
@@ -241,7 +241,7 @@ def test_damaged_records_are_set_apart_and_trained_again(six_sessions, plan, tmp
 
 
 def test_trainings_that_all_fail_are_told_with_their_reason(six_sessions, plan, tmp_path):
-    beyond = load_plan(None, "quick", (*CHANGES, "judge.skip=5000"))
+    beyond = load_plan(None, "quick", (*CHANGES, "evaluation.warmup_samples=5000"))
     with pytest.raises(DataError, match=r"all 8 trainings of a batch failed; the first says: "):
         run_search(six_sessions, beyond, tmp_path, CREW)
     assert read_study(tmp_path).phases[0].failed == 8

@@ -34,8 +34,8 @@ SETTINGS = (
     "model.head.hidden=8",
     "model.blocks=[]",
     "model.window=10",
-    "judge.history=4",
-    'judge.baselines=["persistence"]',
+    "evaluation.history=4",
+    'evaluation.baselines=["persistence"]',
 )
 
 
@@ -94,5 +94,13 @@ def target(tmp_path_factory: pytest.TempPathFactory) -> DataSource:
 def small() -> FinetuneSpec:
     """A fine-tuning of a second."""
     return FinetuneSpec(
-        head_epochs=2, epochs=2, rounds=4, batch=4, head_rate=2e-2, backbone_rate=4e-3, rate=2e-2, rank=2, patience=0
+        head_epochs=2,
+        epochs=2,
+        single_phase_epochs=4,
+        batch=4,
+        head_learning_rate=2e-2,
+        backbone_learning_rate=4e-3,
+        learning_rate=2e-2,
+        rank=2,
+        patience=0,
     )

@@ -40,7 +40,9 @@ def test_both_domains_have_equal_shares_and_the_network_of_the_source_teaches_it
 
 def test_worlds_meet_in_a_batch(tiny, start, tiny_training):
     series = BothDomains(start, kept(tiny), BothSpec()).series(tiny.task, tiny.train)
-    sampler = ChunkSampler(series, tiny.task.horizons, dataclasses.replace(tiny_training.chunks, carried=2), 0)
+    sampler = ChunkSampler(
+        series, tiny.task.horizons, dataclasses.replace(tiny_training.chunks, reset_after_chunks=2), 0
+    )
     shares = [batch.strategy_columns[..., 0].mean() for batch in sampler.epoch(0) if batch.strategy_columns is not None]
     assert 0.2 < np.mean(shares) < 0.8
 

@@ -147,7 +147,7 @@ def test_a_stopped_fine_tuning_goes_on_to_the_same_bits(tuned, run, target, smal
     ends = [load_bundle(folder).predictor.state_dict() for folder in (whole, tmp_path / "run")]
     assert all(torch.equal(ends[0][key], ends[1][key]) for key in ends[0])
     assert set(found["methods"]) == {"two_phase", "direct"}
-    other = dataclasses.replace(order, spec=dataclasses.replace(small, head_rate=1e-3))
+    other = dataclasses.replace(order, spec=dataclasses.replace(small, head_learning_rate=1e-3))
     with pytest.raises(StorageError, match="holds another run"):
         finetune(run, target, other, tmp_path / "run")
 
@@ -199,8 +199,8 @@ def test_a_bundle_alone_is_enough_but_its_world_is_not_judged(run, target, small
 def test_settings_of_a_task_resolve_to_it(run):
     source = read_source(run)
     assert task_settings(source.bundle.task).resolve(100.0) == source.bundle.task
-    made = target_experiment(source, ("split.test_share=0.3", "training.clip_norm=0.5"))
-    assert (made.split.test_share, made.training.clip_norm) == (0.3, 0.5)
+    made = target_experiment(source, ("split.test_fraction=0.3", "training.clip_norm=0.5"))
+    assert (made.split.test_fraction, made.training.clip_norm) == (0.3, 0.5)
 
 
 def test_an_epoch_is_a_pass_over_the_logs_unless_said_otherwise(run):
@@ -218,7 +218,7 @@ def test_an_epoch_is_a_pass_over_the_logs_unless_said_otherwise(run):
         ("training.epochs=3", "settings of its own"),
         ("training.optimizer.learning_rate=1", "settings of its own"),
         ("training.chunks={batch=3}", "settings of its own"),
-        ("finetune.rounds=3", "keeps task and network"),
+        ("finetune.single_phase_epochs=3", "keeps task and network"),
         ("training.clipnorm=1", "unknown key 'training.clipnorm'"),
     ],
 )
@@ -231,7 +231,7 @@ def test_changes_that_cannot_be_are_refused(run, change, reason):
     "change",
     [
         {"epochs": 0},
-        {"rounds": 0},
+        {"single_phase_epochs": 0},
         {"head_rate": 0.0},
         {"rate": 0.0},
         {"smoothness": -1.0},
@@ -256,7 +256,7 @@ def test_methods_that_leave_no_run_or_do_not_exist_are_refused(small):
 
 def test_the_defaults_of_the_two_phases_are_those_of_the_thesis():
     spec = FinetuneSpec()
-    assert (spec.head_epochs, spec.epochs, spec.head_rate, spec.backbone_rate) == (15, 25, 3e-4, 1e-5)
+    assert (spec.head_epochs, spec.epochs, spec.head_learning_rate, spec.backbone_learning_rate) == (15, 25, 3e-4, 1e-5)
     assert (spec.batch, spec.smoothness) == (32, 0.05)
 
 
@@ -329,7 +329,7 @@ def test_the_command_tunes_prints_and_writes_a_report(run, target, tmp_path):
     assert "next: edp evaluate" in told.output
     facts = read_json(tmp_path / "run" / "transfer.json")
     assert set(facts["methods"]) == {"full", "direct", "ridge_arx"}
-    assert facts["settings"] == dataclasses.asdict(FinetuneSpec(rounds=2, batch=4))
+    assert facts["settings"] == dataclasses.asdict(FinetuneSpec(single_phase_epochs=2, batch=4))
     assert load_experiment(tmp_path / "run" / "config.toml", None).training.updates == 3
     assert math.isfinite(facts["methods"]["direct"]["domains"]["target"]["2"]["mean"]["mse"])
     page = (tmp_path / "run" / "transfer.html").read_text(encoding="utf-8")

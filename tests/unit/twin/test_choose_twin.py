@@ -31,7 +31,7 @@ from edp.workflows.twin import choose_twin, fit_twin, training_cost
 from edp.workflows.twin.choose_twin import TwinChoice, shortened
 from edp.workflows.twin.fit_twin import TwinFit
 
-TINY = FreeRunSpec(lanes=8, lengths_s=(0.2,), updates=(20,), validate_every=10, validation_s=2.0, optimizer=AdamW())
+TINY = FreeRunSpec(batch=8, lengths_s=(0.2,), updates=(20,), validate_every=10, validation_s=2.0, optimizer=AdamW())
 
 
 def choice(run, training=TINY, recordings=None, **auto):
@@ -39,7 +39,7 @@ def choice(run, training=TINY, recordings=None, **auto):
     channels = twin_channels(recordings[0])
     data = prepare(recordings, channels.task(), ByRecording(), 20)
     experiment = TwinExperiment(twin=AutoTwin(prefix_ticks=20, **auto), training=training)
-    experiment = replace(experiment, judge=replace(experiment.judge, seconds=4.0, calibration_starts=4))
+    experiment = replace(experiment, evaluation=replace(experiment.evaluation, seconds=4.0, calibration_starts=4))
     fit = TwinFit(channels, fit_scales(channels, data.train), data, experiment)
     return TwinChoice(fit, experiment.twin, KeyedRun(run, "k" * 32))
 
@@ -350,7 +350,7 @@ def test_a_share_of_a_training_keeps_its_stages():
         ("twin.candidates=['arx','arx']", "each once must hold"),
         ("twin.candidates=['auto']", "unknown twin 'auto'"),
         ("twin.units=64", "unknown key 'twin.units'; it belongs to kind = 'recurrent' or 'residual'"),
-        ("twin.least_gain=1.5", "least_gain = 1.5"),
+        ("twin.min_gain=1.5", "least_gain = 1.5"),
         ("twin.folds=0", "folds = 0"),
         ("twin.folds=33", "folds = 33"),
         ("twin={kind='recurrent',units=10,members=3}", "10 units and 3 members; a whole number"),

@@ -24,9 +24,15 @@ pytestmark = pytest.mark.processes
 
 SPEC = ("twin.kind=recurrent", "twin.units=6", "twin.members=2", "twin.prefix_ticks=20")
 SETTINGS = (
-    *("training.lanes=4", "training.lengths_s=[0.2]", "training.updates=[20]", "training.validate_every=10"),
+    *("training.batch=4", "training.lengths_s=[0.2]", "training.updates=[20]", "training.validate_every=10"),
     *("training.validation_s=2", "training.optimizer.learning_rate=0.01"),
-    *("judge.seconds=4", "judge.starts=2", "judge.at_s=[1, 4]", "judge.floors=[]", "judge.calibration_starts=4"),
+    *(
+        "evaluation.duration_s=4",
+        "evaluation.starts=2",
+        "evaluation.at_s=[1, 4]",
+        "evaluation.baselines=[]",
+        "evaluation.calibration_starts=4",
+    ),
 )
 
 
@@ -203,7 +209,13 @@ def test_settings_of_another_twin_are_refused(base, other, tmp_path, changes, te
 
 
 def test_a_twin_without_training_is_refused(other, tmp_path):
-    settings = ("twin.kind=static", "twin.prefix_ticks=20", "judge.seconds=4", "judge.at_s=[1, 4]", "judge.floors=[]")
+    settings = (
+        "twin.kind=static",
+        "twin.prefix_ticks=20",
+        "evaluation.duration_s=4",
+        "evaluation.at_s=[1, 4]",
+        "evaluation.baselines=[]",
+    )
     train_twin(other, load_twin_experiment(None, settings), tmp_path / "static")
     with pytest.raises(ConfigError, match=r"kind .static..*without --start"):
         gone_on(other, tmp_path / "static", tmp_path / "run")

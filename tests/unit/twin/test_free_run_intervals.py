@@ -72,7 +72,7 @@ def test_runs_that_end_early_calibrate_the_horizons_that_they_reach():
 def test_a_short_stretch_calibrates_short_horizons_by_more_starts_than_fit_a_long_run():
     twin, series = twin_and_series()
     short = [replace(part, inputs=part.inputs[:60], targets=part.targets[:60]) for part in series[1:4]]
-    spec = FreeRunJudgeSpec(seconds=60.0, calibration_starts=8)
+    spec = FreeRunJudgeSpec(duration_s=60.0, calibration_starts=8)
     intervals = calibrated([(twin, short)], spec)
     assert intervals.ticks[-1] == 60 - 10 - 1
     assert 50 < intervals.runs <= 3 + 3 * 3 * 8  # but for starts beyond an end stop
@@ -85,7 +85,7 @@ def twin_and_series():
 
 def test_those_of_a_twin_hold_on_recordings_that_calibrated_nothing():
     twin, series = twin_and_series()
-    spec = FreeRunJudgeSpec(seconds=5.0, calibration_starts=20, covered_at_s=(0.1, 1.0, 5.0, 60.0))
+    spec = FreeRunJudgeSpec(duration_s=5.0, calibration_starts=20, coverage_at_s=(0.1, 1.0, 5.0, 60.0))
     intervals = calibrated([(twin, series[1:9])], spec)
     runs = free_runs(twin, series[9:], 5.0, 20)
     scores = plain_value(free_run_scores(runs, spec, intervals).intervals)
@@ -107,7 +107,7 @@ def test_coverage_is_counted_by_channel_and_time():
     answers[0, 10:, 2] = 2.0  # beyond it later, in one run
     intervals = FreeRunIntervals(0.9, (1, 10), np.ones((2, 6), np.float32), 5)
     runs = FreeRuns(channels, tuple("abcd"), answers, truth, truth[:, 0], -np.ones(6), np.ones(6))
-    rows = plain_value(coverage_of(runs, FreeRunJudgeSpec(covered_at_s=(0.1, 0.4)), intervals))["at"]
+    rows = plain_value(coverage_of(runs, FreeRunJudgeSpec(coverage_at_s=(0.1, 0.4)), intervals))["at"]
     assert [row["calibrated"] for row in rows] == [True, False]
     assert rows[0]["velocities"]["by_channel"] == {"speed_1": 0.25, "speed_2": 1.0}
     assert rows[0]["velocities"]["share"] == 0.625
@@ -116,7 +116,7 @@ def test_coverage_is_counted_by_channel_and_time():
 
 def test_they_come_back_with_the_twin_and_earlier_twins_have_none(tmp_path):
     twin, series = twin_and_series()
-    intervals = calibrated([(twin, series[:2])], FreeRunJudgeSpec(seconds=2.0))
+    intervals = calibrated([(twin, series[:2])], FreeRunJudgeSpec(duration_s=2.0))
     save_twin(TwinBundle(StaticMap(prefix_ticks=10), twin, intervals=intervals), tmp_path)
     loaded = load_twin(tmp_path).intervals
     assert loaded.to_dict() == intervals.to_dict()

@@ -118,7 +118,7 @@ def test_stretches_lie_within_recordings_and_begin_everywhere(data):
 
 
 def test_ports_are_measured_by_their_shares():
-    spec = FreeRunSpec(measured_share=0.25, mixed_share=0.25)
+    spec = FreeRunSpec(measured_fraction=0.25, mixed_fraction=0.25)
     ports = draw_measured_ports(spec, (30, 4000, 6), 10, np.random.default_rng(0))
     assert (ports[0] == 1).all()
     later = ports[10:]

@@ -36,7 +36,7 @@ BENCH = bench_grey_box(
         lengths_s=(0.1, 0.4),
         rounds=(3, 2),
         final_rounds=6,
-        lanes=24,
+        batch=24,
         ticks=600,
         final_ticks=600,
         validation_s=2.0,
@@ -250,7 +250,7 @@ def test_what_is_left_out_does_nothing_and_is_not_fitted(bench):
 
 def test_a_part_that_cannot_be_left_out_is_refused_by_name():
     with pytest.raises(ConfigError, match=r"without names 'cushion'.*cushions.*power_limit, cushions, play must hold"):
-        GreyBox(without=("cushion",))
+        GreyBox(omit=("cushion",))
 
 
 def test_monomials_are_sorted_by_degree():

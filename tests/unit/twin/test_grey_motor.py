@@ -204,7 +204,7 @@ FITTED = GreyBox(
     valves=(ValveElement(name="valve", actuator="motor", extend="pedal", regeneration=False),),
     prefix_ticks=PREFIX,
     fit=GreyFitSpec(
-        lengths_s=(0.1, 0.3, 1.0), rounds=(8, 6, 4), final_rounds=0, starts=1, lanes=64, ticks=3000, validation_runs=8
+        lengths_s=(0.1, 0.3, 1.0), rounds=(8, 6, 4), final_rounds=0, starts=1, batch=64, ticks=3000, validation_runs=8
     ),
 )
 

@@ -27,7 +27,7 @@ from edp.workflows.twin.ground_twin import JUDGED
 
 pytestmark = pytest.mark.processes
 
-GROUND = ("ground=drag", "judge.floors=[]")
+GROUND = ("ground=drag", "evaluation.baselines=[]")
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from .test_grey_box import BENCH
 
 UNITS = 6
 OPTIONS = {entry.name: getattr(BENCH, entry.name) for entry in fields(BENCH)}
-SPEC = Residual(**OPTIONS, units=UNITS, lanes=16, lengths_s=(0.2,), updates=(60,), validate_every=20)
+SPEC = Residual(**OPTIONS, units=UNITS, batch=16, lengths_s=(0.2,), updates=(60,), validate_every=20)
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,7 @@ class ModelInversion:
         lead_s: prediction horizon of the model, and lead at which the speed of the reference is read, s.
         proportional: speed by stroke error, 1/s.
         integral: speed by the integral of the stroke error, 1/s^2.
-        rest_m_s: wanted speeds below this leave a lever at neutral.
+        standstill_m_s: wanted speeds below this leave a lever at neutral.
         reach: farthest lever that is tried, from the last solution.
         points: levers tried an axis and side of the last solution.
     """
@@ -42,13 +42,13 @@ class ModelInversion:
     space: ClassVar[Mapping[str, tuple[float, float]]] = {
         "proportional": (0.5, 10.0),
         "integral": (0.0, 10.0),
-        "rest_m_s": (0.0, 0.01),
+        "standstill_m_s": (0.0, 0.01),
     }
 
     lead_s: float = 0.2
     proportional: float = 3.0
     integral: float = 1.0
-    rest_m_s: float = 0.004
+    standstill_m_s: float = 0.004
     reach: float = 0.15
     points: int = 4
 
@@ -59,7 +59,7 @@ class ModelInversion:
             lead_s=above(0.0, 5.0),
             proportional=span(0.0, 100.0),
             integral=span(0.0, 1000.0),
-            rest_m_s=span(0.0, 1.0),
+            standstill_m_s=span(0.0, 1.0),
             reach=above(0.0, 1.0),
             points=integer(1, 100),
         )
@@ -115,7 +115,7 @@ class InversionController(Controller):
         error = self._strokes[min(tick, last)] - measured[len(self.model.reads) :]
         ahead = self._speeds[min(tick + self.model.ticks, last)]
         speed = ahead + self.spec.proportional * error + self._sum
-        asked = np.where(np.abs(speed) > self.spec.rest_m_s, self._solve_levers(speed, self._row), 0.0)
+        asked = np.where(np.abs(speed) > self.spec.standstill_m_s, self._solve_levers(speed, self._row), 0.0)
         free = (asked > self.limits.lever_low) & (asked < self.limits.lever_high)
         total = self._sum + self.spec.integral * error / self.plant.rate_hz
         self._sum = np.where(free, np.clip(total, -MAX_SUM, MAX_SUM), self._sum)

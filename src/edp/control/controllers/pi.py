@@ -31,7 +31,7 @@ class ProportionalIntegral:
         proportional: speed by stroke error, 1/s.
         integral: speed by the integral of the stroke error, 1/s^2.
         lead_s: lead at which the speed of the reference is read, s: the response time of the machine.
-        rest_m_s: wanted speeds below this leave a lever at neutral.
+        standstill_m_s: wanted speeds below this leave a lever at neutral.
     """
 
     needs: ClassVar[tuple[str, ...]] = ("valve_map",)
@@ -39,13 +39,13 @@ class ProportionalIntegral:
         "proportional": (0.5, 10.0),
         "integral": (0.0, 10.0),
         "lead_s": (0.05, 0.35),
-        "rest_m_s": (0.0, 0.01),
+        "standstill_m_s": (0.0, 0.01),
     }
 
     proportional: float = 3.6
     integral: float = 4.0
     lead_s: float = 0.2
-    rest_m_s: float = 0.002
+    standstill_m_s: float = 0.002
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -54,7 +54,7 @@ class ProportionalIntegral:
             proportional=span(0.0, 100.0),
             integral=span(0.0, 1000.0),
             lead_s=span(0.0, 5.0),
-            rest_m_s=span(0.0, 1.0),
+            standstill_m_s=span(0.0, 1.0),
         )
 
     def build(self, plant: PlantInterface, limits: LoopLimits, models: ControlModels) -> Controller:
@@ -91,7 +91,7 @@ class PiController(Controller):
         error = self._strokes[min(tick, last)] - measured
         ahead = self._speeds[min(tick + self._lead, last)]
         speed = ahead + self.spec.proportional * error + self._sum
-        asked = np.array([self._map.lever(i, float(speed[i]), self.spec.rest_m_s) for i in range(AXES)])
+        asked = np.array([self._map.lever(i, float(speed[i]), self.spec.standstill_m_s) for i in range(AXES)])
         # No integration at a saturated lever, which could not follow.
         free = (asked > self.limits.lever_low) & (asked < self.limits.lever_high)
         total = self._sum + self.spec.integral * error / self.plant.rate_hz

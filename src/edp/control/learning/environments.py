@@ -18,7 +18,7 @@ class TaskEnvironment(SingleEnvironment):
     base controller a correction of its levers. An action holds for `hold` ticks. Levers keep the limits of the task,
     whatever is asked. Reward and end: see `RewardWeights` and `LearningSpec`.
 
-    `reset` takes no options; its seed is that of the reference, as that of a loop of ``edp control``, and of the
+    `reset` takes no options; its seed is that of the reference, as that of a loop of ``edp loop run``, and of the
     sensors, and None draws one of `seeds`. It says ``seed``, length in ``seconds`` and ``position_m``; each step says
     ``position_m``, the last one the figures of the episode as ``score`` as well. An episode terminates where the tip is
     lost.

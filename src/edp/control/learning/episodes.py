@@ -205,7 +205,7 @@ def _bases(spec: LearningSpec, plant: PlantInterface, limits: LoopLimits, count:
 
 
 def base_models(spec: LearningSpec, plant: PlantInterface) -> ControlModels:
-    """Return the models of a base controller: a valve map measured on the plant as in `edp control`."""
+    """Return the models of a base controller: a valve map measured on the plant as in `edp loop run`."""
     return ControlModels(measure_valve_map(SingleEnvironment(plant_batch(spec, 1, RUN_S + 1.0)), plant))
 
 

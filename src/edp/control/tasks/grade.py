@@ -13,7 +13,7 @@ from edp.control.tasks.base import TASKS, TaskSpec, check_order
 from edp.errors import ConfigError, closest
 from edp.settings.bounds import above, check_bounds, span
 
-DIRECTIONS = ("drawn", "inwards", "outwards")
+DIRECTIONS = ("random", "inwards", "outwards")
 SOIL_ATTITUDE_DEG = (-100.0, -55.0)
 """In which the edge of a bucket cuts and neither its back nor its floor is dragged through the soil."""
 START = (0.1, 0.9)
@@ -35,7 +35,7 @@ class Grade(TaskSpec):
 
     slope_deg: float = 0.0
     length_m: tuple[float, float] = (1.5, 3.0)
-    direction: str = "drawn"
+    direction: str = "random"
     attitude_deg: tuple[float, float] | None = None
     depth_m: tuple[float, float] = (0.0, 0.05)
 
@@ -63,7 +63,7 @@ class Grade(TaskSpec):
         length, speed = rng.uniform(*self.length_m), self.draw_speed(rng)
         # In soil the bucket cuts inwards; outwards it would be pushed through it by its back.
         away = rng.random() < 0.5 and not self.material
-        outwards = away if self.direction == "drawn" else self.direction == "outwards"
+        outwards = away if self.direction == "random" else self.direction == "outwards"
         slope = math.radians(self.slope_deg)
         along = length if outwards else -length
         goal = start + along * np.array([math.cos(slope), math.sin(slope), 0.0])

@@ -168,11 +168,15 @@ def importances(
     forest = spec.forest
     others = [p for p in range(len(table.pieces)) if p not in set(held_out.tolist())]
     train = rows_of(table, others, columns, forest.samples, spec.horizon)
-    tests = rows_of(table, held_out.tolist(), columns, forest.tests, spec.horizon)
+    tests = rows_of(table, held_out.tolist(), columns, forest.test_samples, spec.horizon)
     scale = np.maximum(train.changes.std(axis=0), 1e-30)
     train, tests = (Rows(r.inputs, (r.changes - train.changes.mean(axis=0)) / scale, r.pieces) for r in (train, tests))
     model = RandomForestRegressor(
-        forest.trees, min_samples_leaf=forest.leaf, max_features=forest.share, n_jobs=-1, random_state=spec.seed
+        forest.trees,
+        min_samples_leaf=forest.min_samples_leaf,
+        max_features=forest.max_features,
+        n_jobs=-1,
+        random_state=spec.seed,
     )
     # One target goes as a vector, since scikit-learn warns of a single column.
     model.fit(train.inputs, train.changes if train.changes.shape[1] > 1 else train.changes[:, 0])

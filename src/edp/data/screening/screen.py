@@ -165,7 +165,7 @@ def list_trusted(table: CandidateTable, spec: ScreeningSpec) -> set[str]:
 
     Targets, the names of Table A.1, and those that the user names.
     """
-    return {*(table.names[i] for i in table.targets), *spec.trusted, *TABLE_A1}
+    return {*(table.names[i] for i in table.targets), *spec.measured, *TABLE_A1}
 
 
 def _structural_flags(table: CandidateTable, lagged: Lagged, spec: ScreeningSpec) -> list[Flag]:
@@ -188,7 +188,7 @@ def _structural_flags(table: CandidateTable, lagged: Lagged, spec: ScreeningSpec
     flagged = sorted(set(range(len(names))) - set(open_ones()))
     flags += copies.find_leaks(names, correlations, trusted, targets, flagged)
     settled = {names.index(flag.channel) for flag in flags if flag.channel in names}
-    pairs = copies.find_copies(correlations, spec.copy)
+    pairs = copies.find_copies(correlations, spec.copy_threshold)
     return flags + copies.copy_flags(names, pairs, set(trusted), copies.innovations(correlations), settled)
 
 
@@ -204,9 +204,9 @@ def _evidence(
     spearman = measured.matrices.spearman
     columns = np.array(used, dtype=np.int64)
     targets = np.searchsorted(lagged.live, table.targets)
-    relations = stability.relations_of(lagged, targets, measured.metrics, spec.level)
-    groups = clusters_of(spearman[np.ix_(columns, columns)], spec.collinear)
-    held_out = values.choose_held_out(len(table.pieces), spec.forest.held_out, spec.seed)
+    relations = stability.relations_of(lagged, targets, measured.metrics, spec.significance_level)
+    groups = clusters_of(spearman[np.ix_(columns, columns)], spec.collinearity_threshold)
+    held_out = values.choose_held_out(len(table.pieces), spec.forest.test_fraction, spec.seed)
     read = columns if spec.horizon else columns[~np.isin(columns, table.targets)]
     if not len(read):
         raise DataError(

@@ -25,20 +25,20 @@ class ForestSpec:
     Attributes:
         trees: number of trees.
         samples: rows that it is fitted on, evenly spread over the training recordings.
-        tests: held-out rows on which channels are permuted.
+        test_samples: held-out rows on which channels are permuted.
         repeats: permutations of each group.
-        leaf: least number of rows in a leaf.
-        share: share of the channels that a node may choose from.
-        held_out: share of the recordings (or segments) held out.
+        min_samples_leaf: least number of rows in a leaf.
+        max_features: share of the channels that a node may choose from.
+        test_fraction: share of the recordings (or segments) held out.
     """
 
     trees: int = 30
     samples: int = 12_000
-    tests: int = 6_000
+    test_samples: int = 6_000
     repeats: int = 5
-    leaf: int = 5
-    share: float = 1 / 3
-    held_out: float = 0.34
+    min_samples_leaf: int = 5
+    max_features: float = 1 / 3
+    test_fraction: float = 0.34
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -46,11 +46,11 @@ class ForestSpec:
             self,
             trees=integer(1, MAX_TREES),
             samples=integer(1, MAX_SAMPLES),
-            tests=integer(1, MAX_SAMPLES),
+            test_samples=integer(1, MAX_SAMPLES),
             repeats=integer(1, MAX_REPEATS),
-            leaf=integer(1, MAX_SAMPLES),
-            share=above(0.0, 1.0),
-            held_out=above(0.0, 0.8),
+            min_samples_leaf=integer(1, MAX_SAMPLES),
+            max_features=above(0.0, 1.0),
+            test_fraction=above(0.0, 0.8),
         )
 
 
@@ -61,53 +61,53 @@ class ScreeningSpec:
     Attributes:
         targets: channels to be predicted; empty takes the cylinder velocities of Table A.1, else every velocity.
         candidates: channels to evaluate; empty takes all of the recordings. Targets are always among them.
-        trusted: channels known to be measured on the machine, in addition to the targets and the names of Table A.1. Of
-            a channel and its copy, the trusted one is taken for the original.
+        measured: channels known to be measured on the machine, in addition to the targets and the names of Table A.1.
+            Of a channel and its copy, the trusted one is taken for the original.
         horizon: prediction horizon of the model.
         max_lag: lags from -max_lag to max_lag are searched.
-        pieces: least number of segments to compare; recordings are cut where there are fewer.
+        min_segments: least number of segments to compare; recordings are cut where there are fewer.
         neighbours: k of the nearest-neighbour estimate of mutual information.
         information_samples: rows for that estimate, evenly spread over the data.
         rank_samples: number of samples for Kendall's tau.
-        piece_samples: rows of each piece for the metrics that are compared among segments.
-        collinear: rank correlation from which channels form a cluster.
-        copy: correlation at the best lag from which one channel is a copy of another.
-        level: chance of a false alarm of each test of significance, shared among the channels.
+        segment_samples: rows of each piece for the metrics that are compared among segments.
+        collinearity_threshold: rank correlation from which channels form a cluster.
+        copy_threshold: correlation at the best lag from which one channel is a copy of another.
+        significance_level: chance of a false alarm of each test of significance, shared among the channels.
         forest: the forest.
         seed: seed of all random values.
     """
 
     targets: tuple[str, ...] = ()
     candidates: tuple[str, ...] = ()
-    trusted: tuple[str, ...] = ()
+    measured: tuple[str, ...] = ()
     horizon: int = 10
     max_lag: int = 100
-    pieces: int = 8
+    min_segments: int = 8
     neighbours: int = 3
     information_samples: int = 4_000
     rank_samples: int = 20_000
-    piece_samples: int = 1_000
-    collinear: float = 0.9
-    copy: float = 0.99
-    level: float = 0.01
+    segment_samples: int = 1_000
+    collinearity_threshold: float = 0.9
+    copy_threshold: float = 0.99
+    significance_level: float = 0.01
     forest: ForestSpec = field(default_factory=ForestSpec)
     seed: int = 0
 
     def __post_init__(self) -> None:
-        shares = dict.fromkeys(("collinear", "copy", "level"), between(0.0, 1.0))
-        rows = dict.fromkeys(("information_samples", "rank_samples", "piece_samples"), integer(100, MAX_SAMPLES))
+        shares = dict.fromkeys(("collinearity_threshold", "copy_threshold", "significance_level"), between(0.0, 1.0))
+        rows = dict.fromkeys(("information_samples", "rank_samples", "segment_samples"), integer(100, MAX_SAMPLES))
         check_bounds(
             "screening",
             self,
             horizon=integer(0, MAX_LAG),
             max_lag=integer(20, MAX_LAG),
-            pieces=integer(4, MAX_PIECES),
+            min_segments=integer(4, MAX_PIECES),
             neighbours=integer(1, MAX_NEIGHBOURS),
             seed=SEED,
             **rows,
             **shares,
         )
-        for name in ("targets", "candidates", "trusted"):
+        for name in ("targets", "candidates", "measured"):
             check_count("screening", name, getattr(self, name), MAX_NAMES)
         if self.horizon > self.max_lag:
             raise ConfigError(

@@ -70,7 +70,7 @@ def piece_rows(table: CandidateTable, piece_index: int, spec: ScreeningSpec) -> 
         usable = len(stretch) - spec.horizon
         if usable < 1:
             continue
-        count = min(usable, max(1, spec.piece_samples * len(stretch) // piece.samples))
+        count = min(usable, max(1, spec.segment_samples * len(stretch) // piece.samples))
         row_indices = np.linspace(0, usable - 1, count).astype(np.int64)
         now.append(stretch[row_indices])
         ahead.append(stretch[row_indices + spec.horizon][:, table.targets])

@@ -131,7 +131,7 @@ class CandidateTable:
 
 
 def chunks(stretches: Sequence[FloatArray], rows: int = 32_768) -> Iterator[Array]:
-    """Return the stretches in float64, some rows at a time."""
+    """Return the segments in float64, some rows at a time."""
     return (s[i : i + rows].astype(np.float64) for s in stretches for i in range(0, len(s), rows))
 
 
@@ -155,7 +155,7 @@ def build_table(recordings: Sequence[Recording], spec: ScreeningSpec) -> Candida
     recordings, short = _long_enough(recordings, spec.max_lag)
     targets = spec.targets or _usual_targets(first)
     names = tuple(dict.fromkeys((*(spec.candidates or first.channel_names), *targets)))
-    for name in (*names, *spec.trusted):
+    for name in (*names, *spec.measured):
         if name not in first.channel_names:
             raise DataError(
                 f"screening asks for '{name}', which '{first.name}' lacks{closest(name, first.channel_names)}"
@@ -248,17 +248,19 @@ def _pieces(names: Sequence[str], columns: Sequence[FloatArray], spec: Screening
     """
     total = sum(len(values) for values in columns)
     pieces: list[Piece] = []
-    if len(columns) >= spec.pieces:
+    if len(columns) >= spec.min_segments:
         # lagged covariances of all pairs are held for every piece: a gigabyte at most
         each = 4 * (2 * spec.max_lag + 1) * columns[0].shape[1] ** 2
-        per = -(-len(columns) // max(spec.pieces, min(MAX_PIECES, int(1e9 / each))))
+        per = -(-len(columns) // max(spec.min_segments, min(MAX_PIECES, int(1e9 / each))))
         for start in range(0, len(columns), per):
             label = names[start] if per == 1 else f"{names[start]} to {names[min(start + per, len(names)) - 1]}"
             pieces.append(Piece(label, tuple(columns[start : start + per])))
     else:
         for name, values in zip(names, columns, strict=True):
             # a part is as long as the lags need, if that leaves fewer parts than asked for
-            parts = max(1, min(round(spec.pieces * len(values) / total + 0.499), len(values) // (5 * spec.max_lag)))
+            parts = max(
+                1, min(round(spec.min_segments * len(values) / total + 0.499), len(values) // (5 * spec.max_lag))
+            )
             edges = np.linspace(0, len(values), parts + 1).astype(int)
             for i in range(parts):
                 label = name if parts == 1 else f"{name} part {i + 1}"

@@ -52,7 +52,7 @@ def values(adaptation: Adaptation, upper: str, intervals: int) -> dict[str, obje
         "rank": adaptation.spec.rank,
         "features": n,
         "forgetting": f"{adaptation.spec.forgetting_s:g}",
-        "judged": f"{adaptation.spec.judged_s:g}",
+        "judged": f"{adaptation.spec.evaluation_s:g}",
         "margin": f"{100 * adaptation.spec.margin:g}",
         "adapt_macs": adaptation.macs,
         "adapt_flash": total_bytes(constants(adaptation)),

@@ -41,7 +41,7 @@ class LaneModel:
     fragments = ("fields.h", "pressures.c")
 
     def sizes(self, plan: PlanParts) -> dict[str, int]:
-        """Return further sizes that the controller defines."""
+        """Return additional sizes that the controller defines."""
         return {}
 
     def cost(self, plan: PlanParts) -> str:
@@ -172,12 +172,12 @@ def lane_model(name: str, bundle: Bundle) -> LaneModel:
     """
     plant = bundle.predictor
     if not isinstance(plant, TwinPlant):
-        raise ExportError("the model of a controller is a twin; export a run of edp control whose twin is one")
+        raise ExportError("the model of a controller is a twin; export a run of edp loop run whose twin is one")
     model = make_model(name, bundle)
     if model.integer or model.hydraulic:
         what = "computes in integer arithmetic" if model.integer else "has a network on a grey box"
         raise ExportError(
-            f"the twin of the controller {what}, which no plan in C can follow; run edp control with a recurrent twin "
+            f"the twin of the controller {what}, which no plan in C can follow; run edp loop run with a recurrent twin "
             "or a grey box"
         )
     return LaneModel(name, model, plant)

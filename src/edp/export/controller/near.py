@@ -46,7 +46,7 @@ class NearModel:
     fragments = ("fields.h", "public.h", "pressures.c", "recall.c")
 
     def sizes(self, plan: PlanParts) -> dict[str, int]:
-        """Return further sizes that the controller defines."""
+        """Return additional sizes that the controller defines."""
         ticks = sum(plan.blocks)
         return {"TICKS": ticks, "SPAN": max(ticks, plan.window), "NEWTON": plan.newton}
 

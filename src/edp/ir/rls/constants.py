@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from edp.errors import ConfigError
 from edp.settings.bounds import check_bounds, integer, span
+from edp.settings.earlier_keys import present_keys
 from edp.settings.tree import Table
 
 Array = NDArray[np.float32]
@@ -39,7 +40,7 @@ class AdaptationSpec:
         prior: spread of the coefficients, in units for one standard width of a feature.
         limit: largest correction, in units.
         dead_zone: share of the targets' spread from the middle within which the machine counts as in steady state.
-        judged_s: seconds of motion over which the correction is evaluated against the prediction without it.
+        evaluation_s: seconds of motion over which the correction is evaluated against the prediction without it.
         margin: share by which it must be worse to be taken back.
 
     Raises:
@@ -55,7 +56,7 @@ class AdaptationSpec:
     limit: float = 3.0
     # At rest nothing is judged, and corrections learned in motion would stay in the output (decision 31).
     dead_zone: float = 0.05
-    judged_s: float = 10.0
+    evaluation_s: float = 10.0
     margin: float = 0.05
 
     def __post_init__(self) -> None:
@@ -151,7 +152,7 @@ class Adaptation:
             "noise": self.spec.noise,
             "limit": self.spec.limit,
             "bound": BOUND * self.spec.prior,
-            "rate": 1.0 - math.exp(-1.0 / (self.spec.judged_s * self.rate_hz)),
+            "rate": 1.0 - math.exp(-1.0 / (self.spec.evaluation_s * self.rate_hz)),
             "worse": 1.0 + self.spec.margin,
             "better": 1.0 - BETTER,
         }
@@ -182,7 +183,9 @@ class Adaptation:
         """
         # JSON has lists only; equality and hashing of an adaptation need tuples.
         entries: Table = {"horizons": tuple(plain["horizons"]), "columns": tuple(plain["columns"]), **arrays}
-        return cls(spec=AdaptationSpec(**plain["spec"]), rate_hz=plain["rate_hz"], **entries)
+        return cls(
+            spec=AdaptationSpec(**present_keys(AdaptationSpec, plain["spec"])), rate_hz=plain["rate_hz"], **entries
+        )
 
     @property
     def digest(self) -> str:

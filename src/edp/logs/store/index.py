@@ -148,10 +148,13 @@ def read_index(folder: str | Path) -> StoreIndex:
     path = Path(folder) / INDEX
     where = f"index of the store '{folder}'"
     if not is_store(folder):
-        raise DataError(f"'{folder}' is no store: it has no {INDEX}; `edp store build LOGS --out {folder}` makes one")
+        raise DataError(
+            f"'{folder}' is no store: it has no {INDEX}; `edp data store build LOGS --out {folder}` makes one"
+        )
     if not is_file_at(path):
         raise DataError(
-            f"the store '{folder}' is half built: it has no {INDEX} yet; give the same `edp store build` again, it "
+            f"the store '{folder}' is half built: it has no {INDEX} yet; give the same `edp data store build` "
+            f"again, it "
             "goes on where it stopped"
         )
     return parse_index(read_text(path, INDEX_BYTES, where, DataError), where)

@@ -105,7 +105,7 @@ def _status(folder: Path, file: RowsFile) -> os.stat_result:
     except OSError as error:
         raise DataError(
             f"'{path}', a file of the store, cannot be read: {error.strerror or error}; copy the store again, or give "
-            "the same `edp store build` again, which reads its logs anew"
+            "the same `edp data store build` again, which reads its logs anew"
         ) from error
     if is_link_at(path) or not is_file_at(path):
         raise DataError(f"'{path}' must be a regular file of the store; it is a link, a folder or a device")

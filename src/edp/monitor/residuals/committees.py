@@ -76,8 +76,8 @@ class CommitteeOptions:
         )
         model = ModelSpec(backbone=backbone, head=LinearHead(), window=max(2, lags[-1]))
         steps = max(MIN_STEPS, min(MAX_STEPS, round(minutes * STEPS_PER_MINUTE)))
-        bagging = BaggingSpec(folds=FOLDS, steps=steps, batch=BATCH, rows=self.rows, checks=5)
-        training = TrainingSpec(loss=MeanSquared(), bagging=bagging, seed=material.seed, device="cpu")
+        bagging = BaggingSpec(folds=FOLDS, steps=steps, batch=BATCH, max_rows=self.rows, validations=5)
+        training = TrainingSpec(loss=MeanSquared(), ensemble=bagging, seed=material.seed, device="cpu")
         fitted = fit(data, model, training)
         return make_bundle(fitted.predictor, data, Provenance(seconds=fitted.seconds)), data
 

@@ -291,8 +291,8 @@ class FlowBalancesSpec(ResidualSpec):
     Attributes:
         rows: ticks that curves are fitted to, at most.
         trials: numbers of trials for dead times, frequencies and play of the spools of an axis.
-        least: share of the mean size of the velocity that a balance must tell on sessions that did not train it; of
-            less it evaluates nothing.
+        min_explained: share of the mean size of the velocity that a balance must tell on sessions that did not train
+            it; of less it evaluates nothing.
 
     Raises:
         ConfigError: a value is out of its bounds.
@@ -301,17 +301,17 @@ class FlowBalancesSpec(ResidualSpec):
     source: ClassVar[type[ResidualSource]] = FlowBalances
     rows: int = 200_000
     trials: int = 80
-    least: float = 0.6
+    min_explained: float = 0.6
 
     def __post_init__(self) -> None:
         check_bounds(
-            "flow_balances", self, rows=integer(1000, MAX_ROWS), trials=integer(1, 10_000), least=span(0.0, 1.0)
+            "flow_balances", self, rows=integer(1000, MAX_ROWS), trials=integer(1, 10_000), min_explained=span(0.0, 1.0)
         )
 
     def fit(self, material: FitMaterial) -> ResidualSource | None:
         """See `ResidualSpec.fit`."""
         material.progress.note("balances of flow")
-        balances = fit_chambers(material, self.rows, self.trials, self.least)
+        balances = fit_chambers(material, self.rows, self.trials, self.min_explained)
         if balances is None:
             return None
         inputs, spools, fitted = balances

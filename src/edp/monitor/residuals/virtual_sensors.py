@@ -139,8 +139,8 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
     """Networks that estimate each channel group from the others: a linear map and some perceptrons on changes.
 
     Attributes:
-        least: share of a channel's mean deviation that a virtual sensor must explain on the sessions that choose; a
-            channel that the others say less about is not evaluated.
+        min_explained: share of a channel's mean deviation that a virtual sensor must explain on the sessions that
+            choose; a channel that the others say less about is not evaluated.
         every: ticks from one run of a network to the next, 1 by default. Networks take turns, are trained at that
             slower rate (spans in `lags_s` shorter than it are one run), and residuals hold in between: a controller
             has one of n networks to run at a tick where it is n or more.
@@ -150,12 +150,12 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
     """
 
     source: ClassVar[type[ResidualSource]] = VirtualSensors
-    least: float = 0.1
+    min_explained: float = 0.1
     every: int = 1
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_bounds("virtual_sensors", self, least=above(-1.0, 1.0), every=integer(1, MAX_EVERY))
+        check_bounds("virtual_sensors", self, min_explained=above(-1.0, 1.0), every=integer(1, MAX_EVERY))
 
     def fit(self, material: FitMaterial) -> ResidualSource | None:
         """See `ResidualSpec.fit`."""
@@ -204,7 +204,9 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
         """Train the network of a group; None if it explains no channel."""
         bundle, data = self.trained(self._task(group, group.judged, material), material, minutes)
         explained = _compute_explained(bundle.predictor, data.validation or data.train)
-        remaining = tuple(name for name, share in zip(group.judged, explained, strict=True) if share >= self.least)
+        remaining = tuple(
+            name for name, share in zip(group.judged, explained, strict=True) if share >= self.min_explained
+        )
         if not remaining:
             return None
         if len(remaining) < len(group.judged):

@@ -16,7 +16,7 @@ from edp.networks.blocks.base import BLOCKS, BlockSlot, OutputSpace
 from edp.networks.streaming import Cost, Operation, State, Streaming, parameters_of
 from edp.settings.bounds import MAX_KERNEL, check_bounds, integer
 
-STARTS = ("ridge", "crossed", "zero")
+STARTS = ("ridge", "cross_validated", "zero")
 
 
 @BLOCKS.register("linear_bypass")
@@ -26,28 +26,28 @@ class LinearBypass:
 
     Attributes:
         taps: samples of history, the present one included.
-        start: ``ridge`` starts from the ridge regression on the training data, with penalty and history chosen on
-            the validation data; ``crossed`` from the one on both, chosen by cross-validation (for little data);
+        init: ``ridge`` starts from the ridge regression on the training data, with penalty and history chosen on
+            the validation data; ``cross_validated`` from the one on both, chosen by cross-validation (for little data);
             ``zero`` from nothing.
-        trained: False keeps the start values, so that the network learns what the linear map leaves.
+        trainable: False keeps the start values, so that the network learns what the linear map leaves.
 
     Raises:
         ConfigError: taps below 1, unknown start, or a skip connection that is zero and not trained.
     """
 
     slot: ClassVar[BlockSlot] = BlockSlot.BYPASS
-    space: ClassVar[dict[str, object]] = {"taps": (5, 50), "start": STARTS}
+    space: ClassVar[dict[str, object]] = {"taps": (5, 50), "init": STARTS}
     taps: int = 25
-    start: str = "ridge"
-    trained: bool = True
+    init: str = "ridge"
+    trainable: bool = True
 
     def __post_init__(self) -> None:
         check_bounds("linear_bypass", self, taps=integer(1, MAX_KERNEL))
-        if self.start not in STARTS:
-            raise ConfigError(f"linear_bypass: unknown start '{self.start}'{closest(self.start, STARTS)}")
+        if self.init not in STARTS:
+            raise ConfigError(f"linear_bypass: unknown start '{self.init}'{closest(self.init, STARTS)}")
         # A map that starts at zero and never changes adds nothing; the combination is refused, not ignored.
-        if self.start == "zero" and not self.trained:
-            raise ConfigError("linear_bypass: start = 'zero' with trained = false does nothing; change one of them")
+        if self.init == "zero" and not self.trainable:
+            raise ConfigError("linear_bypass: init = 'zero' with trainable = false does nothing; change one of them")
 
     def build(self, space: OutputSpace) -> Streaming:
         """Build the skip connection with zero weights; training sets the ridge solution."""
@@ -65,9 +65,9 @@ class Bypass(Streaming):
         self.spec, self.features, self.horizons, self.outputs = spec, features, horizons, outputs
         # Zero until training sets the regression: a bundle loads its weights over them, and a fresh network is
         # unchanged.
-        self.weight = nn.Parameter(torch.zeros(horizons * outputs, features, spec.taps), requires_grad=spec.trained)
-        self.bias = nn.Parameter(torch.zeros(horizons * outputs), requires_grad=spec.trained)
-        self.fixed = () if spec.trained else ("weight", "bias")
+        self.weight = nn.Parameter(torch.zeros(horizons * outputs, features, spec.taps), requires_grad=spec.trainable)
+        self.bias = nn.Parameter(torch.zeros(horizons * outputs), requires_grad=spec.trainable)
+        self.fixed = () if spec.trainable else ("weight", "bias")
 
     def initial_state(self, batch: int, like: Tensor) -> State:
         # Zeros stand for the mean of scaled features, so that a reset starts from the usual operating point.

@@ -41,7 +41,7 @@ class AdaptiveWeights:
     Attributes:
         blend: share of the adaptive part; 0 leaves the fixed weights alone.
         max_ratio: largest ratio of two adaptive weights.
-        memory: share of the running error that an update keeps.
+        decay: share of the running error that an update keeps.
 
     Raises:
         ConfigError: a value out of range.
@@ -49,10 +49,10 @@ class AdaptiveWeights:
 
     blend: float = 0.0
     max_ratio: float = 3.0
-    memory: float = 0.99
+    decay: float = 0.99
 
     def __post_init__(self) -> None:
-        check_bounds("adaptive", self, blend=SHARE, max_ratio=above(1.0, MAX_WEIGHT), memory=below(0.0, 1.0))
+        check_bounds("adaptive", self, blend=SHARE, max_ratio=above(1.0, MAX_WEIGHT), decay=below(0.0, 1.0))
 
     def weights(self, running: Tensor) -> Tensor:
         """Return the weights ``(horizon, output)`` from the running errors, same shape."""
@@ -66,4 +66,4 @@ class AdaptiveWeights:
         count = valid.sum()
         mean = torch.where(valid[..., None, None], error.abs(), 0.0).sum(dim=(0, 1)) / count.clamp(min=1)
         # A batch without valid ticks must not pull the running error towards zero.
-        return torch.where(count > 0, self.memory * running + (1.0 - self.memory) * mean, running)
+        return torch.where(count > 0, self.decay * running + (1.0 - self.decay) * mean, running)

@@ -33,7 +33,7 @@ class DynamicSpec(PhysicsSpec):
         load: forces subtracted from the cylinder force ``A_A p_A - A_B p_B``: ``none`` (exactly the equations of the
             thesis), ``gravity``, or ``all``: gravity, Coriolis torques, friction of the seals and forces of the end
             stops.
-        fade_s: time constant in s with which the acceleration dies away over the horizon, as the oil's stiffness
+        decay_s: time constant in s with which the acceleration dies away over the horizon, as the oil's stiffness
             takes up the force; 0 holds it for all of the k steps, as the thesis does. 0.03 is near the best at
             100 ms on M22 and C14.
 
@@ -41,10 +41,10 @@ class DynamicSpec(PhysicsSpec):
         ConfigError: an unknown load or a negative time.
     """
 
-    space: ClassVar[dict[str, object]] = {"load": LOADS, "fade_s": (0.0, 0.2)}
+    space: ClassVar[dict[str, object]] = {"load": LOADS, "decay_s": (0.0, 0.2)}
     load: str = "all"
     # 0.03 s: measured compromise between boom and bucket at k = 10 (docs/journal, fading acceleration).
-    fade_s: float = 0.03
+    decay_s: float = 0.03
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -52,7 +52,7 @@ class DynamicSpec(PhysicsSpec):
             raise ConfigError(
                 f"physics: load = '{self.load}' must hold one of {', '.join(LOADS)}{closest(self.load, LOADS)}"
             )
-        check_bounds("physics", self, fade_s=span(0.0, MAX_FADE_S))
+        check_bounds("physics", self, decay_s=span(0.0, MAX_FADE_S))
 
     def channels(self) -> tuple[str, ...]:
         return (*super().channels(), *HEADS, *RODS)
@@ -82,7 +82,7 @@ class Dynamic(PhysicsBase):
     def lasting(self) -> list[float]:
         """Return the time (s) during which an acceleration acts for each horizon: k steps, minus the fading time."""
         ahead_s = [k / self.rate_hz for k in self.task.horizons]
-        fade_s = self.spec.fade_s
+        fade_s = self.spec.decay_s
         # The integral of exp(-t / fade); expm1 keeps the digits where the horizon is far below the fading.
         return [fade_s * -math.expm1(-time_s / fade_s) if fade_s else time_s for time_s in ahead_s]
 

@@ -67,15 +67,15 @@ class GreyBox:
         potential_degree: degree of the polynomial of the strokes that is the potential energy.
         linkage: machine name or machine file. Rigid bodies of this linkage, moved by the cylinders boom, arm and
             bucket, replace the polynomials. Empty for polynomials.
-        without: parts of the equations to omit: `power_limit` of the pumps, `cushions` at the end stops, `play` of the
+        omit: parts of the equations to omit: `power_limit` of the pumps, `cushions` at the end stops, `play` of the
             spools.
-        stretches: number of segments of a spool's opening curve: 5, 10 or 20. 0 selects the number by free-run
+        curve_segments: number of segments of a spool's opening curve: 5, 10 or 20. 0 selects the number by free-run
             simulation on the validation part. A bundle without this entry has 5.
         prefix_ticks: number of measured samples before a free-run simulation.
         fit: settings of the fit.
 
     Raises:
-        ConfigError: a value is out of range, `without` has an unknown entry, or degrees are set together with a
+        ConfigError: a value is out of range, `omit` has an unknown entry, or degrees are set together with a
             linkage.
     """
 
@@ -86,8 +86,8 @@ class GreyBox:
     inertia_degree: int = POLYNOMIALS[0]
     potential_degree: int = POLYNOMIALS[1]
     linkage: str = ""
-    without: tuple[str, ...] = ()
-    stretches: int = 0
+    omit: tuple[str, ...] = ()
+    curve_segments: int = 0
     prefix_ticks: int = 30
     fit: GreyFitSpec = field(default_factory=GreyFitSpec)
 
@@ -96,19 +96,19 @@ class GreyBox:
         check_bounds("grey box", self, inertia_degree=degree, potential_degree=integer(1, 6), prefix_ticks=PREFIX)
         for name in ("cylinders", "motors", "valves", "pumps"):
             check_count("grey box", name, getattr(self, name), MAX_NAMES)
-        check_count("grey box", "without", self.without, len(LEFT_OUT))
+        check_count("grey box", "omit", self.omit, len(LEFT_OUT))
         if self.linkage and self.degrees != POLYNOMIALS:
             raise ConfigError(
                 f"grey box: inertia_degree = {self.inertia_degree} and potential_degree = {self.potential_degree} are "
                 f"of polynomials, which twin.linkage = '{self.linkage[:80]}' replaces; leave the degrees out, or the "
                 "linkage"
             )
-        if self.stretches not in (0, *STRETCHES):
+        if self.curve_segments not in (0, *STRETCHES):
             raise ConfigError(
-                f"grey box: stretches = {self.stretches}; any of {', '.join(map(str, STRETCHES))}, or 0 for the "
-                "validation part to choose, must hold"
+                f"grey box: curve_segments = {self.curve_segments}; any of {', '.join(map(str, STRETCHES))}, or 0 for "
+                "the validation part to choose, must hold"
             )
-        for part in self.without:
+        for part in self.omit:
             if part not in LEFT_OUT:
                 raise ConfigError(
                     f"grey box: without names '{part}'{closest(part, tuple(LEFT_OUT))}; any of {', '.join(LEFT_OUT)} "
@@ -152,7 +152,7 @@ class GreyBox:
         own = KnownLinkage.SHAPES if self.linkage else {}
         front = KnownLinkage(*(np.ones(shape) for shape in own.values())) if own else None
         pumps = [1.0] * len(elements.pumps)
-        table = number_table(elements, travels, pumps, self.degrees, self.without, front, self.curve)
+        table = number_table(elements, travels, pumps, self.degrees, self.omit, front, self.curve)
         return {"numbers": (len(table.numbers),), "full": (len(elements.valves),), **own}
 
     def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> GreyTwin:
@@ -180,7 +180,7 @@ class GreyBox:
     @property
     def curve(self) -> int:
         """Number of segments of an opening curve: the smallest one until a number is selected, and in old bundles."""
-        return self.stretches or STRETCHES[0]
+        return self.curve_segments or STRETCHES[0]
 
     def table(
         self, elements: Elements, channels: TwinChannels, scales: TwinScales, front: KnownLinkage | None
@@ -199,7 +199,7 @@ class GreyBox:
             fastest, (first, second) = float(scales.high[i]) / FASTEST, actuator.chambers
             travels.append(Travel(float(low), float(high), fastest, (highest(first), highest(second))))
         pumps = [highest(pump.pressure) * HIGHEST for pump in elements.pumps]
-        return number_table(elements, travels, pumps, self.degrees, self.without, front, self.curve)
+        return number_table(elements, travels, pumps, self.degrees, self.omit, front, self.curve)
 
 
 def _sides(valve: ValveElement, channels: TwinChannels) -> list[int]:
@@ -260,9 +260,9 @@ class GreyTwin(Twin):
 
     def with_stretches(self, stretches: int) -> GreyTwin:
         """Return a twin with the same outputs whose opening curves have more segments."""
-        spec = replace(self.spec, stretches=stretches)
+        spec = replace(self.spec, curve_segments=stretches)
         if spec.curve % self.table.stretches:
-            raise ValueError(f"stretches = {stretches}; a multiple of {self.table.stretches} must hold")
+            raise ValueError(f"curve_segments = {stretches}; a multiple of {self.table.stretches} must hold")
         elements = spec.elements(self.channels)
         table = spec.table(elements, self.channels, self.scales, self.table.front)
         parts = (table, self.wiring)

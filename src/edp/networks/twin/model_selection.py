@@ -28,12 +28,12 @@ class AutoTwin:
 
     Attributes:
         candidates: formulations, the simplest first.
-        least_gain: share of error by which a candidate must be better than a simpler one.
+        min_gain: share of error by which a candidate must be better than a simpler one.
         folds: parts of training and validation part together that are left out in turn, where both are short; with 1
             the validation part alone is left out.
         prefix_ticks: measured ticks before a free run.
-        minutes: counted processor time for the recurrent networks: trainings that do not fit into it are left out;
-            0: no bound.
+        time_budget_min: counted processor time for the recurrent networks: trainings that do not fit into it are left
+            out; 0: no bound.
         elements: what a small system is known to be made of, as one more candidate, tried before the networks.
 
     Raises:
@@ -41,14 +41,14 @@ class AutoTwin:
     """
 
     candidates: tuple[str, ...] = ("static", "arx", "n4sid", "recurrent")
-    least_gain: float = 0.02
+    min_gain: float = 0.02
     folds: int = 5
     prefix_ticks: int = 30
-    minutes: float = 0.0
+    time_budget_min: float = 0.0
     elements: ElementsBox | None = None
 
     def __post_init__(self) -> None:
-        check_bounds("automatic twin", self, least_gain=SHARE, folds=FOLDS, prefix_ticks=PREFIX, minutes=BUDGET)
+        check_bounds("automatic twin", self, min_gain=SHARE, folds=FOLDS, prefix_ticks=PREFIX, time_budget_min=BUDGET)
         check_count("automatic twin", "candidates", self.candidates, MAX_NAMES, least=1)
         for name in self.candidates:
             try:

@@ -40,7 +40,7 @@ class Residual(GreyBox):
 
     Attributes:
         units: width of the network's memory.
-        lanes: free runs side by side in an update of the network.
+        batch: free runs side by side in an update of the network.
         lengths_s: lengths of the free runs, stage after stage.
         updates: updates of each stage.
         validate_every: updates from one validation to the next.
@@ -50,7 +50,7 @@ class Residual(GreyBox):
     """
 
     units: int = 64
-    lanes: int = 32
+    batch: int = 32
     lengths_s: tuple[float, ...] = (0.3, 1.0, 3.0)
     updates: tuple[int, ...] = (300, 700, 150)
     validate_every: int = 50
@@ -58,7 +58,7 @@ class Residual(GreyBox):
     def __post_init__(self) -> None:
         super().__post_init__()
         count = integer(1, MAX_UPDATES)
-        bounds = {"units": integer(1, MAX_UNITS), "lanes": integer(1, MAX_BATCH), "lengths_s": above(0.0, 600.0)}
+        bounds = {"units": integer(1, MAX_UNITS), "batch": integer(1, MAX_BATCH), "lengths_s": above(0.0, 600.0)}
         check_bounds("residual twin", self, updates=count, validate_every=count, **bounds)
         check_count("residual twin", "lengths_s", self.lengths_s, MAX_NAMES, least=1)
         if len(self.lengths_s) != len(self.updates):

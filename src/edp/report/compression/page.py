@@ -12,7 +12,10 @@ from edp.storage.paths import full_path
 
 
 def write_compression_page(folder: str | Path, pictures: bool = True) -> Path:
-    """Write ``report.html``, ``tables/*.csv``, ``tables/*.md`` and ``pictures/*`` into the folder of `edp compress`.
+    """Write page, tables and pictures of a compression search.
+
+    Writes ``report.html``, ``tables/*.csv``, ``tables/*.md`` and ``pictures/*`` into the folder of `edp compress
+    search`.
 
     Returns:
         The page.

@@ -23,7 +23,7 @@ JOINTS = {
 }
 """Heading of each joint histogram, by the name of its figure."""
 NO_COMMANDS = Markup(
-    "No channel of these recordings is known to command. Name them: <code>edp inspect DATA --inputs a,b</code>, or "
+    "No channel of these recordings is known to command. Name them: <code>edp data check DATA --inputs a,b</code>, or "
     "give a signal map with their kinds."
 )
 

@@ -99,19 +99,21 @@ class Transfer:
 
 
 def read_transfer(folder: str | Path) -> Transfer:
-    """Read the result of `edp finetune` from a folder.
+    """Read the result of `edp train finetune` from a folder.
 
     Raises:
         StorageError: nothing, something of another version, or damaged excerpts.
     """
     if not is_file_at(Path(folder) / TransferFile.NAME):
-        raise StorageError(f"'{folder}' holds no {TransferFile.NAME}; give the folder of edp finetune")
+        raise StorageError(f"'{folder}' holds no {TransferFile.NAME}; give the folder of edp train finetune")
     content = TransferFile.read(folder)
     check_files(content.files, folder, TransferFile.ADVICE)
     try:
         shown = load_file(Path(folder) / SHOWN)
     except (OSError, SafetensorError) as error:
-        raise StorageError(f"'{Path(folder) / SHOWN}' cannot be read ({error}); run edp finetune again") from error
+        raise StorageError(
+            f"'{Path(folder) / SHOWN}' cannot be read ({error}); run edp train finetune again"
+        ) from error
     return Transfer(content, shown, Path(folder))
 
 

@@ -13,7 +13,10 @@ from edp.storage.paths import full_path
 
 
 def write_transfer_page(folder: str | Path, pictures: bool = True) -> Path:
-    """Write ``transfer.html``, ``tables/*.csv``, ``tables/*.md`` and ``pictures/*`` into the folder of `edp finetune`.
+    """Write page, tables and pictures of a fine-tuning.
+
+    Writes ``transfer.html``, ``tables/*.csv``, ``tables/*.md`` and ``pictures/*`` into the folder of `edp train
+    finetune`.
 
     Returns:
         The page.

@@ -1,1 +1,4 @@
-"""Ensembles trained on folds: a linear model, and several kinds of learners on its residuals (bagging, stacking)."""
+"""Ensembles trained with cross-validation folds.
+
+A linear model, and several kinds of learners on its residuals (bagging, stacking).
+"""

@@ -73,7 +73,7 @@ class TreeLearner:
         self.rounds = trees.trees // models
         self.models: list[list[_Boosted]] = []
         rng = np.random.default_rng(work.spec.seed)
-        most, folds = work.bagging.tree_rows, work.table.folds
+        most, folds = work.bagging.tree_max_rows, work.table.folds
         self.parts = [
             (part, _sample(_find_common_rows(folds, part), most, rng))
             for part in np.array_split(np.arange(folds.count), min(work.bagging.tree_folds, folds.count))
@@ -146,9 +146,9 @@ class TreeLearner:
         return HistGradientBoostingRegressor(
             max_iter=rounds,
             max_depth=self.trees.depth,
-            max_leaf_nodes=bagging.tree_leaves or None,
-            learning_rate=bagging.tree_rate,
-            min_samples_leaf=bagging.tree_leaf,
+            max_leaf_nodes=bagging.tree_max_leaves or None,
+            learning_rate=bagging.tree_learning_rate,
+            min_samples_leaf=bagging.tree_min_leaf_rows,
             l2_regularization=PENALTY,
             early_stopping=False,
             random_state=self.work.spec.seed,

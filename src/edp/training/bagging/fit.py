@@ -78,7 +78,7 @@ def fit_bagged(data: Prepared, model: ModelSpec, spec: TrainingSpec, on_event: E
     check_training(data.task, model, spec)
     began = time.perf_counter()
     net = build_model(data.task, model, data.scaler(), spec.seed).eval()
-    table = table_of(net, data, spec.bagging or BaggingSpec())
+    table = table_of(net, data, spec.ensemble or BaggingSpec())
     work = FoldFit(net, data, spec, table, _fit_linear(net, table), on_event or (lambda event: None))
     learners = _learners(work)
     for learner in learners:

@@ -45,7 +45,7 @@ class FoldFit:
     @property
     def bagging(self) -> BaggingSpec:
         """The settings of bagging."""
-        return self.spec.bagging or BaggingSpec()
+        return self.spec.ensemble or BaggingSpec()
 
     @property
     def residual(self) -> DoubleArray:

@@ -48,7 +48,7 @@ class MemberGroup:
             for parameter in (pair[0], pair[1].unsqueeze(1))
         ]
         self.parameters += [last.requires_grad_(), torch.zeros(members.members, 1, outputs).requires_grad_()]
-        bagging = spec.bagging or BaggingSpec()
+        bagging = spec.ensemble or BaggingSpec()
         self.optimizer = EagerAdamW(self.parameters, lr=bagging.learning_rate, weight_decay=bagging.weight_decay)
         self.average = [parameter.detach().clone() for parameter in self.parameters]
         self.best = [parameter.clone() for parameter in self.average]

@@ -34,7 +34,7 @@ def losses_of(spec: TrainingSpec) -> tuple[Penalty, ...]:
     """
     if not isinstance(spec.loss, Penalty):
         raise TypeError("bagging trains with a loss that reads an error alone; check_training refuses any other")
-    width = (spec.bagging or BaggingSpec()).robust_width
+    width = (spec.ensemble or BaggingSpec()).huber_delta
     return (spec.loss, Huber(delta=width)) if width else (spec.loss,)
 
 
@@ -62,7 +62,7 @@ class PerceptronLearner:
         Raises:
             Diverged: the loss is not finite any more.
         """
-        steps, checks = self.bagging.steps, min(self.bagging.checks, self.bagging.steps)
+        steps, checks = self.bagging.steps, min(self.bagging.validations, self.bagging.steps)
         edges = [round(steps * check / checks) for check in range(checks + 1)]
         # The linear model alone is a candidate: members count where they lower the error.
         for group in self.groups:
@@ -88,7 +88,7 @@ class PerceptronLearner:
             facts = {"epoch": len(self.work.history) + 1, "update": step + 1, "kept_epoch": None}
             raise Diverged(
                 f"the training loss is {value} at update {step + 1}: the training diverged; nothing is kept. Lower "
-                "training.bagging.learning_rate, or look for outliers with edp inspect",
+                "training.ensemble.learning_rate, or look for outliers with edp data check",
                 None,
                 facts,
             )

@@ -99,7 +99,7 @@ def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> BaggingTable:
     # A filter starts from nothing: derivatives and changes of a stretch's first ticks say what no later tick says. No
     # test looks at them either; of a short stretch most rows are still taken.
     skips = [min(net.spec.window - 1, count // 4) for count in ticks]
-    stride = max(1, math.ceil((sum(ticks) - sum(skips)) / spec.rows))
+    stride = max(1, math.ceil((sum(ticks) - sum(skips)) / spec.max_rows))
     # Logs that begin alike, as filters settle, would all give the same ticks of it: the others would be told by none.
     firsts = [
         skip + number % min(stride, count - skip) for number, (skip, count) in enumerate(zip(skips, ticks, strict=True))
@@ -110,7 +110,7 @@ def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> BaggingTable:
     check_setting(
         rows * (2 * FLOAT * bank.columns + 6 * DOUBLE * outputs),
         f"training: {rows:,} rows of {bank.columns:,} columns and {outputs:,} outputs",
-        "make training.bagging.rows smaller, or the backbone's lags fewer",
+        "make training.ensemble.max_rows smaller, or the backbone's lags fewer",
     )
     columns = np.concatenate([bank_rows(net, part, of) for part, of in zip(stretches, chosen, strict=True)])
     targets = np.concatenate(

@@ -61,31 +61,33 @@ class DistillationSpec:
     """The dual objective (eq. 2.23): ``truth * hard + (1 - truth) * soft + hint * hidden``.
 
     Attributes:
-        truth: alpha, weight of the truth; 0 learns from the teachers alone.
-        soft: loss between student and teachers: a loss of point predictions, or `SoftmaxDivergence`.
-        hint: weight of the hidden-feature hint; 0 for none.
+        target_weight: alpha, weight of the truth; 0 learns from the teachers alone.
+        distillation_loss: loss between student and teachers: a loss of point predictions, or `SoftmaxDivergence`.
+        hint_weight: weight of the hidden-feature hint; 0 for none.
         components: principal components of the teachers' hidden features that the hint compares.
 
     Raises:
         ConfigError: a value out of range.
     """
 
-    truth: float = 0.5
-    soft: LossSpec = field(default_factory=Huber)
-    hint: float = 0.0
+    target_weight: float = 0.5
+    distillation_loss: LossSpec = field(default_factory=Huber)
+    hint_weight: float = 0.0
     components: int = 16
 
     def __post_init__(self) -> None:
-        if not below(0.0, 1.0).holds(self.truth):
+        if not below(0.0, 1.0).holds(self.target_weight):
             raise ConfigError(
-                f"distillation: truth = {self.truth}; 0 <= truth < 1 must hold (with 1 there is no teacher: train)"
+                f"distillation: target_weight = {self.target_weight}; expected 0 <= target_weight < 1 (with 1 there is "
+                "no teacher: train)"
             )
-        if POINT not in self.soft.outputs:
+        if POINT not in self.distillation_loss.outputs:
             raise ConfigError(
-                f"distillation: soft = {type(self.soft).__name__}, a loss of outputs {', '.join(self.soft.outputs)}; a "
-                "loss of point predictions must hold: teachers say one number of each target"
+                f"distillation: distillation_loss = {type(self.distillation_loss).__name__}, a loss of outputs "
+                f"{', '.join(self.distillation_loss.outputs)}; a loss of point "
+                "predictions is expected, since teachers predict one number per target"
             )
-        check_bounds("distillation", self, hint=span(0.0, MAX_WEIGHT), components=integer(1, MAX_UNITS))
+        check_bounds("distillation", self, hint_weight=span(0.0, MAX_WEIGHT), components=integer(1, MAX_UNITS))
 
 
 class Distillation:
@@ -127,7 +129,7 @@ class Distillation:
         A mark whether there is truth, predictions in SI units, hidden components.
         """
         check_same_ends(task, self.teachers[0].task, "the student", "the teacher")
-        if self.spec.hint and self.components is None:
+        if self.spec.hint_weight and self.components is None:
             self.components = Components.fitted(
                 (self._collect_hidden(part) for part in own_series), self.spec.components
             )
@@ -136,7 +138,7 @@ class Distillation:
 
     def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
         """Copy the weights and scaling of the start, if there is one; refuse a hint for too small batches."""
-        if self.spec.hint:
+        if self.spec.hint_weight:
             chunks = spec.chunks
             ticks = chunks.batch * (chunks.length if chunks.regime == "chunk" else 1)
             width = int(net.forward_features(*_one_tick(net))[2].shape[-1])
@@ -144,8 +146,8 @@ class Distillation:
             if ticks < 4 * width:
                 raise ConfigError(
                     f"distillation: a batch has {ticks} ticks with a loss, too few to compare {width} hidden features "
-                    f"with the teachers' (hint = {self.spec.hint}); {4 * width} or more must hold: take larger batches "
-                    "or hint = 0"
+                    f"with the teachers' (hint_weight = {self.spec.hint_weight}); {4 * width} or more must "
+                    "hold: take larger batches or hint_weight = 0"
                 )
         if self.start is None:
             return False
@@ -159,15 +161,15 @@ class Distillation:
         labelled = batch_context.valid & (strategy_columns[..., 0] > 0.5)
         teacher_predictions = strategy_columns[..., 1 : 1 + self.said].unflatten(-1, batch_context.future.shape[2:])
         target = objective.code.encode(teacher_predictions, batch_context.features)
-        loss = (1.0 - spec.truth) * compute_masked_loss(
-            spec.soft, batch_context.answer, target, batch_context.valid, objective.weights
+        loss = (1.0 - spec.target_weight) * compute_masked_loss(
+            spec.distillation_loss, batch_context.answer, target, batch_context.valid, objective.weights
         )
-        if spec.truth:
-            loss = loss + spec.truth * objective.evaluate(
+        if spec.target_weight:
+            loss = loss + spec.target_weight * objective.evaluate(
                 batch_context.answer, batch_context.future, batch_context.features, labelled
             )
-        if spec.hint:
-            loss = loss + spec.hint * hint_error(
+        if spec.hint_weight:
+            loss = loss + spec.hint_weight * hint_error(
                 batch_context.hidden, strategy_columns[..., 1 + self.said :], batch_context.valid
             )
         return loss
@@ -182,7 +184,7 @@ class Distillation:
         if not np.isfinite(mean).all():
             raise DataError(
                 f"distillation: a teacher's prediction for '{part.name}' is not finite; look at the recording with "
-                "edp inspect"
+                "edp data check"
             )
         columns = [np.full((part.samples, 1), truth), mean]
         if self.components is not None:

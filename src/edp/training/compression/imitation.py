@@ -177,7 +177,7 @@ class CommitteeImitation:
                 f"distillation: no recording of the training part is longer than the largest horizon of {reach} ticks; "
                 "give longer ones"
             )
-        stride = max(1, math.ceil(total / BaggingSpec().rows))
+        stride = max(1, math.ceil(total / BaggingSpec().max_rows))
         # A filter starts from nothing: what the bank gives of the first ticks no later tick has.
         chosen = [slice(min(skip, ticks // 4), ticks, stride) for _, ticks in parts]
         rows = [bank_rows(self.teacher, part)[of] for (part, _), of in zip(parts, chosen, strict=True)]
@@ -239,7 +239,7 @@ class _Perceptrons:
             facts = {"epoch": None, "update": stop, "kept_epoch": None}
             raise Diverged(
                 f"the loss of the student is {mean} by update {stop}: the training diverged; nothing is kept. Look for "
-                "outliers with edp inspect",
+                "outliers with edp data check",
                 None,
                 facts,
             )

@@ -121,7 +121,7 @@ class Meta(ABC):
 
     def _halves(self, net: Predictor, parts: Sequence[Series]) -> tuple[Pieces, list[Series]]:
         # The first half adapts and the second judges: the order on a machine, too.
-        """Return the pieces of the first halves, as many as an episode has, and the second halves."""
+        """Return the segments of the first halves, as many as an episode has, and the second halves."""
         chunks, horizons = self.training.chunks, net.task.horizons
         starts, rest = [], []
         for index, part in enumerate(parts):

@@ -15,7 +15,7 @@ class MetaSpec:
     """Inner loop of the meta-learners; joint training over all machines does not use it.
 
     Attributes:
-        inner_rate: learning rate of a step of adaptation.
+        inner_learning_rate: learning rate of a step of adaptation.
         inner_steps: steps of adaptation to a machine.
         shots: segments (``training.chunks.length``) of a machine that are adapted on, and as many that evaluate.
         head_only: adapt the head alone (ANIL, Raghu et al. 2020, arXiv 1909.09157).
@@ -24,7 +24,7 @@ class MetaSpec:
         ConfigError: a value out of range.
     """
 
-    inner_rate: float = 0.5
+    inner_learning_rate: float = 0.5
     inner_steps: int = 3
     shots: int = 4
     head_only: bool = False
@@ -33,7 +33,7 @@ class MetaSpec:
         check_bounds(
             "pretraining",
             self,
-            inner_rate=RATE,
+            inner_learning_rate=RATE,
             inner_steps=integer(1, MAX_STEPS),
             shots=integer(1, MAX_BATCH),
         )
@@ -41,4 +41,4 @@ class MetaSpec:
     @property
     def steps(self) -> tuple[float, ...]:
         """The rate of each step."""
-        return (self.inner_rate,) * self.inner_steps
+        return (self.inner_learning_rate,) * self.inner_steps

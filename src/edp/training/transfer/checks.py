@@ -96,7 +96,7 @@ def check_lengths(data: Prepared, chunks: ChunkSpec, window: int) -> None:
         raise DataError(
             f"logs are too short: each part of each log needs {needed / rate:.2f} s (start-up of {lead} ticks and "
             f"horizon of {data.task.max_horizon}), but there are {'; '.join(short)}. Leave these logs out, join them, "
-            "or give validation and test larger shares (--set split.validation_share=0.2)"
+            "or give validation and test larger shares (--set split.validation_fraction=0.2)"
         )
 
 
@@ -123,7 +123,7 @@ def check_moving(data: Prepared) -> None:
         if still:
             raise DataError(
                 f"{'; '.join(still)} in the {part} part of the logs: nothing can be learned or judged of a target "
-                "that does not move. Look for a frozen sensor or a wrong column with edp inspect, or give logs in "
+                "that does not move. Look for a frozen sensor or a wrong column with edp data check, or give logs in "
                 "which every target moves"
             )
 

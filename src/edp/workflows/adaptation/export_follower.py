@@ -1,4 +1,4 @@
-"""``edp export RUN --to follower --twin GREY``: a grey box that follows the machine, as C99 without heap."""
+"""``edp export RUN --format follower --twin GREY``: a grey box that follows the machine, as C99 without heap."""
 
 from __future__ import annotations
 

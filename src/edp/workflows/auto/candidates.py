@@ -200,15 +200,15 @@ class Foundation:
             seed: seed of all random choices.
             threads: CPU threads.
         """
-        rounds = FinetuneSpec().rounds
+        rounds = FinetuneSpec().single_phase_epochs
         updates = int(min(affordable, max(MIN_UPDATES, rounds * rows / self.ticks))) // rounds
         training = replace(self._training(max(1, updates), threads), seed=seed)
         return NetworkPlan(self.source.predictor.spec, training)
 
     def _training(self, updates: int, threads: int) -> TrainingSpec:
-        """Return the training of `edp finetune --method full` with this number of updates per epoch."""
+        """Return the training of `edp train finetune --method full` with this number of updates per epoch."""
         own = tuned(self.source.experiment.training, FinetuneSpec())
-        return replace(own, updates=updates, threads=threads, bagging=None)
+        return replace(own, updates=updates, threads=threads, ensemble=None)
 
     def strategy(self) -> TrainingStrategy:
         """Return the strategy: initial weights, and removal of the mean training error at the end."""
@@ -228,7 +228,7 @@ def read_foundation(path: str) -> Foundation | None:
     if isinstance(foundation.source.predictor.spec.backbone, CommitteeSpec):
         raise ConfigError(
             f"{SETTING}: '{path}' is a committee, which the preset makes of the recordings itself; give a network that "
-            "was trained by gradient, such as a run of edp pretrain, or leave the setting out"
+            "was trained by gradient, such as a run of edp train pretrain, or leave the setting out"
         )
     return foundation
 
@@ -369,7 +369,7 @@ def _steps(amount: Amount, groups: int) -> int:
 
 def _estimate_fixed_seconds(amount: Amount) -> float:
     """Return the processor time of parts that no budget shortens: linear models and radial basis functions."""
-    rows, columns = min(amount.rows, BaggingSpec().rows), _columns(amount)
+    rows, columns = min(amount.rows, BaggingSpec().max_rows), _columns(amount)
     linear = LINEAR_MODELS * (2 * rows * columns**2 / LINEAR_PRODUCTS_PER_S + FOLDS * columns**3 / EIGEN_CUBES_PER_S)
     kernels = len(LENGTHS) * min(rows, JUDGED_ROWS) + (rows if rows > JUDGED_ROWS else 0)
     near = sum(RADIAL_ROW_S + RADIAL_CELL_S * amount.features * (1 + (span > 0)) for span in _list_near_spans(amount))
@@ -446,7 +446,7 @@ def _committee(amount: Amount) -> NetworkPlan:
         _bank(amount),
         activations=activations,
         centres=min(CENTRES, amount.rows // ROWS_PER_CENTRE),
-        near=tuple(_list_near_spans(amount)),
+        local_lags=tuple(_list_near_spans(amount)),
         trees=plan.trees,
         tree_depth=TREE_DEPTH,
     )
@@ -454,11 +454,11 @@ def _committee(amount: Amount) -> NetworkPlan:
         folds=FOLDS,
         batch=BATCH,
         steps=_steps(amount, len(activations)),
-        robust_width=ROBUST,
+        huber_delta=ROBUST,
         tree_models=plan.models,
-        tree_rows=plan.rows,
+        tree_max_rows=plan.rows,
         tree_folds=plan.folds,
-        tree_rate=plan.rate,
+        tree_learning_rate=plan.rate,
     )
     return _plan(amount, backbone, bagging)
 
@@ -466,7 +466,7 @@ def _committee(amount: Amount) -> NetworkPlan:
 def _bank(amount: Amount) -> CommitteeSpec:
     """Return a committee of linear members on the feature bank of an amount."""
     spans = spans_of(amount)
-    bank = CommitteeSpec(lags=tuple(spans.lags), smoothed=tuple(spans.smoothed), bounded=True)
+    bank = CommitteeSpec(lags=tuple(spans.lags), smoothed=tuple(spans.smoothed), clip_inputs=True)
     return replace(bank, members=MEMBERS, units=UNITS, layers=2, activations=())
 
 
@@ -474,7 +474,7 @@ def _plan(amount: Amount, backbone: CommitteeSpec, bagging: BaggingSpec) -> Netw
     head = LinearHead(dead_band=amount.changes)
     return NetworkPlan(
         ModelSpec(window=amount.window, backbone=backbone, head=head, activation=Identity()),
-        TrainingSpec(loss=MeanSquared(), seed=amount.seed, threads=amount.threads, bagging=bagging),
+        TrainingSpec(loss=MeanSquared(), seed=amount.seed, threads=amount.threads, ensemble=bagging),
     )
 
 
@@ -510,7 +510,7 @@ def _recurrent(amount: Amount) -> NetworkPlan | None:
         chunks=ChunkSpec(length=RECURRENT_CHUNK, batch=RECURRENT_LANES, burn_in=RECURRENT_BURN_IN),
         loss=Huber(delta=0.3),
         optimizer=Soap(learning_rate=6e-3, weight_decay=1e-4),
-        schedule=OneCycle(rise=0.2),
+        schedule=OneCycle(warmup=0.2),
     )
     return NetworkPlan(model, training)
 

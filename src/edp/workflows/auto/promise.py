@@ -136,7 +136,7 @@ def blocks_of(data: Prepared, skip: int) -> tuple[list[Block], int]:
         raise DataError(
             f"automatic choice: the validation part has {sum(validated)} usable ticks, {judged} independent block(s) "
             f"longer than the largest horizon of {reach} ticks; two must hold: give longer or more recordings, a "
-            "larger validation share (split.validation_share), or a shorter horizon"
+            "larger validation share (split.validation_fraction), or a shorter horizon"
         )
     return blocks, judged
 

@@ -112,7 +112,7 @@ def divide(recordings: Sequence[Recording], settings: AutoSettings) -> tuple[Aut
     # Logged channels: the targets, or the channels that they are derived from.
     channels = list(dict.fromkeys(sources.get(target, target) for target in task.targets))
     every = [np.ones(recording.samples, dtype=bool) for recording in recordings]
-    by_time = ByTime(validation_share=split.validation_share, test_share=split.test_share)
+    by_time = ByTime(validation_fraction=split.validation_fraction, test_fraction=split.test_fraction)
     if len(recordings) > 1:
         # Of equal recordings that are too short to be divided nothing would be left to validate.
         if all(recording.samples < MIN_DIVIDED * gap for recording in recordings):
@@ -120,7 +120,7 @@ def divide(recordings: Sequence[Recording], settings: AutoSettings) -> tuple[Aut
         moving = moving_ticks(recordings, channels, max(1, *task.horizons))
         if is_even(split, recordings, gap, every) and is_even(split, recordings, gap, moving):
             return settings, []
-        by_time = replace(by_time, whole_short=True)
+        by_time = replace(by_time, train_short_recordings=True)
     uneven = blocks_where_time_is_uneven(recordings, channels, task.horizons, by_time)
     if uneven is not None:
         blocks, why = uneven
@@ -175,7 +175,7 @@ def prepare(source: ReadOnce, settings: AutoSettings, foundation: Foundation | N
             features=len(data.task.features.features),
             outputs=len(data.task.horizons) * len(data.task.targets),
             horizon=data.task.max_horizon,
-            minutes=auto.minutes,
+            minutes=auto.time_budget_min,
             seed=auto.seed,
             threads=auto.threads,
             foundation=foundation,

@@ -32,8 +32,8 @@ class Portfolio:
     """The table ``[auto]``.
 
     Attributes:
-        minutes: processor time to spend on training; sizes of networks and lengths of trainings follow from it, so
-            that equal settings and data give equal results on every machine.
+        time_budget_min: processor time to spend on training; sizes of networks and lengths of trainings follow from
+            it, so that equal settings and data give equal results on every machine.
         candidates: names of registered candidates, the simplest first; none takes all of them.
         foundation: run folder or bundle of a pretrained network, which is trained on as one more candidate; empty for
             none.
@@ -41,14 +41,16 @@ class Portfolio:
         threads: CPU threads of a training; another count gives other bits.
     """
 
-    minutes: float = 5.0
+    time_budget_min: float = 5.0
     candidates: tuple[str, ...] = ()
     foundation: str = ""
     seed: int = 0
     threads: int = 1
 
     def __post_init__(self) -> None:
-        check_bounds("auto", self, minutes=span(MIN_MINUTES, MAX_MINUTES), seed=SEED, threads=integer(0, MAX_THREADS))
+        check_bounds(
+            "auto", self, time_budget_min=span(MIN_MINUTES, MAX_MINUTES), seed=SEED, threads=integer(0, MAX_THREADS)
+        )
         if self.candidates and ("foundation" in self.candidates) != bool(self.foundation):
             raise ConfigError(
                 f"auto.candidates = {list(self.candidates)} and auto.foundation = '{self.foundation}': the candidate "
@@ -67,7 +69,7 @@ class AutoSettings:
 
     def experiment(self, model: ModelSpec, training: TrainingSpec) -> Experiment:
         """Return the experiment of a candidate."""
-        return Experiment(task=self.task, split=self.split, model=model, training=training, judge=self.judge)
+        return Experiment(task=self.task, split=self.split, model=model, training=training, evaluation=self.judge)
 
 
 def usual_preset(path: str | Path | None = None, overrides: Sequence[str] = ()) -> str:

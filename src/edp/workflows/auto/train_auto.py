@@ -193,7 +193,7 @@ def _make_choice_file(
     against = still if floor is None or choice.name == FLOOR else floor.promise
     skill = promise.relative_to(against)
     return AutoChoice(
-        minutes=settings.auto.minutes,
+        minutes=settings.auto.time_budget_min,
         rows=amount.rows,
         chosen=choice.name,
         best=choice.best,

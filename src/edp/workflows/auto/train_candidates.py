@@ -78,8 +78,11 @@ class CandidateTraining:
 
     @property
     def on_folds(self) -> bool:
-        """Return whether the candidate is trained on folds, in contrast to gradient descent on chunks."""
-        return self.experiment.training.bagging is not None
+        """Test whether it is trained with cross-validation folds.
+
+        Networks trained by gradient descent on chunks are not.
+        """
+        return self.experiment.training.ensemble is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +124,7 @@ def _train_by_gradient(job: CandidateTraining, on_event: OnEvent | None) -> Trai
     experiment, begun = job.experiment, {}
     if job.foundation is not None:
         begun = {"foundation": job.foundation.facts}
-    settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
+    settings = {part: values for part, values in plain_tree(experiment).items() if part != "evaluation"}
     key = run_key(settings | begun, job.data.digest)
     with Run.create(job.folder, "network", key, experiment_toml(experiment)) as run:
         strategy = None if job.foundation is None else job.foundation.strategy()

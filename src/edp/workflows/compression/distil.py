@@ -32,7 +32,7 @@ from edp.training.strategy import DirectFit, TrainingStrategy
 from edp.workflows.compression.bench import CompressionRequest
 from edp.workflows.train_evaluate import StrategyFactory, train
 
-DISTIL_SETTINGS = SettingsTree({"soft": LOSSES})
+DISTIL_SETTINGS = SettingsTree({"distillation_loss": LOSSES})
 """Reads the table ``[distil]``, whose objective holds a registered loss."""
 
 
@@ -182,7 +182,7 @@ def _run_folder(run: str | Path) -> Path:
 def order_facts(order: CompressionRequest) -> dict[str, object]:
     """Return the plain values that determine the training of a request."""
     spec = order.distillation
-    plain = None if spec is None else asdict(spec) | {"soft": _loss(spec)}
+    plain = None if spec is None else asdict(spec) | {"distillation_loss": _loss(spec)}
     rounding: RoundingSpec | None = order.rounding
     return {
         "units": order.units,
@@ -196,8 +196,11 @@ def order_facts(order: CompressionRequest) -> dict[str, object]:
 def _loss(spec: DistillationSpec) -> Any:
     """Return the soft loss with its name; an unregistered loss, such as the softmax form, by its class."""
     # Losses of a distillation need not be registered: the class name stands for them in the key.
-    name = next((key for key, kind in LOSSES.items() if kind is type(spec.soft)), type(spec.soft).__name__)
-    return {"kind": name} | {key: plain_tree(value) for key, value in vars(spec.soft).items()}
+    name = next(
+        (key for key, kind in LOSSES.items() if kind is type(spec.distillation_loss)),
+        type(spec.distillation_loss).__name__,
+    )
+    return {"kind": name} | {key: plain_tree(value) for key, value in vars(spec.distillation_loss).items()}
 
 
 def _read_unlabelled(

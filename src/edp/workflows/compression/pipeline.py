@@ -1,4 +1,4 @@
-"""Pipeline of `edp compress` and of phase 6 of the search: train candidates, evaluate them in formats, choose one.
+"""Pipeline of `edp compress search` and of phase 6: train candidates, evaluate their formats, select one.
 
 The two differ in who trains and where results are kept: runs in a folder, or records of a ledger.
 """

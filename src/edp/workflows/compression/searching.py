@@ -183,7 +183,7 @@ def search(
     data = prepare_data(source or own, experiment, frozen)
     held_out = _find_sealed(source or own, experiment, data)
     # The judge changes no weights; its settings stay out of the key.
-    settings = {key: value for key, value in plain_tree(experiment).items() if key != "judge"}
+    settings = {key: value for key, value in plain_tree(experiment).items() if key != "evaluation"}
     key = run_key(settings | {"teacher": weights_digest(teacher)}, data.digest)
     with Run.create(out, "compression", key, experiment_toml(experiment)) as folder:
         bench = DiskBench(teacher, data, experiment, source or own, make_folder(folder.file("runs")))
@@ -239,7 +239,7 @@ def _find_sealed(source: DataSource, experiment: Experiment, data: Prepared) -> 
         return _SealedRecordings(data)
     # Sessions count by content: a renamed file is still the same recording.
     there = {recording.digest for recording in source.read()}
-    if not any(session.digest in there for session in split.second):
+    if not any(session.digest in there for session in split.second_test):
         return _SealedRecordings(data, opened_before=any(session.digest in there for session in split.test))
     study = Path(split.study)
     recorded = split.study and is_file_at(study / "study.json") and is_file_at(study / "ledger" / "about.json")
@@ -311,7 +311,7 @@ class _Comparison:
         pair = {TEACHER: self.teacher, "chosen": best}
         # Weights and format are the key of an opening: the same pair may be evaluated again without a second look.
         keys = [f"{weights_digest(self._networks[row.name])} {row.number_format}" for row in pair.values()]
-        why = "the network chosen by edp compress, and its teacher"
+        why = "the network chosen by edp compress search, and its teacher"
         openings: list[Opening] = []
         # The ledger of the search comes first: it knows of openings from other folders.
         for ledger_folder in [*([held_out.study / "ledger"] if held_out.study else []), folder.file("ledger")]:

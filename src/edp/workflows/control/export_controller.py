@@ -1,4 +1,4 @@
-"""``edp export RUN --to controller``: a controller that was run, as C99 without heap."""
+"""``edp export RUN --format controller``: a controller that was run, as C99 without heap."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 def export_controller(
     run: str | Path, folder: str | Path, name: str, options: Mapping[str, str] | None = None
 ) -> list[Path]:
-    """Write the controller of a run of edp control as C99.
+    """Write the controller of a run of edp loop run as C99.
 
     Args:
         run: its run folder.
@@ -84,7 +84,7 @@ def parts_of(
     spec, limits = experiment.controller, experiment.task.limits
     if not isinstance(spec, ProportionalIntegral | PredictiveControl):
         raise ExportError(
-            f"controller '{CONTROLLERS.name_of(spec)}' has no form in C; these have: pi, nmpc. Run edp control with "
+            f"controller '{CONTROLLERS.name_of(spec)}' has no form in C; these have: pi, nmpc. Run edp loop run with "
             "one of them"
         )
     valves = models.require_map(CONTROLLERS.name_of(spec))
@@ -105,7 +105,7 @@ def parts_of(
     channels = {channel.name: channel for channel in plant.channels}
     table = TipTable(plant.geometry)
     return ControllerParts(
-        title=f"controller '{CONTROLLERS.name_of(spec)}' of a run of edp control",
+        title=f"controller '{CONTROLLERS.name_of(spec)}' of a run of edp loop run",
         machine=plant.geometry.machine.name,
         inputs=tuple(channels[name] for name in reads),
         limits_low=low,
@@ -119,7 +119,7 @@ def parts_of(
         lever_high=np.array(limits.lever_high),
         slew=np.array(limits.slew_per_s) / plant.rate_hz,
         sides=[_sides(valves, axis) for axis in range(AXES)],
-        gains=(loop.proportional, loop.integral, loop.rest_m_s, MAX_SUM),
+        gains=(loop.proportional, loop.integral, loop.standstill_m_s, MAX_SUM),
         lead=round(loop.lead_s * plant.rate_hz),
         plan=plan,
         golden=None,

@@ -136,16 +136,16 @@ def load_kept(run: str | Path) -> KeptController:
     """Load the controller of a run folder.
 
     Raises:
-        StorageError: not a run of edp control, or one of an earlier version that kept no controller.
+        StorageError: not a run of edp loop run, or one of an earlier version that kept no controller.
         BundleError: the stored controller is damaged.
         ConfigError: the settings or the machine cannot be.
     """
     path = Path(run)
     folder = path / KEPT
     if not is_file_at(folder / HEADER):
-        raise StorageError(missing_text(path, "control", "a run of edp control, or is one of an earlier version"))
+        raise StorageError(missing_text(path, "control", "a run of edp loop run, or is one of an earlier version"))
     with convert_damage(folder):
-        header = sealed_header(folder / HEADER, "controller", (SCHEMA,), "run edp control again")
+        header = sealed_header(folder / HEADER, "controller", (SCHEMA,), "run edp loop run again")
         channels = tuple(channel_from_dict(entry) for entry in header["channels"])
         arrays = load_arrays(read_arrays(folder, header["arrays"]))
         rules = ARRAYS | (MAP if {*MAP} & {*arrays} else {})

@@ -71,7 +71,7 @@ def control_loops(
     """
     chosen = sources or ControlSources()
     check_claimable(out, "control")
-    check_free(out, "edp control")
+    check_free(out, "edp loop run")
     # Before the folder is claimed: a reference or plant that is refused must not keep the corrected command out.
     bench = ControlBench(experiment, chosen)
     bench.check()

@@ -71,7 +71,7 @@ def tune_gains(
     progress: Progress = SILENT,
     workers: Workers = IN_PROCESS,
 ) -> Tuning:
-    """Tune a controller and write a run folder: ``tuning.json``, and ``tuned.toml`` for ``edp control --config``.
+    """Tune a controller and write a run folder: ``tuning.json``, and ``tuned.toml`` for ``edp loop run --config``.
 
     Args:
         experiment: task, machine, the controller to begin with, and the seeds that evaluate.
@@ -95,7 +95,7 @@ def tune_gains(
             f"seed = {experiment.seed}: references from {TUNING_SEED} on are for tuning; choose lower ones"
         )
     check_claimable(out, "tuning")
-    check_free(out, "edp tune")
+    check_free(out, "edp loop tune")
     # Both before the first trial, and before the folder is claimed: what is refused is refused at once.
     bench = ControlBench(replace(experiment, seed=TUNING_SEED, loops=chosen.loops), tuned_on)
     judge = ControlBench(experiment, judged_on)

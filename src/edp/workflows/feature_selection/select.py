@@ -254,7 +254,8 @@ def _proposal_text(screening: ScreeningResult, features: FeatureSettings) -> str
         if target not in screening.proposal.kept:
             reasons[target] = "a target: its present value, which mode = 'delta' needs"
     head = [
-        f"Proposed by edp screen: {len(features.channels)} of {count_of(len(screening.channels), 'channel')}, most "
+        f"Proposed by edp data screen: {len(features.channels)} of "
+        f"{count_of(len(screening.channels), 'channel')}, most "
         "useful first.",
         "edp train DATA --set task.features=THIS_FILE",
     ]
@@ -276,7 +277,7 @@ def _settings_text(screening: ScreeningResult, name: str) -> str:
         "model": {"window": screening.proposal.window},
     }
     why = " ".join(screening.proposal.window_reason.split())
-    return f"# Settings for a training on what edp screen proposed.\n# window: {why}\n\n{tomli_w.dumps(table)}"
+    return f"# Settings for a training on what edp data screen proposed.\n# window: {why}\n\n{tomli_w.dumps(table)}"
 
 
 def _make_map(source: DataSource, screening: ScreeningResult, first: Recording) -> str | None:
@@ -297,7 +298,7 @@ def _make_map(source: DataSource, screening: ScreeningResult, first: Recording) 
         # The kind is stated where the name alone does not tell it.
         usual = VOCABULARY.get(name)
         entries[name] = {"column": name} | ({} if usual is not None and usual.kind == kind else {"kind": str(kind)})
-    return "# The channels that edp screen proposed, under the names of the files.\n\n" + tomli_w.dumps(
+    return "# The channels that edp data screen proposed, under the names of the files.\n\n" + tomli_w.dumps(
         {"channels": entries}
     )
 
@@ -316,9 +317,11 @@ def _try_sets(
     experiment = replace(order.experiment, task=trial_task(order.experiment.task, screening))
     asked: dict[str, str | FeatureSettings] = {**sets, **order.sets}
     leaks = {flag.channel for flag in screening.flags if flag.kind is FlagKind.LEAK}
-    barred = tuple(sorted(leaks | set(order.trials.barred)))  # a random set with a leak would look best of all
+    barred = tuple(
+        sorted(leaks | set(order.trials.excluded_channels))
+    )  # a random set with a leak would look best of all
     return try_feature_sets(
-        source, experiment, asked, folder / "trials", replace(order.trials, barred=barred), on_trial, workers
+        source, experiment, asked, folder / "trials", replace(order.trials, excluded_channels=barred), on_trial, workers
     )
 
 

@@ -50,19 +50,19 @@ class TrialSpec:
     """Trainings in addition to the given feature sets.
 
     Attributes:
-        random: sets drawn at random from the channels, of the size of the first given set.
-        draw: seed of the draw.
-        barred: channels that random sets must not hold; leaks of the future, with which any set looks good.
+        random_sets: sets drawn at random from the channels, of the size of the first given set.
+        random_seed: seed of the draw.
+        excluded_channels: channels that random sets must not hold; leaks of the future, with which any set looks good.
         seeds: a training for each set with each of these seeds.
     """
 
-    random: int = 3
-    draw: int = 0
-    barred: tuple[str, ...] = ()
+    random_sets: int = 3
+    random_seed: int = 0
+    excluded_channels: tuple[str, ...] = ()
     seeds: tuple[int, ...] = (0,)
 
     def __post_init__(self) -> None:
-        check_bounds("trials", self, random=integer(0, MAX_SETS), draw=SEED, seeds=SEED)
+        check_bounds("trials", self, random_sets=integer(0, MAX_SETS), random_seed=SEED, seeds=SEED)
         check_count("trials", "seeds", self.seeds, MAX_SETS)
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise ConfigError(f"trials: seeds = {list(self.seeds)}; at least one seed, each once, must hold")
@@ -100,8 +100,8 @@ def try_feature_sets(
     if not chosen:
         raise ConfigError("no feature set can be tried: " + "; ".join(notes))
     drawn = _draw_sets(chosen, experiment, first, spec)
-    if len(drawn) < spec.random:
-        notes.append(f"{len(drawn)} of {spec.random} random sets were drawn: there are no others of this size")
+    if len(drawn) < spec.random_sets:
+        notes.append(f"{len(drawn)} of {spec.random_sets} random sets were drawn: there are no others of this size")
     chosen |= drawn
     folder = make_folder(out)
     planned = [
@@ -220,19 +220,19 @@ def _draw_sets(
     first_inputs = _inputs(next(iter(chosen.values())), first)
     size = len(first_inputs)
     always = experiment.task.targets if experiment.task.mode is TargetMode.DELTA else ()
-    free = [name for name in first.channel_names if name not in {*always, *spec.barred}]
-    rng = np.random.default_rng(spec.draw)
+    free = [name for name in first.channel_names if name not in {*always, *spec.excluded_channels}]
+    rng = np.random.default_rng(spec.random_seed)
     drawn: dict[str, str | FeatureSettings] = {}
     # The first set itself would be no random one.
     drawn_sets = {frozenset(first_inputs)}
-    for _ in range(_DRAWS * spec.random):
+    for _ in range(_DRAWS * spec.random_sets):
         picked = sorted(rng.choice(len(free), max(0, min(size - len(always), len(free))), replace=False))
         channels = (*always, *(free[i] for i in picked))
         if frozenset(channels) not in drawn_sets:
             drawn_sets.add(frozenset(channels))
             name = f"random {len(drawn) + 1}"
             drawn[name] = FeatureSettings(name=name, channels=channels)
-        if len(drawn) == spec.random:
+        if len(drawn) == spec.random_sets:
             break
     return drawn
 

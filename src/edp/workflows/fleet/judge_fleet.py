@@ -59,7 +59,7 @@ class FleetQuestion:
     Attributes:
         network: run folder or bundle.
         store: recordings that say their machine.
-        deltas: folder of `edp finetune --fleet`, whose deltas are added for the machines that have one.
+        deltas: folder of `edp train finetune --fleet`, whose deltas are added for the machines that have one.
         monitor: folder of a monitor that watches every machine.
     """
 

@@ -64,7 +64,8 @@ def machines_of(store: str | Path) -> list[StoredMachine]:
     """
     if not is_store(Path(store)):
         raise ConfigError(
-            f"'{store}' is no store; a fleet's logs are stored once, by `edp store build LOGS --out STORE`, where a "
+            f"'{store}' is no store; a fleet's logs are stored once, by `edp data store build LOGS --out "
+            f"STORE`, where a "
             "data-set file can state the machine of each log"
         )
     machines: dict[str, StoredMachine] = {}

@@ -1,4 +1,4 @@
-"""`edp finetune --fleet`: one network, and a delta of kilobytes for each machine of a store."""
+"""`edp train finetune --fleet`: one network, and a delta of kilobytes for each machine of a store."""
 
 from __future__ import annotations
 
@@ -231,7 +231,7 @@ def _errors(network: Predictor, data: Prepared) -> float:
 
     In report units.
     """
-    skip = max(network.spec.window, data.task.features.starting_ticks)
+    skip = max(network.spec.window, data.task.features.init_samples)
     scores = score_predictions(stream_predictions(network, data.test), data, skip)
     return metric(scores.overall[str(data.task.horizons[0])][MEAN], "mae")
 

@@ -88,7 +88,7 @@ class RegistryEntry(ResultFile):
 
 
 def add_to_registry(registry: str | Path, source: str | Path, name: str) -> RegistryEntry:
-    """Enter a run, a bundle, or the folder of `edp finetune --fleet`.
+    """Enter a run, a bundle, or the folder of `edp train finetune --fleet`.
 
     Args:
         registry: folder; made where absent.

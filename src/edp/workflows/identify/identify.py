@@ -153,8 +153,8 @@ def identify(
     _check_strokes(channels, data, base)
     # What could not be judged, or holds no number, is refused before the fit of minutes.
     celsius, notes = _celsius(recordings, base)
-    scales, judge = fit_scales(channels, data.train) if loaded is None else loaded[0].scales, settings.judge
-    check_runs(channels, scales, grey.prefix_ticks, data.test, judge.seconds, judge.starts)
+    scales, judge = fit_scales(channels, data.train) if loaded is None else loaded[0].scales, settings.evaluation
+    check_runs(channels, scales, grey.prefix_ticks, data.test, judge.duration_s, judge.starts)
     if loaded is not None:
         check_same_linkage(loaded[0], base, machine)
     made_of = {"machine": asdict(base), "from": None if run is None else model_digest(run)}
@@ -264,9 +264,9 @@ def _whole_grey_box(spec: TwinSpec | AutoTwin) -> GreyBox:
         )
     if spec.motors:
         raise ConfigError(NO_MOTORS)
-    if spec.without:
+    if spec.omit:
         raise ConfigError(
-            f"settings: twin.without = {list(spec.without)} leaves out numbers that a machine file has; identify with "
+            f"settings: twin.omit = {list(spec.omit)} leaves out numbers that a machine file has; identify with "
             "a grey box that has all of them"
         )
     return spec
@@ -317,7 +317,7 @@ def _add_information(twin: GreyTwin, data: Prepared, seed: int) -> _Fitted:
     rng, total = np.random.default_rng(seed), np.zeros((len(twin.numbers),) * 2)
     ticks = max(1, round(spec.lengths_s[-1] * twin.channels.rate_hz))
     for _ in range(ROUNDS_THAT_INFORM):
-        drawn = problem.draw(ticks, max(8, min(spec.lanes, spec.ticks // ticks)), rng)
+        drawn = problem.draw(ticks, max(8, min(spec.batch, spec.ticks // ticks)), rng)
         total += problem.normal_equations(np.zeros(len(twin.numbers)), drawn, True).matrix
     return _Fitted(twin, total / ROUNDS_THAT_INFORM)
 
@@ -433,8 +433,8 @@ def _scores(
     The identified machine, the guess, the grey box and the static map.
     """
     data, settings = logs
-    twin, judge = fitted.twin, settings.judge
-    prefix, grey = twin.prefix_ticks, free_runs(twin, data.test, judge.seconds, judge.starts)
+    twin, judge = fitted.twin, settings.evaluation
+    prefix, grey = twin.prefix_ticks, free_runs(twin, data.test, judge.duration_s, judge.starts)
     ticks = prefix + grey.truth.shape[1]
     windows = MeasuredWindows.read(even_starts(twin, data.test, ticks + 1, judge.starts), ticks)
     front = FrontChannels.from_twin(twin, parts, machines[0])
@@ -444,7 +444,7 @@ def _scores(
         MACHINE: replace(grey, answers=simulate_machine(machines[1], front, windows, prefix)),
         f"machine {machines[0].name}": replace(grey, answers=simulate_machine(machines[0], front, windows, prefix)),
         GREY: grey,
-        "static map": free_runs(static, data.test, judge.seconds, judge.starts),
+        "static map": free_runs(static, data.test, judge.duration_s, judge.starts),
     }
     return {name: free_run_scores(each, judge) for name, each in runs.items()}
 
@@ -462,7 +462,7 @@ def _description(base: Machine) -> str:
 def _head(base: Machine, rows: Sequence[IdentifiedNumber], notes: Sequence[str]) -> list[str]:
     told_count, rough_count = sum(row.is_told for row in rows), sum(row.excited and not row.is_told for row in rows)
     return [
-        f"Identified from logs by edp identify: {told_count} of {len(rows)} numbers are told, {rough_count} roughly.",
+        f"Identified from logs by edp calibrate: {told_count} of {len(rows)} numbers are told, {rough_count} roughly.",
         "Behind a number: an approximate 95 % interval, from how far parts of the logs and runs of other lengths",
         f"differ ('roughly' where it is wider than {percent(TOLD)}), or that the number is kept. Numbers without a",
         f"comment are those of machine {base.name}, bodies but for their lengths excepted.",

@@ -160,7 +160,7 @@ def build_dictionary(
         draws, spent = draws + 1, spent + part.seconds
         drawing.step(draws)
         # Two draws at least, then as many as the time allows.
-        if not side_by_side.is_elsewhere and draws >= 2 and spent * (draws + 1) / draws > 60.0 * spec.minutes:
+        if not side_by_side.is_elsewhere and draws >= 2 and spent * (draws + 1) / draws > 60.0 * spec.time_budget_min:
             break
     provenance: Table = {
         "machine": machine, "seed": seed, "draws": draws, "sessions": len(faults),

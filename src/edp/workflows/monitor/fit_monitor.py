@@ -186,7 +186,7 @@ def fit_to_recordings(
         twins=tuple(bundle for bundle in bundles if isinstance(bundle, TwinBundle)),
         groups=experiment.groups,
         seed=experiment.seed,
-        minutes=experiment.minutes,
+        minutes=experiment.time_budget_min,
         progress=progress,
     )
     sources = _sources(experiment, material, side_by_side)
@@ -419,7 +419,7 @@ def _healthy_sessions(recordings: Sequence[Recording], experiment: MonitorExperi
     count = 0
     for count, index in enumerate(order, start=1):
         drawn += sessions[index].samples
-        if drawn >= experiment.train_share * total and count >= 2:
+        if drawn >= experiment.train_fraction * total and count >= 2:
             break
     count = min(count, len(sessions) - 4)
     chosen = [sessions[i] for i in order[:count]]

@@ -1,4 +1,4 @@
-"""The table of `edp parity`."""
+"""The table of `edp verify`."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ RUN = ("run.json", "provenance.json")
 """Training and distillation write both beside a bundle, quantisation and adaptation the second; a bundle that is passed
 on has neither."""
 WHAT = (
-    "edp parity writes C, Python and MATLAB code of this network, compiles it and runs it on this computer with your "
+    "edp verify writes C, Python and MATLAB code of this network, compiles it and runs it on this computer with your "
     "rights. The code holds numbers and sizes of the bundle, and its text in comments and strings only"
 )
 

@@ -161,11 +161,13 @@ def _start(path: str | Path) -> tuple[Predictor, dict[str, str]]:
 def _carrying(experiment: Experiment, episodic: bool, rate_hz: float) -> Experiment:
     """Return the settings with streams that continue for a minute, for chunk training without this setting."""
     chunks = experiment.training.chunks
-    if episodic or chunks.carried or chunks.regime == "window":
+    if episodic or chunks.reset_after_chunks or chunks.regime == "window":
         return experiment
     # At least one chunk, however long chunks are.
     carried = max(1, round(CARRIED_S * rate_hz / chunks.length))
-    return replace(experiment, training=replace(experiment.training, chunks=replace(chunks, carried=carried)))
+    return replace(
+        experiment, training=replace(experiment.training, chunks=replace(chunks, reset_after_chunks=carried))
+    )
 
 
 def _result(order: Pretrain, experiment: Experiment, data: Prepared, contexts: Contexts) -> FoundationFile:
@@ -177,7 +179,7 @@ def _result(order: Pretrain, experiment: Experiment, data: Prepared, contexts: C
         meta=asdict(order.meta) if PRETRAININGS[order.method].episodic else None,
         horizon=data.task.horizons[0],
         rate_hz=data.task.rate_hz,
-        carried=experiment.training.chunks.carried,
+        carried=experiment.training.chunks.reset_after_chunks,
         data={
             part: PartSize(
                 machines=len(owned),

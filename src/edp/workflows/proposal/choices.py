@@ -130,7 +130,7 @@ def choose_split(group: LogGroup, proposal: MapProposal, targets: Sequence[str])
 
 def _rests_in_most(group: LogGroup, proposal: MapProposal, targets: Sequence[str]) -> str:
     """State why whole logs would not test an output or a command that moves in few logs; empty if they would."""
-    tests = max(1, round(ByName.test_share * len(group.paths)))
+    tests = max(1, round(ByName.test_fraction * len(group.paths)))
     for guess in proposal.columns:
         if guess.channel not in targets and not (guess.channel and guess.role == "command"):
             continue

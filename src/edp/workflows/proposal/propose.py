@@ -56,7 +56,8 @@ class LogsProposal:
         columns: the columns with what they are taken for.
         files: the texts to write, by name.
         targets: channels to predict.
-        inputs: channels that command, where no kind tells it; `edp inspect` sees their coverage only if they are named.
+        inputs: channels that command, where no kind tells it; `edp data check` sees their coverage only if they are
+        named.
         repairs: repairs without which training would refuse the logs, in the notation of ``--repair``.
         notes: other remarks for the user.
         recordings: number of recordings that the commands read.
@@ -80,7 +81,7 @@ class LogsProposal:
         run = _quoted(folder / "runs" / "first")
         inputs = f" --inputs {shlex.quote(','.join(self.inputs))}" if self.inputs else ""
         return [
-            f"edp inspect {data}{mapped}{inputs}",
+            f"edp data check {data}{mapped}{inputs}",
             f"edp train {data}{mapped} --config {_quoted(folder / SETTINGS)} --out {run}{repair}",
             f"edp evaluate {run}",
             f"edp report {run}",

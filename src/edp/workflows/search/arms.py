@@ -30,7 +30,7 @@ class Arm:
         Equal requests then have equal keys.
         """
         tables = plain_tree(experiment)
-        del tables["split"], tables["judge"]["baselines"]
+        del tables["split"], tables["evaluation"]["baselines"]
         # Orders decide these; left in the settings they would make equal trainings different.
         for name in ("epochs", "updates", "patience", "refit", "seed"):
             del tables["training"][name]

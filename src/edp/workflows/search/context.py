@@ -96,7 +96,7 @@ class SearchContext:
         return add_modules(arm, names, self.channels, options, self.shaped)
 
     def orders(self, arm: Arm, runs: Sequence[int], seed: int = 0) -> list[TrainingRequest]:
-        """Return one request per run: the same folds and seeds for every arm (common random numbers).
+        """Return one request per run: the same folds and seeds for every arm (common random values).
 
         Trainings of several epochs are validated by the sessions that evaluate them, as in the thesis.
 
@@ -152,10 +152,10 @@ class SearchContext:
 
 def is_enough(sessions: int, spec: SearchSpec) -> bool:
     """Return whether there are enough sessions for test sets and folds; True if test sessions are named."""
-    if spec.test or spec.second:
+    if spec.test or spec.second_test:
         return True
-    test = max(1, round(spec.test_share * sessions))
-    second = max(1, round(spec.second_share * sessions)) if spec.compression.on else 0
+    test = max(1, round(spec.test_fraction * sessions))
+    second = max(1, round(spec.second_test_fraction * sessions)) if spec.compression.enabled else 0
     return _fills_folds(sessions - test - second, spec)
 
 
@@ -178,24 +178,26 @@ def set_apart(
         ConfigError: a session that is to be set apart is not there, or is named for both test sets.
         DataError: too few sessions for the folds.
     """
-    for part, named in (("test", spec.test), ("second", spec.second)):
+    for part, named in (("test", spec.test), ("second", spec.second_test)):
         strange = [name for name in named if name not in sessions]
         if strange:
             raise ConfigError(
                 f"search: {part} names '{strange[0]}', and there is no such session{closest(strange[0], sessions)}"
             )
-    both = sorted(set(spec.test) & set(spec.second))
+    both = sorted(set(spec.test) & set(spec.second_test))
     if both:
         raise ConfigError(f"search: {', '.join(both)} is named in test and in second; each must be in one of them")
-    free = [name for name in sessions if name not in spec.second]
+    free = [name for name in sessions if name not in spec.second_test]
     named = tuple(name for name in sessions if name in spec.test)
     # The seed differs from all others of the search, so that the same draw never serves two purposes.
-    test = named or _draw_sessions(free, families, [spec.seed, 0x7E57], max(1, round(spec.test_share * len(sessions))))
+    test = named or _draw_sessions(
+        free, families, [spec.seed, 0x7E57], max(1, round(spec.test_fraction * len(sessions)))
+    )
     rest = [name for name in free if name not in test]
     second: tuple[str, ...] = ()
-    if spec.compression.on:
-        count = max(1, round(spec.second_share * len(sessions)))
-        named = tuple(name for name in sessions if name in spec.second)
+    if spec.compression.enabled:
+        count = max(1, round(spec.second_test_fraction * len(sessions)))
+        named = tuple(name for name in sessions if name in spec.second_test)
         second = named or _draw_sessions(rest, families, [spec.seed, 0x7E58], count)
     development = tuple(name for name in sessions if name not in (*test, *second))
     if not _fills_folds(len(development), spec):

@@ -40,7 +40,7 @@ def freeze_split(folder: Path, context: SearchContext, digests: Mapping[str, str
     test, second, validation, train = (
         tuple(Session(name=name, digest=digests[name]) for name in names) for names in parts
     )
-    return ByFrozen(test=test, second=second, validation=validation, train=train, study=str(full_path(folder)))
+    return ByFrozen(test=test, second_test=second, validation=validation, train=train, study=str(full_path(folder)))
 
 
 def write_networks(

@@ -234,7 +234,7 @@ class _Observer:
         self.study_log.report(self.stage)
 
     def _open(self, test_set: str, keys: Sequence[str], why: str) -> None:
-        """Record an opening before it is made. ``edp compress`` may have opened the second test set before phase 6."""
+        """Record an opening before it is made; `edp compress search` may have opened the second test set earlier."""
         # Recorded before it is made: a kill in between must not leave an opening without a trace.
         earlier = [one for one in self.ledger.openings(test_set) if one.judged != tuple(keys)]
         self.ledger.open_test_set(test_set, keys, why, again=test_set == SECOND_TEST_SET)
@@ -264,7 +264,7 @@ def _refuse_twice(recordings: Sequence[Recording]) -> None:
         if recording.digest in seen:
             raise DataError(
                 f"'{recording.name}' and '{seen[recording.digest]}' are the same session, value for value; one of "
-                "them would train and the other judge, or test: remove one (edp inspect names all that repeat)"
+                "them would train and the other judge, or test: remove one (edp data check names all that repeat)"
             )
         seen[recording.digest] = recording.name
 
@@ -288,7 +288,7 @@ def _check_channels(recordings: Sequence[Recording], plan: SearchPlan) -> str:
             except (ConfigError, DataError) as error:
                 raise DataError(
                     f"feature set {name} cannot be had of '{recording.name}': {error}; name others with --set "
-                    "search.features=[...] (a file of edp screen is one)"
+                    "search.features=[...] (a file of edp data screen is one)"
                 ) from error
     return units.pop() if len(units) == 1 else "mixed units"
 

@@ -42,11 +42,11 @@ MOVED = {
     "screening_runs": "screening.runs",
     "screening_repeats": "screening.repeats",
     "module_trials": "screening.trials",
-    "least_effect": "planning.least_effect",
+    "least_effect": "planning.min_effect",
     "power": "planning.power",
-    "most_runs": "planning.most_runs",
+    "most_runs": "planning.max_runs",
     "alpha": "confirmation.alpha",
-    "least_gain": "confirmation.least_gain",
+    "least_gain": "confirmation.min_gain",
     "joint_trials": "synthesis.trials",
     "free_trials": "exploration.trials",
 }
@@ -121,22 +121,22 @@ class PlanningSpec:
     """Phase 2.5: power analysis for the confirmation.
 
     Attributes:
-        least_effect: smallest effect to detect, as a fraction of the baseline's mean score.
+        min_effect: smallest effect to detect, as a fraction of the baseline's mean score.
         power: probability of detecting this effect.
-        most_runs: maximum number of training runs per arm.
+        max_runs: maximum number of training runs per arm.
 
     Raises:
         ConfigError: a value out of range.
     """
 
-    least_effect: float = 0.02
+    min_effect: float = 0.02
     power: float = 0.80
-    most_runs: int = 20
+    max_runs: int = 20
 
     def __post_init__(self) -> None:
         share = between(0.0, 1.0)
         most = integer(2, MAX_TRAININGS)
-        check_bounds("search.planning", self, least_effect=share, power=share, most_runs=most)
+        check_bounds("search.planning", self, min_effect=share, power=share, max_runs=most)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,17 +145,17 @@ class ConfirmationSpec:
 
     Attributes:
         alpha: significance level, also of the comparisons of later phases.
-        least_gain: minimum improvement, as a fraction of the baseline's mean score.
+        min_gain: minimum improvement, as a fraction of the baseline's mean score.
 
     Raises:
         ConfigError: a value out of range.
     """
 
     alpha: float = 0.05
-    least_gain: float = 0.01
+    min_gain: float = 0.01
 
     def __post_init__(self) -> None:
-        check_bounds("search.confirmation", self, alpha=between(0.0, 1.0), least_gain=span(0.0, 1.0))
+        check_bounds("search.confirmation", self, alpha=between(0.0, 1.0), min_gain=span(0.0, 1.0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,10 +180,10 @@ class CompressionSpec:
     """Phase 6: the best network that a controller can run.
 
     Attributes:
-        on: whether it is made; without it no second test set is set apart.
+        enabled: whether it is made; without it no second test set is set apart.
         budget: limits of the controller: a table, or the path of a budget file.
         units: widths to make; none given, they are planned from the budget.
-        shares: fractions of the widest network that fits; each gives one width.
+        width_fractions: fractions of the widest network that fits; each gives one width.
         formats: number formats to evaluate in; none given, all.
         updates: training steps of each smaller network; 0 for as many as the teacher has, `SearchSpec.final_updates`.
 
@@ -191,17 +191,21 @@ class CompressionSpec:
         ConfigError: a value out of range.
     """
 
-    on: bool = True
+    enabled: bool = True
     budget: Budget = field(default_factory=Budget)
     units: tuple[int, ...] = ()
-    shares: tuple[float, ...] = SHARES
+    width_fractions: tuple[float, ...] = SHARES
     formats: tuple[str, ...] = ()
     updates: int = 0
 
     def __post_init__(self) -> None:
-        bounds = {"units": integer(1, MAX_UNITS), "shares": above(0.0, 1.0), "updates": integer(0, MAX_UPDATES)}
+        bounds = {
+            "units": integer(1, MAX_UNITS),
+            "width_fractions": above(0.0, 1.0),
+            "updates": integer(0, MAX_UPDATES),
+        }
         check_bounds("compression", self, **bounds)
-        wrong = [] if self.shares else ["shares = [] (at least one)"]
+        wrong = [] if self.width_fractions else ["shares = [] (at least one)"]
         for name in self.formats:
             if name not in FORMATS:
                 wrong.append(f"formats = {shown(name)} ({', '.join(FORMATS)}{closest(name, FORMATS)})")
@@ -224,10 +228,11 @@ class SearchSpec:
             and the best one counts. 1 is one long epoch that chooses nothing.
         patience: epochs without a better validation before a training ends early; 0 never.
         horizon: horizon of the scores, one of the task's.
-        test_share: share of the sessions that are set apart as test before anything else.
+        test_fraction: share of the sessions that are set apart as test before anything else.
         test: names of the sessions to set apart, instead of a share that is drawn.
-        second_share: share of the sessions that are set apart beside them, as second test set, for phase 6 alone.
-        second: names of these, instead of a share that is drawn.
+        second_test_fraction: share of the sessions that are set apart beside them, as second test set, for phase 6
+            alone.
+        second_test: names of these, instead of a share that is drawn.
         folds: into which the other sessions are dealt.
         backbones: registered backbones that are compared.
         features: feature sets that are compared: names, or sets of one's own.
@@ -268,10 +273,10 @@ class SearchSpec:
     epochs: int = 1
     patience: int = 0
     horizon: int = 10
-    test_share: float = 0.2
+    test_fraction: float = 0.2
     test: tuple[str, ...] = ()
-    second_share: float = 0.1
-    second: tuple[str, ...] = ()
+    second_test_fraction: float = 0.1
+    second_test: tuple[str, ...] = ()
     folds: int = 5
     backbones: tuple[str, ...] = ("lstm", "tcn", "hybrid")
     features: tuple[str | FeatureSettings, ...] = ("FG1", "FG2")
@@ -306,7 +311,7 @@ class SearchSpec:
         # Zero steps stand for passes over the data, which only several epochs know.
         steps = integer(1 if self.epochs == 1 else 0, MAX_UPDATES)  # 0: passes over the data
         bounds |= dict.fromkeys(("updates", "final_updates"), steps)
-        bounds |= dict.fromkeys(("test_share", "second_share", "rungs"), between(0.0, 1.0))
+        bounds |= dict.fromkeys(("test_fraction", "second_test_fraction", "rungs"), between(0.0, 1.0))
         check_bounds("search", self, **bounds)
         wrong = self._wrong_epochs()
         if self.mode not in MODES:
@@ -328,8 +333,8 @@ class SearchSpec:
         ]
         if self.isolation.runs < 2 * self.folds or self.isolation.runs % self.folds:
             wrong.append(f"isolation.runs = {self.isolation.runs} (two repeats of the {self.folds} folds or more)")
-        if self.planning.most_runs < self.folds:
-            wrong.append(f"planning.most_runs = {self.planning.most_runs} (at least the {self.folds} folds)")
+        if self.planning.max_runs < self.folds:
+            wrong.append(f"planning.max_runs = {self.planning.max_runs} (at least the {self.folds} folds)")
         if not self.backbones or not self.features:
             wrong.append("backbones and features (at least one of each)")
         if len(self.feature_sets) < len(self.features):

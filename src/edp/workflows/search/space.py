@@ -23,6 +23,11 @@ REAL = span(-1e30, 1e30)
 class Real:
     """A number between two bounds, uniform or uniform in its logarithm.
 
+    Attributes:
+        low: lower bound.
+        high: upper bound.
+        log: whether the number is uniform in its logarithm.
+
     Raises:
         ConfigError: bounds that hold nothing, or that have no logarithm.
     """
@@ -64,6 +69,9 @@ class Real:
 @dataclass(frozen=True)
 class Choice:
     """One of some values, in ascending order of cost where they have one.
+
+    Attributes:
+        options: the values, each once.
 
     Raises:
         ConfigError: fewer than two values, or one twice.
@@ -135,9 +143,9 @@ def _loss(arm: Arm, value: str) -> Arm:
 
 SCHEDULES: dict[str, dict[str, float | str]] = {
     # Factor, patience and threshold of appendix B.1.1.
-    "plateau": {"kind": "plateau", "shrink": 0.5, "patience": 5, "threshold": 1e-4},
+    "plateau": {"kind": "plateau", "factor": 0.5, "patience": 5, "threshold": 1e-4},
     # Annealed to zero, as PyTorch's schedule does by default; B.1.1 has no warm-up.
-    "cosine": {"kind": "cosine", "warmup": 0.0, "floor": 0.0},
+    "cosine": {"kind": "cosine", "warmup": 0.0, "min_lr_ratio": 0.0},
 }
 """The two schedules of thesis 3.2.4.2."""
 

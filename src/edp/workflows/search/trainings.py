@@ -182,10 +182,10 @@ def train_part(order: TrainingRequest, start: bytes | None = None) -> TrainedPar
     data = prepared(order, experiment)
     windowed = order.epochs > 1 and experiment.training.chunks.regime == "window"
     fitted, state = fit_part(data, experiment.model, experiment.training, order.until, start, windowed)
-    spec = JudgeSpec(baselines=(), skip=experiment.judge.skip)
+    spec = JudgeSpec(baselines=(), warmup_samples=experiment.evaluation.warmup_samples)
     if windowed:
         # Windows have no start-up of their own; the first whole one ends at the window's last tick.
-        skip = max(spec.skip or 0, experiment.model.window, data.task.features.starting_ticks)
+        skip = max(spec.warmup_samples or 0, experiment.model.window, data.task.features.init_samples)
         by_recording = score_predictions(window_predictions(fitted.predictor, data.test), data, skip).recordings
     else:
         by_recording = judge(fitted.predictor, data, spec, "").scores.models["network"].recordings

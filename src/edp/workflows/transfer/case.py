@@ -122,8 +122,8 @@ def tuned(
         training,
         chunks=chunks,
         terms=terms,
-        optimizer=optimizer or Soap(learning_rate=spec.rate, weight_decay=spec.weight_decay),
-        epochs=epochs or spec.rounds,
+        optimizer=optimizer or Soap(learning_rate=spec.learning_rate, weight_decay=spec.weight_decay),
+        epochs=epochs or spec.single_phase_epochs,
         patience=spec.patience,
         refit="none",
     )
@@ -131,7 +131,7 @@ def tuned(
 
 def repeat_chunks(chunks: ChunkSpec) -> ChunkSpec:
     """Return chunks for minutes of logs, which fill few lanes: they are read repeatedly with other cuts."""
-    if chunks.carried or chunks.regime == "window":
+    if chunks.reset_after_chunks or chunks.regime == "window":
         return chunks
     # A piece must be longer than its burn-in; eight chunks leave most of its ticks with a loss.
-    return replace(chunks, carried=max(8, chunks.burn_in // chunks.length + 1))
+    return replace(chunks, reset_after_chunks=max(8, chunks.burn_in // chunks.length + 1))

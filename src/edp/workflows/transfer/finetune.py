@@ -43,7 +43,7 @@ from edp.workflows.transfer.source import SourceModel, read_source, target_exper
 KIND, SHOWN = "transfer", "transfer_predictions.safetensors"
 BEFORE = "direct"
 RENAMED = {"replay": "rehearsal", "replay_distilled": "rehearsal_distilled"}
-"""Methods by their former names; ``edp replay`` evaluates a log with an adapted network and mixes no data."""
+"""Methods by their former names; ``edp adapt replay`` evaluates a log with an adapted network and mixes no data."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,7 +194,7 @@ def _able(source: SourceModel, order: FinetuneRequest) -> tuple[list[str], list[
         elif METHODS[name].needs_code and not code_names(source.predictor):
             lacking[name] = (
                 "needs a network that reads the code of a machine, which that of the source does not; give one of "
-                "edp pretrain --method codes"
+                "edp train pretrain --method codes"
             )
     if order.method in lacking:
         raise ConfigError(f"method '{order.method}' {lacking[order.method]}")
@@ -231,7 +231,7 @@ def _result(
 ) -> tuple[TransferFile, dict[str, NDArray[np.float32]]]:
     """Return the scores of all methods in both domains, and the predictions before and after that pictures show."""
     # The longest start-up of all methods, so that all are scored on the same ticks.
-    skip = max(source.predictor.spec.window, experiment.judge.history, data.task.features.starting_ticks)
+    skip = max(source.predictor.spec.window, experiment.evaluation.history, data.task.features.init_samples)
     predictions = {name: one.predict(data) for name, one in results.items()}
     errors = {name: errors_of(values, data, skip) for name, values in predictions.items()}
     domains = {"target": {name: measure(values, data, skip) for name, values in predictions.items()}}

@@ -20,10 +20,12 @@ from edp.networks.matrices import matrices_of
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
 from edp.registry import Registry
+from edp.settings.earlier_keys import present_keys
 from edp.settings.tree import value_at
 from edp.training.averages import NoAverage
 from edp.training.bundle import weights_digest
 from edp.training.optimizers import AdamW, Discriminative, Sgd
+from edp.training.pretraining.spec import MetaSpec
 from edp.training.schedules import Constant
 from edp.training.transfer.both_domains import BothDomains, BothSpec
 from edp.training.transfer.strategies import LowRank
@@ -125,8 +127,9 @@ class FewSteps(Method):
         """Take the steps; what did not adapt in the meta-learning does not here."""
         spec, source = case.spec, case.source
         more = source.bundle.provenance.more
-        rate = spec.inner_rate or float(value_at(more, "strategy.meta.inner_rate", STEP_RATE))
-        frozen = decompose(source.predictor).encoding if value_at(more, "strategy.meta.head_only") else ()
+        meta = present_keys(MetaSpec, value_at(more, "strategy.meta") or {})
+        rate = spec.inner_learning_rate or float(meta.get("inner_learning_rate", STEP_RATE))
+        frozen = decompose(source.predictor).encoding if meta.get("head_only") else ()
         training = replace(
             case.tuning(Sgd(learning_rate=rate), spec.inner_steps),
             # Plain descent at a constant rate without an average: what meta-learning trained for.
@@ -213,7 +216,7 @@ class DistilledRehearsal(Method):
 
     def make(self, case: TransferCase) -> Made:
         """Train on both domains."""
-        spec = BothSpec(weight=case.spec.source_weight, soft=case.spec.soft)
+        spec = BothSpec(weight=case.spec.source_weight, soft=case.spec.distillation_fraction)
         return train_both(case, "rehearsal_distilled", spec)
 
 
@@ -226,7 +229,7 @@ class Adversarial(Method):
 
     def make(self, case: TransferCase) -> Made:
         """Train on both domains."""
-        spec = BothSpec(weight=case.spec.source_weight, reversal=case.spec.reversal)
+        spec = BothSpec(weight=case.spec.source_weight, reversal=case.spec.adversarial_weight)
         return train_both(case, "adversarial", spec)
 
 
@@ -274,7 +277,7 @@ class Ridge(Method):
 
     def make(self, case: TransferCase) -> Made:
         """Fit it; penalty and history are chosen on the validation part."""
-        predict, baseline = baseline_predictions(RidgeArx, case.data, case.experiment.judge)
+        predict, baseline = baseline_predictions(RidgeArx, case.data, case.experiment.evaluation)
         return Made(predict, int(baseline.weights.size + baseline.intercept.size))
 
 
@@ -289,7 +292,11 @@ class Scratch(Method):
         training, spec = case.experiment.training, case.spec
         chunks = repeat_chunks(training.chunks)
         training = replace(
-            training, chunks=chunks, epochs=SCRATCH_TIMES * spec.rounds, patience=spec.patience, refit="none"
+            training,
+            chunks=chunks,
+            epochs=SCRATCH_TIMES * spec.single_phase_epochs,
+            patience=spec.patience,
+            refit="none",
         )
         network = case.train("scratch", training, None)
         return result_of_network(network)
@@ -305,7 +312,7 @@ class TwoPhase(Method):
         """Return both phases; the first is a run of its own within the run of the second."""
         spec, parts = case.spec, decompose(case.source.predictor)
         # 0.999 is AdamW's usual value; the library's default of 0.99 is for short runs.
-        heads = AdamW(learning_rate=spec.head_rate, weight_decay=spec.weight_decay, beta2=0.999)
+        heads = AdamW(learning_rate=spec.head_learning_rate, weight_decay=spec.weight_decay, beta2=0.999)
         warmed = case.train(
             "two_phase, head",
             case.tuning(heads, spec.head_epochs),
@@ -314,8 +321,8 @@ class TwoPhase(Method):
         )
         # Depth counts from the head: layers near the input change least.
         above = list(reversed(parts.backbone))
-        rates = tuple((part, spec.backbone_rate * spec.depth_decay**depth) for depth, part in enumerate(above))
-        optimizer = Discriminative(rates=rates, learning_rate=spec.head_rate, weight_decay=spec.weight_decay)
+        rates = tuple((part, spec.backbone_learning_rate * spec.depth_decay**depth) for depth, part in enumerate(above))
+        optimizer = Discriminative(rates=rates, learning_rate=spec.head_learning_rate, weight_decay=spec.weight_decay)
         start = {"start": weights_digest(warmed)}
         network = case.train("two_phase", case.tuning(optimizer, spec.epochs), lambda: WarmStart(warmed), start)
         return result_of_network(network)

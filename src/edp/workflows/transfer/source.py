@@ -31,7 +31,7 @@ from edp.workflows.train_evaluate import read_trained_run
 
 OWN = ("training.epochs", "training.optimizer", "training.patience", "training.refit", "training.chunks.batch")
 """Settings that a fine-tuning has others for, in the table ``[finetune]``."""
-PLACES = ("training", "split", "judge")
+PLACES = ("training", "split", "evaluation")
 
 
 @dataclass(frozen=True, eq=False)

@@ -208,7 +208,7 @@ class TwinChoice:
             for form in forms if round_ < BOTH_FORMS or ahead is None else [one for one in forms if one == ahead.spec]:
                 training = shortened(self.training, share)
                 cost = training_seconds(form, self.fit.channels, training, count)
-                if self.auto.minutes and spent + cost > 60.0 * self.auto.minutes:
+                if self.auto.time_budget_min and spent + cost > 60.0 * self.auto.time_budget_min:
                     unfit.append(self._skip_training(form, training, spent + cost))
                     continue
                 spent += cost
@@ -226,7 +226,7 @@ class TwinChoice:
         """Return a training that is left out, with the reason."""
         why = (
             f"about {typed(seconds / 60.0, 2)} min of counted time with those before it, of minutes = "
-            f"{setting_text(self.auto.minutes)}"
+            f"{setting_text(self.auto.time_budget_min)}"
         )
         return TwinCandidate(labelled(form, training), 0.0, why=why)
 
@@ -323,7 +323,7 @@ class TwinChoice:
 
     def _simplest(self, tried: Sequence[TwinCandidate]) -> TwinCandidate | None:
         """Return the simplest formulation that is as good as the best; of its trainings the best one."""
-        enough = _least(tried) / (1.0 - self.auto.least_gain)
+        enough = _least(tried) / (1.0 - self.auto.min_gain)
         spec = next((one.spec for one in tried if one.error is not None and one.error <= enough), None)
         return None if spec is None else _best([one for one in tried if one.spec == spec])
 
@@ -338,17 +338,17 @@ class TwinChoice:
 
         More of them fit into it, and differ more from one another, than long ones.
         """
-        return free_runs(twin, fold.validation, self.training.validation_s, self.training.lanes)
+        return free_runs(twin, fold.validation, self.training.validation_s, self.training.batch)
 
     def _error(self, runs: Sequence[FreeRuns], reference: Sequence[FreeRuns]) -> float:
         """Return the error relative to a reference in the same folds."""
         ours, theirs = (FreeRuns.joined(some) for some in (runs, reference[: len(runs)]))
-        return relative_error(ours, theirs, self.fit.experiment.judge, self.training.validation_s)
+        return relative_error(ours, theirs, self.fit.experiment.evaluation, self.training.validation_s)
 
 
 def relative_error(runs: FreeRuns, reference: FreeRuns, judge: FreeRunJudgeSpec, seconds: float) -> float:
     """Return the error of free runs of a length in seconds, relative to a reference in the same runs."""
-    judge = replace(judge, seconds=seconds, at_s=tuple(sorted({share * seconds for share in AT})))
+    judge = replace(judge, duration_s=seconds, at_s=tuple(sorted({share * seconds for share in AT})))
     return free_run_error(free_run_scores(runs, judge), free_run_scores(reference, judge))
 
 

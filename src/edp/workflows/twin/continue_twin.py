@@ -200,9 +200,9 @@ class ContinuedTwin:
         training, data = self.fit.experiment.training, self.fit.data
         static = StaticMap(prefix_ticks=twin.prefix_ticks).start(twin.channels, twin.scales, data.train, 0)
         ours, theirs = (
-            free_runs(one, data.validation, training.validation_s, training.lanes) for one in (twin, static)
+            free_runs(one, data.validation, training.validation_s, training.batch) for one in (twin, static)
         )
-        return relative_error(ours, theirs, self.fit.experiment.judge, training.validation_s)
+        return relative_error(ours, theirs, self.fit.experiment.evaluation, training.validation_s)
 
 
 def _set_members(twin: Twin, members: int) -> Twin:

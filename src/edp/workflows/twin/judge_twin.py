@@ -68,19 +68,19 @@ def judge_twin(
         labels: see `driving_labels`.
         progress: receiver of what begins.
     """
-    twin, spec = bundle.twin, experiment.judge
+    twin, spec = bundle.twin, experiment.evaluation
     progress.note("free runs of the twin")
-    runs = free_runs(twin, data.test, spec.seconds, spec.starts)
+    runs = free_runs(twin, data.test, spec.duration_s, spec.starts)
     beyond = commands_beyond(bundle.provenance.more.get(RANGES), twin.channels, [part.inputs for part in data.test])
     own = free_run_scores(runs, spec, bundle.intervals, labels)
     scores = {TWIN: replace(own, ahead=_score_ahead(twin, data, spec), beyond=beyond)}
-    for name in spec.floors:
+    for name in spec.baselines:
         progress.note(f"free runs of {name}")
         floor_spec: TwinSpec = replace(TWINS[name](), prefix_ticks=experiment.twin.prefix_ticks)
         taught, seed = [*data.train, *data.validation], experiment.training.seed
         try:
             floor = floor_spec.start(twin.channels, twin.scales, taught, seed)
-            floor_runs = free_runs(floor, data.test, spec.seconds, spec.starts)
+            floor_runs = free_runs(floor, data.test, spec.duration_s, spec.starts)
         except (ConfigError, DataError, NotFiniteError) as problem:
             # What such a log is too short for is no rival on it, and no reason to have no twin.
             progress.note(f"the floor {name} is left out: {problem}")
@@ -137,9 +137,9 @@ def select_shown_runs(runs: FreeRuns, intervals: FreeRunIntervals | None) -> dic
 def _score_ahead(twin: Twin, data: Prepared, spec: FreeRunJudgeSpec) -> AheadErrors | None:
     """Return the scores a few ticks ahead; None where no recording is long enough."""
     longest = max(part.samples for part in data.test)
-    if longest < twin.prefix_ticks + spec.ahead_ticks + 1:
+    if longest < twin.prefix_ticks + spec.horizon + 1:
         return None
-    return score_ahead(look_ahead(twin, data.test, spec.ahead_ticks))
+    return score_ahead(look_ahead(twin, data.test, spec.horizon))
 
 
 def evaluate_twin(
@@ -183,7 +183,7 @@ def evaluate_twin(
     scores, runs = judge_twin(bundle, experiment, data, driving_labels(recordings), progress)
     if predictor_run is not None:
         progress.note("the look-ahead predictor")
-        beside = compare_with_predictor(bundle.twin, data.test, recordings, Path(predictor_run), experiment.judge)
+        beside = compare_with_predictor(bundle.twin, data.test, recordings, Path(predictor_run), experiment.evaluation)
         scores[TWIN] = replace(scores[TWIN], beside=beside)
     write_scores(target, scores, runs, bundle.intervals)
     step_responses(bundle.twin, data.test).write(target)
@@ -202,7 +202,7 @@ def compare_with_predictor(
     """
     bundle = load_bundle(run)
     predictor, task = bundle.predictor, bundle.task
-    ticks = spec.ahead_ticks if spec.ahead_ticks in task.horizons else max(task.horizons)
+    ticks = spec.horizon if spec.horizon in task.horizons else max(task.horizons)
     names = [name for name in task.targets if name in {channel.name for channel in twin.channels.answers}]
     if ticks < 1 or not names:
         raise DataError(

@@ -117,7 +117,7 @@ def train_twin(
         if fitted.datasheet:
             Datasheet(basis=BASIS, numbers=fitted.datasheet).write(run.path)
         progress.note("calibrating intervals")
-        intervals = calibrated(result.unseen or ((fitted.twin, data.validation),), experiment.judge)
+        intervals = calibrated(result.unseen or ((fitted.twin, data.validation),), experiment.evaluation)
         before = None if base is None else base.bundle.provenance.more.get(RANGES)
         ranges = command_ranges(channels, [*data.train, *data.validation], before)
         provenance = training_provenance(source, data, experiment.training.seed, 1, fitted.seconds).add_entries(
@@ -138,7 +138,7 @@ def _check_judged(channels: TwinChannels, data: Prepared, experiment: TwinExperi
     Raises:
         DataError: see `check_runs`.
     """
-    judge, prefix = experiment.judge, experiment.twin.prefix_ticks
+    judge, prefix = experiment.evaluation, experiment.twin.prefix_ticks
     # An automatic twin is fitted to both parts in the end, and calibrated on folds of them.
     auto = isinstance(experiment.twin, AutoTwin)
     scales = fit_scales(channels, [*data.train, *data.validation] if auto else data.train)
@@ -149,9 +149,9 @@ def _check_judged(channels: TwinChannels, data: Prepared, experiment: TwinExperi
     low, high = scales.low.copy(), scales.high.copy()
     low[columns], high[columns] = -FARTHEST_TURN, FARTHEST_TURN
     scales = replace(scales, low=low, high=high)
-    check_runs(channels, scales, prefix, data.test, judge.seconds, judge.starts)
+    check_runs(channels, scales, prefix, data.test, judge.duration_s, judge.starts)
     if not auto:
-        check_runs(channels, scales, prefix, data.validation, judge.seconds, judge.calibration_starts)
+        check_runs(channels, scales, prefix, data.validation, judge.duration_s, judge.calibration_starts)
 
 
 def _linkage(experiment: TwinExperiment) -> dict[str, object]:

@@ -21,5 +21,5 @@ def training_seconds(form: Recurrent, channels: TwinChannels, training: FreeRunS
         count * (form.prefix_ticks + round(length * channels.rate_hz))
         for count, length in zip(training.updates, training.lengths_s, strict=True)
     )
-    each = ticks * training.lanes * (PER_WEIGHT_S * weights + PER_UNIT_S * units)
+    each = ticks * training.batch * (PER_WEIGHT_S * weights + PER_UNIT_S * units)
     return members * (sum(training.updates) * PER_UPDATE_S + each)

@@ -36,7 +36,7 @@ SPEC = SearchSpec(
     isolation=IsolationSpec(runs=6),
     calibration=CalibrationSpec(trials=8),
     screening=ModuleScreeningSpec(runs=32, repeats=1, trials=2),
-    planning=PlanningSpec(most_runs=6),
+    planning=PlanningSpec(max_runs=6),
     synthesis=TrialsSpec(trials=6),
     exploration=TrialsSpec(trials=12),
     space={"learning_rate": Real(1e-4, 1e-1, log=True), "units": Choice((4, 8, 16, 32))},
@@ -171,7 +171,7 @@ def sound_once():
 
 @pytest.fixture(scope="session")
 def thesis_once():
-    return study_of(dataclasses.replace(SPEC, mode="thesis", planning=PlanningSpec(most_runs=6, least_effect=0.01)))
+    return study_of(dataclasses.replace(SPEC, mode="thesis", planning=PlanningSpec(max_runs=6, min_effect=0.01)))
 
 
 @pytest.fixture

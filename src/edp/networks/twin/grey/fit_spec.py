@@ -29,7 +29,7 @@ class GreyFitSpec:
         rounds: rounds of each stage; every one draws other segments.
         starts: number of starting points of the first stage; the one with the least validation error is used.
         steps: Gauss-Newton steps in a round.
-        lanes: free runs of a round at most.
+        batch: free runs of a round at most.
         ticks: approximate total number of samples of the free runs in a round.
         memory: share of what a round knows that counts in the next one, beside its own segments.
         final_rounds: number of rounds after all stages, each with one step on free runs of the longest length; 0 for
@@ -51,7 +51,7 @@ class GreyFitSpec:
     rounds: tuple[int, ...] = (8, 6, 6, 4)
     starts: int = 3
     steps: int = 3
-    lanes: int = 512
+    batch: int = 512
     ticks: int = 12_000
     memory: float = 0.5
     final_rounds: int = 24
@@ -69,7 +69,7 @@ class GreyFitSpec:
         bounds |= {"final_rounds": integer(0, MAX_UPDATES), "final_ticks": count, "final_memory": SHARE}
         bounds |= {
             "starts": integer(1, MAX_STARTS),
-            "lanes": integer(1, MAX_BATCH),
+            "batch": integer(1, MAX_BATCH),
             "validation_runs": integer(1, MAX_BATCH),
             "validate_every": count,
         }

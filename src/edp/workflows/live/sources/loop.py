@@ -1,4 +1,4 @@
-"""``--loop``: a controller in closed loop with the simulator along a task, as `edp control` runs it."""
+"""``--loop``: a controller in closed loop with the simulator along a task, as `edp loop run` runs it."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class LoopSource(LiveSource):
 
     @classmethod
     def from_options(cls, options: SourceOptions, needs: Needs) -> LoopSource:
-        """Return `SourceOptions.value` is the name of a task, or a file of settings of `edp control` (TOML).
+        """Return `SourceOptions.value` is the name of a task, or a file of settings of `edp loop run` (TOML).
 
         Settings: ``controller`` (a name), ``twin`` and ``predictor`` (run folders that it uses) and ``plant`` (a
         twin's run folder, or an FMU whose native code is trusted, in the simulator's place).

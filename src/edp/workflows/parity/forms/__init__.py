@@ -1,4 +1,4 @@
-"""Forms that `edp parity` runs: a file each."""
+"""Forms that `edp verify` runs: a file each."""
 
 from edp.workflows.parity.forms import c_code, casadi, fmu, matlab, onnx_runtime, ros2, ticks
 

@@ -77,7 +77,7 @@ def streamed(bundle: Bundle, inputs: Rows, folder: Path) -> tuple[Rows, float]:
 
 @FORMS.register("c")
 class CCode:
-    """``edp export --to c`` of the unchanged network."""
+    """``edp export --format c`` of the unchanged network."""
 
     title: ClassVar[str] = "C"
 
@@ -89,7 +89,7 @@ class CCode:
 
 @FORMS.register("c_w8a16")
 class WholeNumbers:
-    """``edp export --to c`` in integers (W8A16); a float network is quantised on the golden recording for this."""
+    """``edp export --format c`` in integers (W8A16); a float network is quantised on the golden recording for this."""
 
     title: ClassVar[str] = "C in integers (W8A16)"
 

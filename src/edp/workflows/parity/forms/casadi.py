@@ -52,7 +52,7 @@ def _run(case: ParityCase, folder: Path, how: str, compiler: str = "") -> Sequen
 
 @FORMS.register("casadi")
 class CasadiStep:
-    """``edp export --to casadi``: the symbolic step, without EDP and PyTorch."""
+    """``edp export --format casadi``: the symbolic step, without EDP and PyTorch."""
 
     title: ClassVar[str] = "CasADi, symbolic step"
 
@@ -63,7 +63,7 @@ class CasadiStep:
 
 @FORMS.register("casadi_external")
 class CasadiExternal:
-    """``edp export --to casadi``: the C code behind the external function."""
+    """``edp export --format casadi``: the C code behind the external function."""
 
     title: ClassVar[str] = "CasADi, external C"
 

@@ -66,7 +66,7 @@ class Slave:
 
 @FORMS.register("fmu")
 class Fmu:
-    """``edp export --to fmu``, its library for Linux."""
+    """``edp export --format fmu``, its library for Linux."""
 
     title: ClassVar[str] = "FMU in FMPy"
 

@@ -82,7 +82,7 @@ def _octave(case: ParityCase, folder: Path, run: str, timed: str) -> tuple[Rows,
 
 @FORMS.register("matlab")
 class MatlabCode:
-    """``edp export --to simulink``: the plain MATLAB code."""
+    """``edp export --format simulink``: the plain MATLAB code."""
 
     title: ClassVar[str] = "MATLAB code, GNU Octave"
 
@@ -95,7 +95,7 @@ class MatlabCode:
 
 @FORMS.register("s_function")
 class SFunction:
-    """``edp export --to simulink``: the S-function as a MEX with substitutes for Simulink's headers."""
+    """``edp export --format simulink``: the S-function as a MEX with substitutes for Simulink's headers."""
 
     title: ClassVar[str] = "S-function, MEX in GNU Octave"
 
@@ -109,7 +109,7 @@ class SFunction:
 
 @FORMS.register("c_caller")
 class CCaller:
-    """``edp export --to simulink``: the function of a C Caller block."""
+    """``edp export --format simulink``: the function of a C Caller block."""
 
     title: ClassVar[str] = "C Caller's function"
 

@@ -64,7 +64,7 @@ def _runs(case: ParityCase, folder: Path, kind: str, inputs: np.ndarray, rest: d
 
 @FORMS.register("onnx_step")
 class OnnxStep:
-    """``edp export --to onnx``: the graph of a tick."""
+    """``edp export --format onnx``: the graph of a tick."""
 
     title: ClassVar[str] = "ONNX step, ONNX Runtime"
 
@@ -75,7 +75,7 @@ class OnnxStep:
 
 @FORMS.register("onnx_window")
 class OnnxWindow:
-    """``edp export --to onnx``: the graph of a window."""
+    """``edp export --format onnx``: the graph of a window."""
 
     title: ClassVar[str] = "ONNX window, ONNX Runtime"
 

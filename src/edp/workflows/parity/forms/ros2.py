@@ -35,7 +35,7 @@ print(json.dumps([found, least / len(rows)]))
 
 @FORMS.register("ros2")
 class Ros2Core:
-    """``edp export --to ros2``: the core of the node, without ROS."""
+    """``edp export --format ros2``: the core of the node, without ROS."""
 
     title: ClassVar[str] = "ROS 2 package, core"
 

@@ -34,19 +34,19 @@ class CompressionPhase:
     def trainings(self, context: SearchContext) -> int:
         """Return teacher, at most three networks a width, and teacher and choice once more on the second test set."""
         spec = context.spec.compression
-        if not spec.on:
+        if not spec.enabled:
             return 0
         if "exploration" in context.decided:
             try:
                 return plan_of(context, teacher_of(context)).trainings + 3
             except ConfigError:
                 return 1
-        widths = len(spec.units) or len(spec.shares) + len(spec.formats or FORMATS) - 1
+        widths = len(spec.units) or len(spec.width_fractions) + len(spec.formats or FORMATS) - 1
         return 3 * widths + 3
 
     def run(self, context: SearchContext) -> Course:
         """Train teacher and students of each width, round the better ones, evaluate the choice on the test set."""
-        if not context.spec.compression.on:
+        if not context.spec.compression.enabled:
             yield from ()
             return Decision(NAME, SmallerFacts(on=False), ("Left out: search.compression.on is false.",))
         teacher_arm = teacher_of(context)
@@ -180,7 +180,7 @@ def plan_of(context: SearchContext, teacher: Arm) -> CompressionPlan:
     network = build_model(task, experiment.model, blank_scaler(task), seed=0)
     # Widths beyond the teacher's are left out here: settings are written before its width is known.
     units = [width for width in spec.units if width <= width_of(experiment.model)]
-    return make_plan(network, spec.budget, units, spec.formats, shares=spec.shares)
+    return make_plan(network, spec.budget, units, spec.formats, shares=spec.width_fractions)
 
 
 def _nothing(context: SearchContext, why: str) -> Decision:

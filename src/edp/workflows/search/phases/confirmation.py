@@ -36,7 +36,7 @@ class Confirmation:
         screening, planning = facts_of_kind(decisions, ScreeningFacts), facts_of_kind(decisions, PlanningFacts)
         half = len(spec.modules or MODULES) // 2
         arms = half if screening is None else len(screening.passed)
-        runs = spec.planning.most_runs if planning is None else planning.runs
+        runs = spec.planning.max_runs if planning is None else planning.runs
         return (1 + arms) * runs * (spec.run_seeds if spec.mode == "thesis" else 1) if arms else 0
 
     def run(self, context: SearchContext) -> Course:
@@ -82,7 +82,7 @@ def _sound(context: SearchContext, passed: list[str], arms: list[Arm]) -> Course
         # All modules that were screened count for the adjustment, not only those that passed.
         context.facts(ScreeningFacts).registered,
         mask[:start],
-        Rule(alpha=rules.alpha, least_gain=rules.least_gain, interim_analyses=interim_analyses),
+        Rule(alpha=rules.alpha, least_gain=rules.min_gain, interim_analyses=interim_analyses),
     )
     confirmed = tuple(entry.module for entry in evidence if entry.confirmed)
     texts = (f"{MODULES[entry.module].title}: {entry.reason}." for entry in evidence)

@@ -92,7 +92,7 @@ class Exploration:
 def fresh_runs(context: SearchContext) -> range:
     """Return two repeats of the folds behind all that phases 0 to 4 may have used."""
     spec = context.spec
-    used = max(spec.planning.most_runs, spec.isolation.runs, spec.trial_runs, spec.screening.repeats)
+    used = max(spec.planning.max_runs, spec.isolation.runs, spec.trial_runs, spec.screening.repeats)
     # Rounded up to whole repeats, so that the fresh folds are complete.
     start = -(-used // spec.folds) * spec.folds
     return range(start, start + 2 * spec.folds)

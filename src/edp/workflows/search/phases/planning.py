@@ -35,18 +35,18 @@ def _sound(context: SearchContext) -> Decision:
     # At least one, so that the level stays defined where nothing is registered.
     modules = max(1, len(context.facts(ScreeningFacts).registered))
     plan = plan_runs(
-        spec.planning.least_effect * mean,
+        spec.planning.min_effect * mean,
         facts.variance,
         len(context.development),
         folds=spec.folds,
         # Bonferroni's level: the strictest that a single true module has to pass.
         alpha=spec.confirmation.alpha / modules,
         target=spec.planning.power,
-        most=spec.planning.most_runs,
+        most=spec.planning.max_runs,
     )
     # Whole repeats of the folds, even where the power is not reached.
-    runs = plan.runs or spec.planning.most_runs - spec.planning.most_runs % spec.folds
-    effect = typed(100 * spec.planning.least_effect)
+    runs = plan.runs or spec.planning.max_runs - spec.planning.max_runs % spec.folds
+    effect = typed(100 * spec.planning.min_effect)
     sentences = [f"To see {effect} % of {typed(mean, 3)}{behind(context.unit)}: {plan.reason}."]
     if plan.runs is None:
         sentences.append(
@@ -73,14 +73,14 @@ def _thesis(context: SearchContext) -> Decision:
             mean,
             sigma,
             spec.run_seeds,
-            share=planning.least_effect,
+            share=planning.min_effect,
             alpha=spec.confirmation.alpha,
             power=planning.power,
         )
-    runs = min(plan.splits or 2, planning.most_runs)
+    runs = min(plan.splits or 2, planning.max_runs)
     text = (
         f"J = {plan.splits} splits of {spec.run_seeds} seeds after eq. 3.42 (seeds differ by {typed(sigma, 3)}"
-        f"{behind(context.unit)}, {typed(100 * planning.least_effect)} % of an MAE of {typed(mean, 3)} are to be "
+        f"{behind(context.unit)}, {typed(100 * planning.min_effect)} % of an MAE of {typed(mean, 3)} are to be "
         f"seen); {runs} are made."
     )
     return Decision("planning", ThesisPlanning(**vars(plan), runs=runs, mae=mean, sigma_seed=sigma), (text,))
