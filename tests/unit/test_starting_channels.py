@@ -119,7 +119,7 @@ def test_a_task_survives_the_header_of_a_bundle():
     assert task_from_plain(task_to_plain(TASK)) == TASK
     plain = task_to_plain(TASK)
     del plain["features"]["init_channels"], plain["features"]["init_samples"]  # of a bundle from before
-    assert task_from_plain(plain).features.starting == ()
+    assert task_from_plain(plain).features.init_channels == ()
 
 
 def test_baselines_do_not_see_the_start_and_it_is_not_scored(free, predictor):
