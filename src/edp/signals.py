@@ -339,6 +339,15 @@ class ChannelMap:
     """Mapping from a file's column, with unit and kind, to one channel.
 
     Or a constant if the machine lacks the channel.
+
+    Attributes:
+        name: name of the channel.
+        column: name of the column in the file; empty for a constant.
+        unit: unit of the column.
+        kind: physical quantity of the channel.
+        scale: factor on the column, for example -1 to change the sign.
+        constant: value of the channel where the machine lacks it.
+        description: description for reports.
     """
 
     name: str
@@ -384,6 +393,8 @@ class SignalMap:
         header: False for a file without a header row; `columns` then names its columns.
         columns: column names of a headerless file.
         variable: the variable of a MAT file that holds the signals, when there are several.
+        delimiter: character between columns of a text file; None finds it.
+        decimal: decimal mark of a text file, a point or a comma.
         others: also take every column of numbers that `channels` does not name, under its own name; the vocabulary
             or else the file's unit tells its kind.
     """

@@ -17,41 +17,41 @@ EXTREMES = ("-1", "0", "1e9", "1000000000000", "9" * 6000, "nan", "1e400", "")
 APART = {"simulate", "demo"}
 """Their numbers are tested with the simulator's."""
 ALWAYS_WRONG = {
-    ("distil", "--units"): ("-1", "0", "1000000000000"),
-    ("quantise", "--ticks"): ("-1", "0", "1000000000000"),
+    ("compress distil", "--units"): ("-1", "0", "1000000000000"),
+    ("compress quantise", "--calibration-samples"): ("-1", "0", "1000000000000"),
     ("search run", "--workers"): ("-1", "1000000000000"),
     ("search run", "--threads"): ("-1", "0", "1000000000000"),
-    ("search run", "--seconds"): ("-1", "0", "nan", "inf"),
-    ("search run", "--memory"): ("-1", "0", "nan", "inf"),
+    ("search run", "--max-seconds"): ("-1", "0", "nan", "inf"),
+    ("search run", "--max-memory"): ("-1", "0", "nan", "inf"),
 }
 HUGE = "1000000000000"
 SETTINGS_ALWAYS_WRONG = {
-    ("distil", "distil.units"): ("-1", "0", HUGE, "wide"),
-    ("distil", "distil.levels"): ("-1", "0", "1000"),
-    ("distil", "distil.objective.truth"): ("-1", "nan", "inf"),
-    ("distil", "distil.objective.hint"): ("-1", "nan", "inf"),
-    ("distil", "distil.objective.soft"): ('{kind="quantile"}', '{kind="huberr"}'),
-    ("pretrain", "pretrain.inner_learning_rate"): ("-1", "0", "nan", "inf"),
-    ("pretrain", "pretrain.inner_steps"): ("-1", "0", HUGE),
-    ("pretrain", "pretrain.shots"): ("-1", "0", HUGE),
-    ("finetune", "finetune.epochs"): ("-1", "0", HUGE, "9" * 6000),
-    ("finetune", "finetune.head_learning_rate"): ("-1", "nan", "inf"),
-    ("finetune", "finetune.batch"): ("-1", "0", HUGE),
-    ("finetune", "finetune.smoothness"): ("-1", "nan", "inf"),
-    ("finetune", "finetune.weight_decay"): ("-1", "nan", "inf"),
-    ("finetune", "finetune.patience"): ("-1", HUGE),
-    ("finetune", "finetune.rank"): ("-1", "0", HUGE),
-    ("finetune", "finetune.distillation_fraction"): ("-1", "nan", "2"),
-    ("finetune", "finetune.inner_learning_rate"): ("-1", "nan", "inf"),
-    ("finetune", "finetune.center"): ("1", "no"),
-    ("adapt", "adapt.rank"): ("-1", HUGE),
-    ("adapt", "adapt.noise"): ("-1", "nan", "inf"),
-    ("adapt", "adapt.dead_zone"): ("-1", "nan", "inf"),
-    ("compress", "compress.units"): ("[-1]", "[0]", f"[{HUGE}]", "3"),
-    ("compress", "compress.formats"): ('["w8a6"]', "w8a16"),
-    ("compress", "compress.recipes"): ("[]", '["stirred"]'),
-    ("compress", "compress.budget"): ("small.toml", "{cycles=-1}"),
-    ("screen", "screen.max_lag"): ("-1", "0", HUGE, "nan"),
+    ("compress distil", "distil.units"): ("-1", "0", HUGE, "wide"),
+    ("compress distil", "distil.levels"): ("-1", "0", "1000"),
+    ("compress distil", "distil.objective.target_weight"): ("-1", "nan", "inf"),
+    ("compress distil", "distil.objective.hint_weight"): ("-1", "nan", "inf"),
+    ("compress distil", "distil.objective.distillation_loss"): ('{kind="quantile"}', '{kind="huberr"}'),
+    ("train pretrain", "pretrain.inner_learning_rate"): ("-1", "0", "nan", "inf"),
+    ("train pretrain", "pretrain.inner_steps"): ("-1", "0", HUGE),
+    ("train pretrain", "pretrain.shots"): ("-1", "0", HUGE),
+    ("train finetune", "finetune.epochs"): ("-1", "0", HUGE, "9" * 6000),
+    ("train finetune", "finetune.head_learning_rate"): ("-1", "nan", "inf"),
+    ("train finetune", "finetune.batch"): ("-1", "0", HUGE),
+    ("train finetune", "finetune.smoothness"): ("-1", "nan", "inf"),
+    ("train finetune", "finetune.weight_decay"): ("-1", "nan", "inf"),
+    ("train finetune", "finetune.patience"): ("-1", HUGE),
+    ("train finetune", "finetune.rank"): ("-1", "0", HUGE),
+    ("train finetune", "finetune.distillation_fraction"): ("-1", "nan", "2"),
+    ("train finetune", "finetune.inner_learning_rate"): ("-1", "nan", "inf"),
+    ("train finetune", "finetune.center"): ("1", "no"),
+    ("adapt run", "adapt.rank"): ("-1", HUGE),
+    ("adapt run", "adapt.noise"): ("-1", "nan", "inf"),
+    ("adapt run", "adapt.dead_zone"): ("-1", "nan", "inf"),
+    ("compress search", "compress.units"): ("[-1]", "[0]", f"[{HUGE}]", "3"),
+    ("compress search", "compress.formats"): ('["w8a6"]', "w8a16"),
+    ("compress search", "compress.recipes"): ("[]", '["stirred"]'),
+    ("compress search", "compress.budget"): ("small.toml", "{cycles=-1}"),
+    ("data screen", "screen.max_lag"): ("-1", "0", HUGE, "nan"),
     ("simulate", "limit.moments"): ("-1", "0", HUGE, "nan"),
     ("simulate", "limit.horizons"): ("[0]", "[]", "[5,2]", "1"),
     ("simulate", "masses"): ("12", "[12]", "[nan,12]"),
@@ -112,11 +112,10 @@ SENSIBLE = {
     ("demo", "--seed"): {"0"},
     ("simulate", "--seed"): {"0", "1000000000000000000"},
     ("simulate", "--family"): {"0"},  # one machine
-    ("screen", "--horizon"): {"0"},
-    ("animate", "--start"): {"0", "1e-320"},
-    ("evaluate", "--minutes"): {"0", "1e-320"},  # the cheapest baseline alone
+    ("data screen", "--horizon"): {"0"},
+    ("data animate", "--from"): {"0", "1e-320"},
     ("rollout", "--from"): {"0", "1e-320"},
-    ("forecast", "--gain"): {"0", "1e-320"},
+    ("data add-forecasts", "--observer-gain"): {"0", "1e-320"},
     ("live", "--port"): {"0"},
     ("live", "--udp"): {"0"},
     ("live", "--seed"): {"0"},
@@ -153,13 +152,14 @@ def words_of(name):
 
 
 def test_the_commands_are_all_there():
-    assert {"train", "evaluate", "search run", "finetune", "adapt", "screen", "quantise", "parity"} <= set(COMMANDS)
+    expected = {"train run", "evaluate", "search run", "train finetune", "adapt run", "data screen", "verify"}
+    assert expected <= set(COMMANDS)
     assert len(CASES) > 10
     assert {name for name, _ in SETTINGS_ALWAYS_WRONG} <= set(COMMANDS)
     assert set(ALWAYS_WRONG) <= set(CASES)
 
 
-WITHOUT_INPUTS = {"control", "tune"}
+WITHOUT_INPUTS = {"loop run", "loop tune"}
 """Commands that begin to work with a value that their option takes."""
 
 
@@ -209,7 +209,7 @@ def test_numbers_that_cannot_be_are_refused_by_name(name, option, edp):
 @pytest.mark.parametrize(("name", "key"), list(SETTINGS_ALWAYS_WRONG))
 def test_settings_that_cannot_be_are_refused_by_name(name, key, edp):
     for value in SETTINGS_ALWAYS_WRONG[name, key]:
-        width = ["--set", "distil.units=4"] if name == "distil" else []
+        width = ["--set", "distil.units=4"] if name == "compress distil" else []
         code, err, left = edp(*words_of(name), *width, "--set", f"{key}={value}")
         assert code == 1, f"{value}: {err}"
         said = err.partition("error: ")[2]
@@ -218,9 +218,9 @@ def test_settings_that_cannot_be_are_refused_by_name(name, key, edp):
 
 
 def test_a_key_of_a_table_is_named_with_its_table(edp):
-    for command, key in (("finetune", "rounds"), ("adapt", "rank"), ("pretrain", "shots")):
+    for command, key in (("train finetune", "rounds"), ("adapt run", "rank"), ("train pretrain", "shots")):
         code, err, _ = edp(*words_of(command), "--set", f"{key}=3")
-        assert (code, f"did you mean '{command}.{key}'?" in err) == (1, True), err
+        assert (code, f"did you mean '{command.removesuffix(' run').split()[-1]}.{key}'?" in err) == (1, True), err
 
 
 @pytest.mark.parametrize(("command", "option"), list(FORMER))

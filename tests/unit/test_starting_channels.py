@@ -119,7 +119,7 @@ def test_a_task_survives_the_header_of_a_bundle():
     assert task_from_dict(task_to_dict(TASK)) == TASK
     plain = task_to_dict(TASK)
     del plain["features"]["init_channels"], plain["features"]["init_samples"]  # of a bundle from before
-    assert task_from_dict(plain).features.starting == ()
+    assert task_from_dict(plain).features.init_channels == ()
 
 
 def test_baselines_do_not_see_the_start_and_it_is_not_scored(free, predictor):

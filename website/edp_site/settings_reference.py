@@ -38,7 +38,7 @@ BASIC = frozenset(
         *("task.features", "task.targets", "task.horizons", "task.mode", "split.kind", "auto.time_budget_min"),
         *("model.backbone.kind", "model.window", "training.epochs", "training.seed", "training.chunks.length"),
         *("training.optimizer.learning_rate", "training.patience", "evaluation.baselines", "machine", "recordings"),
-        *("duration_min", "seed", "twin.kind", "evaluation.duration_s", "hours_per_false_alarm", "task.kind"),
+        *("minutes", "seed", "twin.kind", "evaluation.duration_s", "hours_per_false_alarm", "task.kind"),
         *("controller.kind", "loops", "rate_hz", "finetune.epochs", "distil.units", "compress.budget"),
         *("screen.targets", "screen.horizon", "search.mode", "search.backbones"),
     )
@@ -109,6 +109,10 @@ def _matches(hint: Any, registry: Mapping[str, Any]) -> bool:
     """Return whether the parts of a registry stand in a field of this type."""
     plain = {str, int, float, bool}
     leaves = set(_leaves(hint))
+    settled = [leaf for leaf in leaves if isinstance(leaf, type) and is_dataclass(leaf)]
+    # A field of the same name may stand in another tree, such as the task of a closed loop.
+    if settled and not any(issubclass(part, leaf) for part in registry.values() for leaf in settled):
+        return False
     return bool(leaves - plain - {type(None), Ellipsis}) and all(isinstance(part, type) for part in registry.values())
 
 

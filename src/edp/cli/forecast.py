@@ -8,9 +8,10 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out, table
-from edp.cli.options import LogsArgument, MapOption, RepairOption, source_of
+from edp.cli.options import MOST_TICKS, LogsArgument, MapOption, RepairOption, source_of, within
 from edp.cli.progress import show_progress
 from edp.errors import count_of
+from edp.settings.bounds import integer, span
 from edp.settings.results import plain_value
 from edp.wording import figure
 
@@ -22,13 +23,19 @@ def forecast(
     run: Annotated[Path, typer.Argument(help="Run folder of edp twin.")],
     data: LogsArgument,
     folder: Annotated[Path, typer.Option("--out", help="New folder for the logs with forecasts (Parquet).")],
-    horizon: Annotated[list[int], typer.Option(help="Prediction horizon in samples; may be repeated.")] = [10],  # noqa: B006
+    horizon: Annotated[
+        list[int],
+        typer.Option(callback=within(integer(1, MOST_TICKS)), help="Prediction horizon in samples; may be repeated."),
+    ] = [10],  # noqa: B006
     channel: Annotated[
         list[str], typer.Option(help="Channel to forecast; may be repeated. Default: the velocities.")
     ] = [],  # noqa: B006
     observer_gain: Annotated[
         float | None,
-        typer.Option(help="Gain of the observer, 0 to 1; default: the gain with the least error on the logs."),
+        typer.Option(
+            callback=within(span(0.0, 1.0)),
+            help="Gain of the observer, 0 to 1; default: the gain with the least error on the logs.",
+        ),
     ] = None,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006

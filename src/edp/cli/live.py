@@ -10,9 +10,9 @@ import typer
 
 from edp.cli.consent import ask_for_fmus
 from edp.cli.console import JsonFlag, emit, err, out
-from edp.cli.options import MapOption
+from edp.cli.options import MapOption, within
 from edp.errors import ConfigError
-from edp.settings.bounds import MAX_SEED
+from edp.settings.bounds import MAX_SEED, span
 from edp.storage.paths import full_path
 
 if TYPE_CHECKING:
@@ -66,7 +66,12 @@ def live(
         str | None, typer.Option("--udp-bind", help="Address that --udp listens on; default: 127.0.0.1.")
     ] = None,
     free_s: Annotated[
-        float | None, typer.Option("--rollout-seconds", help="Length of a twin's simulations in seconds; default: 60.")
+        float | None,
+        typer.Option(
+            "--rollout-seconds",
+            callback=within(span(0.1, 86_400.0)),
+            help="Length of a twin's simulations in seconds; default: 60.",
+        ),
     ] = None,
     signal_map: MapOption = None,
     as_json: JsonFlag = False,

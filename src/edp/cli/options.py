@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.errors import ConfigError
-from edp.settings.bounds import Bound, shown
+from edp.settings.bounds import MAX_SHOWN, Bound, shown
 from edp.settings.earlier_keys import KEYS
 
 if TYPE_CHECKING:
@@ -178,14 +178,14 @@ def parse_seconds(text: str) -> float:
     """Return a length of time with a unit, such as ``90s``, ``3min`` or ``2h``, in seconds.
 
     Raises:
-        ConfigError: the text is not a number with one of these units.
+        BadParameter: the text is not a number with one of these units.
     """
-    found = _TIME.fullmatch(str(text))
+    match = _TIME.fullmatch(str(text))
     try:
-        return float(found[1]) * _UNITS[found[2]] if found else float(text if isinstance(text, float) else "")
+        return float(match[1]) * _UNITS[match[2]] if match else float(text if isinstance(text, float) else "")
     except ValueError:
-        raise ConfigError(
-            f"time '{text}': expected a number with a unit (ms, s, min or h); write for example 90s, 3min or 2h"
+        raise typer.BadParameter(
+            f"got '{text[:MAX_SHOWN]}', expected a number with a unit (ms, s, min or h), such as 90s, 3min or 2h"
         ) from None
 
 

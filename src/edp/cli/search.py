@@ -11,15 +11,17 @@ import typer
 
 from edp.cli.console import JsonFlag, duration, emit, out, table
 from edp.cli.groups import RUN, RunByDefault
-from edp.cli.options import LogsArgument, MapOption, RepairOption, check_effects, source_of
+from edp.cli.options import MAX_SECONDS, LogsArgument, MapOption, RepairOption, check_effects, source_of, within
 from edp.cli.progress import show_progress
 from edp.errors import count_of
+from edp.settings.bounds import above
 from edp.wording import number
 
 if TYPE_CHECKING:
     from edp.workflows.search.runner import SearchResult
     from edp.workflows.search.study_log import StudyStatus
 
+MAX_MEMORY_MB = 1e9
 StudyArgument = Annotated[Path, typer.Argument(help="Folder of a study, as in edp search --out.")]
 
 
@@ -62,9 +64,17 @@ def run(
     ] = False,
     threads: Annotated[int, typer.Option(help="CPU threads per training (results depend on it).")] = 1,
     seconds: Annotated[
-        float | None, typer.Option("--max-seconds", help="Time limit of a training, in seconds.")
+        float | None,
+        typer.Option(
+            "--max-seconds", callback=within(above(0.0, MAX_SECONDS)), help="Time limit of a training, in seconds."
+        ),
     ] = None,
-    memory: Annotated[float | None, typer.Option("--max-memory", help="Memory limit of a training, in MB.")] = None,
+    memory: Annotated[
+        float | None,
+        typer.Option(
+            "--max-memory", callback=within(above(0.0, MAX_MEMORY_MB)), help="Memory limit of a training, in MB."
+        ),
+    ] = None,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     as_json: JsonFlag = False,

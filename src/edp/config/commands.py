@@ -54,8 +54,8 @@ def command_settings(
             raise ConfigError(f"settings {where}: unknown key {shown(key)}{hint}")
     table: dict[str, object] = {}
     for layer in layers:
-        given = layer.get(command)
-        present = tree.renamed(spec, given, command) if isinstance(given, Mapping) else given
+        entries = layer.get(command)
+        present = tree.renamed(spec, entries, command) if isinstance(entries, Mapping) else entries
         table = merged(table, {command: present} if command in layer else {})
     rest = tuple({key: value for key, value in layer.items() if key != command} for layer in layers)
     return tree.build(spec, table.get(command, {}), where, command), tuple(layer for layer in rest if layer)

@@ -48,7 +48,7 @@ class FrontEnd(Streaming):
     Maps inputs ``(batch, time, input)`` in SI units to physical features ``(batch, time, feature)``; `scale` gives
     the standardised ones. State: the previous tick's inputs, whether there was one, and what the derived channels'
     means need; at the first tick after a reset every change is 0. Inputs of the physics base follow those of the
-    features and are passed over. Channels of the start have their mean from `starting_ticks` on, whatever is fed; the
+    features and are passed over. Channels of the start have their mean from `init_samples` on, whatever is fed; the
     state then counts the ticks.
     """
 

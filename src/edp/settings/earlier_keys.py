@@ -8,9 +8,10 @@ from __future__ import annotations
 import sys
 import typing
 from collections.abc import Mapping
-from typing import Any
 
 from edp.errors import ConfigError
+
+T = typing.TypeVar("T")
 
 _SPLIT = {
     "validation_share": "validation_fraction",
@@ -23,6 +24,7 @@ _SPLIT = {
 _FEATURES = {"starting": "init_channels", "starting_ticks": "init_samples"}
 _GREY = {"stretches": "curve_segments", "without": "omit"}
 KEYS: Mapping[str, Mapping[str, str]] = {
+    "AutoSettings": {"judge": "evaluation"},
     "Experiment": {"judge": "evaluation"},
     "TwinExperiment": {"judge": "evaluation"},
     "JudgeSpec": {"skip": "warmup_samples"},
@@ -121,7 +123,7 @@ _used: dict[str, str] = {}
 """Keys of earlier versions in settings that this process was given, with the present keys."""
 
 
-def present_keys(cls: type, table: Mapping[str, Any], path: str = "") -> dict[str, Any]:
+def present_keys(cls: type, table: Mapping[str, T], path: str = "") -> dict[str, T]:
     """Return a table of settings with the keys and values of this version.
 
     Args:
@@ -132,22 +134,22 @@ def present_keys(cls: type, table: Mapping[str, Any], path: str = "") -> dict[st
     Raises:
         ConfigError: a key is given by its earlier and by its present name.
     """
-    present: dict[str, Any] = {}
+    present: dict[str, T] = {}
     for key, value in table.items():
         name = earlier(cls).get(key, key) if isinstance(key, str) else key
         if name != key and name in table:
             raise ConfigError(f"'{join(path, key)}' is now '{join(path, name)}', and both are given; give the second")
         changed = next((VALUES[base.__name__, name] for base in cls.__mro__ if (base.__name__, name) in VALUES), {})
-        present[name] = changed.get(value, value) if isinstance(value, str) else value
+        present[name] = typing.cast(T, changed.get(value, value)) if isinstance(value, str) else value
     return present
 
 
 def earlier(cls: type) -> Mapping[str, str]:
     """Return the keys of earlier versions of a settings class, with the present keys."""
-    found: dict[str, str] = {}
+    renames: dict[str, str] = {}
     for base in reversed(cls.__mro__):
-        found |= KEYS.get(base.__name__, {})
-    return found
+        renames |= KEYS.get(base.__name__, {})
+    return renames
 
 
 def join(path: str, key: str) -> str:
@@ -165,14 +167,14 @@ def used_earlier_keys() -> Mapping[str, str]:
     return dict(_used)
 
 
-def common_renames(classes: typing.Iterable[type], known: typing.Collection[str]) -> Mapping[str, str]:
+def common_renames(classes: typing.Iterable[type], present: typing.Collection[str]) -> Mapping[str, str]:
     """Return the renames of several classes one of which a table belongs to; a key that one of them has stays.
 
     Args:
         classes: classes that the table may describe.
-        known: keys of all these classes.
+        present: keys of all these classes.
     """
     renames: dict[str, str] = {}
     for cls in classes:
-        renames |= {old: new for old, new in earlier(cls).items() if old not in known}
+        renames |= {old: new for old, new in earlier(cls).items() if old not in present}
     return renames

@@ -241,8 +241,8 @@ class SettingsTree:
         return self._renamed([cls], table, path)
 
     def _renamed(self, classes: Sequence[type], table: Mapping[str, object], path: str) -> dict[str, object]:
-        known = [_settings_of(cls) for cls in classes]
-        renames = common_renames(classes, {key for keys in known for key in keys})
+        fields_by_class = [_settings_of(cls) for cls in classes]
+        renames = common_renames(classes, {key for keys in fields_by_class for key in keys})
         result: dict[str, object] = {}
         for key, value in table.items():
             name = renames.get(key, key)
@@ -251,7 +251,7 @@ class SettingsTree:
                 if name in table:
                     raise ConfigError(f"'{_join(path, key)}' is now '{where}', and both are given; give the second")
                 note_earlier(_join(path, key), where)
-            hints = [keys[name].hint for keys in known if name in keys]
+            hints = [keys[name].hint for keys in fields_by_class if name in keys]
             result[name] = self._renamed_value(str(name), hints, value, where)
         return result
 

@@ -10,7 +10,7 @@ from edp.cli.evaluate import baseline_names
 from edp.evaluation.baselines import BASELINES
 from edp.storage import write_json
 
-SETTINGS = ("--set", "task.targets=['CylVels_1']", "--set", "task.horizons=[5]", "--minutes", "0.01")
+SETTINGS = ("--set", "task.targets=['CylVels_1']", "--set", "task.horizons=[5]", "--time-budget", "0.01min")
 
 
 def test_train_says_what_it_chose_and_why(edp, logs, tmp_path):
@@ -39,9 +39,9 @@ def test_settings_of_a_network_take_the_preset_standard(edp, logs, tmp_path, sma
 
 
 def test_minutes_are_of_the_preset_auto_alone(edp, logs, tmp_path):
-    ended = edp("train", logs, "--out", tmp_path / "run", "--preset", "quick", "--minutes", "3")
+    ended = edp("train", logs, "--out", tmp_path / "run", "--preset", "quick", "--time-budget", "3min")
     assert ended.code == 1
-    assert "--minutes: it has no effect without the preset auto" in ended.err
+    assert "--time-budget: it has no effect without the preset auto" in ended.err
     assert not (tmp_path / "run").exists()
 
 
@@ -76,7 +76,7 @@ def log(folder, ticks, u=None, y=None):
     rows = "".join(f"{tick / 50:.3f},{a:.6f},{b:.6f}\n" for tick, (a, b) in enumerate(zip(u, y, strict=True)))
     (folder / "log.csv").write_text("time,u,y\n" + rows)
     (folder / "map.toml").write_text('time = "time"\n[channels.u]\ncolumn = "u"\n[channels.y]\ncolumn = "y"\n')
-    return folder / "log.csv", "--map", folder / "map.toml", "--minutes", "0.001", "--set", "task.targets=['y']"
+    return folder / "log.csv", "--map", folder / "map.toml", "--time-budget", "0.001min", "--set", "task.targets=['y']"
 
 
 BLIND = ("task.features={name='lever', channels=['u']}", "task.mode='absolute'")

@@ -11,16 +11,16 @@ from .test_cli_options import leaves
 
 COMMANDS = dict(leaves(get_command(app)))
 CLAIMING = {
-    "train": (".lock", "is in use by process"),
-    "distil": (".lock", "is in use by process"),
-    "compress": (".lock", "is in use by process"),
-    "quantise": (".lock", "is in use by process"),
-    "adapt": (".lock", "is in use by process"),
-    "finetune": (".lock", "is in use by process"),
-    "pretrain": (".lock", "is in use by process"),
+    "train run": (".lock", "is in use by process"),
+    "compress distil": (".lock", "is in use by process"),
+    "compress search": (".lock", "is in use by process"),
+    "compress quantise": (".lock", "is in use by process"),
+    "adapt run": (".lock", "is in use by process"),
+    "train finetune": (".lock", "is in use by process"),
+    "train pretrain": (".lock", "is in use by process"),
     "twin": (".lock", "is in use by process"),
-    "control": (".lock", "is in use by process"),
-    "tune": (".lock", "is in use by process"),
+    "loop run": (".lock", "is in use by process"),
+    "loop tune": (".lock", "is in use by process"),
     "monitor fit": (".lock", "is in use by process"),
     "search run": ("ledger/.lock", "is coordinated by process"),
 }
@@ -32,25 +32,25 @@ NOT_CLAIMING = {
     "search export": "writes one journal at its end",
     "monitor report": "writes one page at its end",
     "monitor run": "writes its few files at its end, each replaced as a whole",
-    "animate": "writes one page or film at its end",
+    "data animate": "writes one page or film at its end",
     "rollout": "writes one table at its end",
-    "identify": "writes one machine file, which must not exist before",
+    "calibrate": "writes one machine file, which must not exist before",
     "init": "writes two files in a moment",
     "export": "replaces the folder of an export as a whole at its end",
-    "forecast": "writes a new folder, refused where it exists",
-    "screen": "writes pages and figures at its end, and keeps no state to go on from",
+    "data add-forecasts": "writes a new folder, refused where it exists",
+    "data screen": "writes pages and figures at its end, and keeps no state to go on from",
     "fleet report": "writes pages at its end",
     "fleet network": "writes a bundle as a whole at its end",
-    "store build": "is a store with a lock of its own, not a run",
+    "data store build": "is a store with a lock of its own, not a run",
     "demo": "makes its data first; its run is that of edp train, which claims",
 }
 """Commands with ``--out`` that hold no run folder, each with the reason."""
-ARGUMENTS = {"monitor fit": ("logs",), "finetune": ("source", "logs"), "control": (), "tune": ()}
-DATA = {"train", "twin", "pretrain", "search run"}
+ARGUMENTS = {"monitor fit": ("logs",), "train finetune": ("source", "logs"), "loop run": (), "loop tune": ()}
+DATA = {"train run", "twin", "train pretrain", "search run"}
 """Commands whose first argument is logs."""
-FURTHER = {"distil": ("--units", 4)}
+FURTHER = {"compress distil": ("--units", 4)}
 """Options without which a command is refused at once."""
-FOLDER = {"control": (), "tune": (), "search run": ("--study",)}
+FOLDER = {"loop run": (), "loop tune": (), "search run": ("--out",)}
 """How the folder is given, where it is not ``--out``."""
 
 

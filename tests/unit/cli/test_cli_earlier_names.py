@@ -63,5 +63,5 @@ def test_present_names_print_no_notice(edp, logs):
 
 def test_a_time_without_a_unit_is_refused(edp, tmp_path):
     ended = edp("simulate", tmp_path / "x", "--duration", "5")
-    assert ended.code == 1
-    assert "time '5': expected a number with a unit" in ended.err
+    assert ended.code == 2
+    assert "'--duration': got '5', expected a number with a unit" in ended.err

@@ -114,13 +114,13 @@ def tuned(*ratios):
 VERDICTS = {
     "evaluate": lambda *ratios: network_verdict(scores(*ratios)),
     "twin": lambda *ratios: twin_verdict(free_runs(ratios, "twin")),
-    "identify": lambda *ratios: machine_verdict(free_runs(ratios, MACHINE)),
-    "finetune": lambda *ratios: transfer_verdict(Methods(ratios)),
-    "adapt": lambda *ratios: adaptation_verdict(adapted(*ratios)),
-    "replay": lambda *ratios: adaptation_verdict(adapted(*ratios)),
-    "tune": lambda *ratios: tuning_verdict(tuned(*ratios)),
+    "calibrate": lambda *ratios: machine_verdict(free_runs(ratios, MACHINE)),
+    "train finetune": lambda *ratios: transfer_verdict(Methods(ratios)),
+    "adapt run": lambda *ratios: adaptation_verdict(adapted(*ratios)),
+    "adapt replay": lambda *ratios: adaptation_verdict(adapted(*ratios)),
+    "loop tune": lambda *ratios: tuning_verdict(tuned(*ratios)),
 }
-UNITS = dict.fromkeys(JUDGING, "recordings") | {"tune": "references"}
+UNITS = dict.fromkeys(JUDGING, "recordings") | {"loop tune": "references"}
 """What the interval of each command is over."""
 CASES = {
     ErrorOutcome.WORSE: (0.5, 0.6, 0.7, 0.55),
@@ -273,7 +273,7 @@ def test_a_command_whose_help_or_module_compares_with_a_reference_is_one_that_ju
         file.stem
         for file in COMMANDS.glob("*.py")
         if re.search(r"_verdict\b|beaten_by\(", file.read_text(encoding="utf-8")) and file.name != "verdicts.py"
-    } - {"inspect", "quality"}
+    } - {"data check", "quality"}
     assert users == FILES
 
 

@@ -70,7 +70,7 @@ def test_a_machine_file_is_written_that_simulates_and_says_what_is_told(edp, log
     own = facts["models"]["machine M22"]
     assert own["velocity_mae"]["mean"] < 1.0
     assert own["stroke_error"][-1]["mean"] < 1.0
-    assert edp("simulate", tmp_path / "data", "--machine", file, "--minutes", 0.05, "--recordings", 1).code == 0
+    assert edp("simulate", tmp_path / "data", "--machine", file, "--duration", "0.05min", "--recordings", 1).code == 0
 
 
 def test_a_run_of_a_grey_box_is_taken_and_one_of_another_kind_refused(edp, logs, tmp_path, monkeypatch):

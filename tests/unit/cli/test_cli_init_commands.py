@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 COMMANDS = {
-    "inspect": (),
+    "data check": (),
     "train": ("--preset", "quick", "--set", "training.epochs=1", "--set", "training.updates=3"),
     "evaluate": ("--baselines", "none"),
     "report": (),
-    "twin": ("--set", "twin.kind=arx", "--set", "judge={seconds=4,starts=2,at_s=[1,4]}"),
+    "twin": ("--set", "twin.kind=arx", "--set", "evaluation={duration_s=4,starts=2,at_s=[1,4]}"),
 }
 """What shortens a command that `edp init` prints; every printed command has an entry."""
 SEARCH = (
@@ -61,7 +61,7 @@ def test_every_command_that_init_prints_and_a_search_run_on_its_files(edp, tmp_p
     assert len(commands) == len(COMMANDS)
     for command in commands:
         words = shlex.split(command)[1:]
-        ended = edp(*words, *COMMANDS[words[0]])
+        ended = edp(*words, *COMMANDS[" ".join(words[:2]) if words[0] == "data" else words[0]])
         assert ended.code in (0, 6), ended.err
     files = ("--map", tmp_path / "out/map.toml", "--config", tmp_path / "out/settings.toml")
     found = edp("search", data, *files, "--study", tmp_path / "study", *SEARCH, "--json")

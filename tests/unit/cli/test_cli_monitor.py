@@ -57,7 +57,7 @@ def fitted(healthy, tmp_path_factory):
 
 def test_fit_says_what_is_watched_and_promised_and_two_workers_give_the_same_monitor(edp, healthy, fitted, tmp_path):
     folder = tmp_path / "monitor"
-    options = ("--hours-per-false-alarm", 0.06, "--minutes", 0.05, "--workers", 2, "--json")
+    options = ("--hours-per-false-alarm", 0.06, "--time-budget", "0.05min", "--workers", 2, "--json")
     ended = edp("monitor", "fit", healthy, "--out", folder, *options)
     assert ended.code == 0, ended.err
     facts = ended.json
@@ -83,7 +83,7 @@ def test_fit_says_what_is_watched_and_promised_and_two_workers_give_the_same_mon
         (("--machine", "M99"), "unknown machine 'M99'; known: C14, M22"),
         (("--set", 'dictionary.kinds=["leak"]'), "leak"),
         (("--hours-per-false-alarm", -1), "hours_per_false_alarm = -1"),
-        (("--minutes", -1), "minutes = -1"),
+        (("--time-budget", "min" - 1), "minutes = -1"),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_is_trained(edp, healthy, tmp_path, options, told):
@@ -169,7 +169,9 @@ def test_logs_in_two_folders_are_read_together(edp, healthy, tmp_path):
         half.mkdir()
         for path in chosen:
             shutil.copy(path, half)
-    ended = edp("monitor", "fit", *halves, "--out", tmp_path / "m", "--hours-per-false-alarm", 0.06, "--minutes", 0.05)
+    ended = edp(
+        "monitor", "fit", *halves, "--out", tmp_path / "m", "--hours-per-false-alarm", 0.06, "--time-budget", "0.05min"
+    )
     assert ended.code == 0, ended.err
     together = load_monitor(tmp_path / "m")
     assert together.provenance["sessions"] == len(paths)

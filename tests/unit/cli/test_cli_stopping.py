@@ -48,7 +48,7 @@ def test_stopped_and_killed_training_ends_with_the_same_bits(edp, logs, tmp_path
 
 def test_stopped_simulation_keeps_whole_logs_and_goes_on(edp, tmp_path, start, stop_once):
     data = tmp_path / "data"
-    command = ("simulate", data, "--minutes", 24, "--recordings", 12, "--workers", 1)
+    command = ("simulate", data, "--duration", "24min", "--recordings", 12, "--workers", 1)
 
     def some():
         return any(data.glob("*.parquet"))

@@ -133,11 +133,13 @@ def test_without_a_formulation_the_best_of_several_is_chosen_and_told(edp, logs,
 
 
 def test_a_budget_is_that_of_a_choice(edp, logs, tmp_path):
-    assert "--minutes: it has no effect without a choice among formulations" in " ".join(
-        edp("twin", logs, "--out", tmp_path / "run", *WORDS, "--minutes", 1).err.split()
+    assert "--time-budget: it has no effect without a choice among formulations" in " ".join(
+        edp("twin", logs, "--out", tmp_path / "run", *WORDS, "--time-budget", "1min").err.split()
     )
-    assert "--minutes: got -1" in " ".join(edp("twin", logs, "--out", tmp_path / "run", "--minutes", -1).err.split())
-    words = ["--set", "twin.candidates=['static','recurrent']", *WORDS[4:], "--minutes", 1e-4]
+    assert "--time-budget: got -1" in " ".join(
+        edp("twin", logs, "--out", tmp_path / "run", "--time-budget", "-1min").err.split()
+    )
+    words = ["--set", "twin.candidates=['static','recurrent']", *WORDS[4:], "--time-budget", "6ms"]
     ended = edp("twin", logs, "--out", tmp_path / "run", *words, "--json").json
     assert [row["label"] for row in ended["candidates"] if row["chosen"]] == ["static"]
     assert "counted time" in ended["candidates"][1]["why"]
@@ -214,7 +216,7 @@ def test_a_floor_that_does_not_suit_the_logs_is_left_out(edp, logs, tmp_path, mo
 
 def test_a_rollout_writes_measured_and_free_values_row_by_row(edp, logs, trained, tmp_path):
     log, file = logs / "log_1.parquet", tmp_path / "free.parquet"
-    ended = edp("rollout", trained, log, "--seconds", 3, "--from", 2, "--out", file, "--json")
+    ended = edp("rollout", trained, log, "--rollout-seconds", 3, "--from", 2, "--out", file, "--json")
     assert ended.code == 0
     assert ended.json["start_s"] == 2.0
     assert [row["at_s"] for row in ended.json["stroke_error"]] == [1.0, 3.0]
@@ -275,7 +277,7 @@ def test_a_twin_is_judged_anew_and_on_other_recordings_beside_a_predictor(edp, l
 
 
 def test_a_rollout_prints_the_error_of_each_channel_by_time(edp, logs, trained):
-    shown = edp("rollout", trained, logs / "log_1.parquet", "--seconds", 3).out
+    shown = edp("rollout", trained, logs / "log_1.parquet", "--rollout-seconds", 3).out
     lines = shown.splitlines()
     assert "error after, mm" in lines[0]
     assert lines[1].split() == ["stroke_1", "stroke_2"]
@@ -286,7 +288,7 @@ def test_a_rollout_prints_the_error_of_each_channel_by_time(edp, logs, trained):
 
 def test_plots_of_a_rollout(edp, logs, trained, tmp_path):
     folder = tmp_path / "plots"
-    words = ["rollout", trained, logs / "log_1.parquet", "--seconds", 3, "--from", 2, "--plots", folder]
+    words = ["rollout", trained, logs / "log_1.parquet", "--rollout-seconds", 3, "--from", 2, "--plots", folder]
     assert f"plots in {folder}" in edp(*words).out.replace("\n", "")
     stems = ("velocities", "strokes", "pressures")
     assert sorted(path.name for path in folder.iterdir()) == sorted(f"{s}.{e}" for s in stems for e in ("svg", "png"))
@@ -313,7 +315,7 @@ def test_the_page_of_a_twin_and_that_of_one_run(edp, logs, trained, tmp_path):
         assert f'id="figure-runs_{part}"' in page
     assert 'id="figure-horizon"' in page
     assert "told the commands in between" in page
-    words = ["rollout", trained, logs / "log_1.parquet", "--seconds", 3, "--from", 2, "--page", file]
+    words = ["rollout", trained, logs / "log_1.parquet", "--rollout-seconds", 3, "--from", 2, "--page", file]
     assert f"page: {file}" in edp(*words).out.replace("\n", "")
     assert "actuators_1 from 2 s" in file.read_text()
     assert "--limit" in edp("report", trained, "--limit", file).err
@@ -325,7 +327,7 @@ def test_the_page_of_a_twin_and_that_of_one_run(edp, logs, trained, tmp_path):
 def test_channels_that_stay_measured(edp, logs, trained, tmp_path):
     log = logs / "log_1.parquet"
     free, mixed = (
-        edp("rollout", trained, log, "--seconds", 3, *words, "--json").json["velocity_mae"]["mean"]
+        edp("rollout", trained, log, "--rollout-seconds", 3, *words, "--json").json["velocity_mae"]["mean"]
         for words in ([], ["--measured", "speed_1", "--measured", "speed_2"])
     )
     assert mixed < 0.5 * free
@@ -339,11 +341,11 @@ def test_channels_that_stay_measured(edp, logs, trained, tmp_path):
             r"has 5 measured ticks before it; the twin needs a prefix of 20 \(0\.4 s\): begin at --from",
         ),
         (
-            ["--from", 11, "--seconds", 5],
+            ["--from", 11, "--rollout-seconds", 5],
             "goes beyond the end of 'actuators_1' at 12 s; at most --seconds 0.98 from there",
         ),
         (["--from", 50], "goes beyond the end.*begin earlier"),
-        (["--seconds", -1], "--seconds: got -1.0, expected 0 < seconds"),
+        (["--rollout-seconds", -1], "--rollout-seconds: got -1.0, expected 0 < rollout_seconds"),
         (["--measured", "speed_3"], "the twin does not answer this channel; did you mean 'speed_2'"),
     ],
 )
@@ -390,7 +392,7 @@ def test_a_log_of_positions_alone_of_two_kinds_has_a_table_an_actuator(edp, tmp_
     assert judged.code == 6
     assert "less error than the twin" in judged.out
     assert f"{names[0]}_velocity: its MAE" in judged.out
-    assert edp("rollout", run, log, "--seconds", 2).code == 0
+    assert edp("rollout", run, log, "--rollout-seconds", 2).code == 0
 
 
 def test_a_twin_goes_on_with_other_logs_and_shows_what_was_tried(edp, logs, trained, tmp_path):

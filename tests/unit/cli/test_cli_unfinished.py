@@ -11,17 +11,17 @@ from edp.storage.runs import Run
 ARGUMENTS = {
     "evaluate": ("{run}",),
     "rollout": ("{run}", "{log}"),
-    "forecast": ("{run}", "{log}", "--out", "{out}"),
+    "data add-forecasts": ("{run}", "{log}", "--out", "{out}"),
     "live": ("{run}", "--log", "{log}"),
-    "distil": ("{run}", "--units", "4", "--out", "{out}"),
-    "compress": ("{run}", "--out", "{out}"),
-    "finetune": ("{run}", "{log}", "--out", "{out}"),
-    "adapt": ("{run}", "--out", "{out}"),
-    "replay": ("{run}", "{log}"),
-    "footprint": ("{run}",),
-    "export": ("{run}", "--to", "c", "--out", "{out}"),
-    "parity": ("{run}",),
-    "quantise": ("{run}", "--out", "{out}"),
+    "compress distil": ("{run}", "--units", "4", "--out", "{out}"),
+    "compress search": ("{run}", "--out", "{out}"),
+    "train finetune": ("{run}", "{log}", "--out", "{out}"),
+    "adapt run": ("{run}", "--out", "{out}"),
+    "adapt replay": ("{run}", "{log}"),
+    "compress estimate": ("{run}",),
+    "export": ("{run}", "--format", "c", "--out", "{out}"),
+    "verify": ("{run}",),
+    "compress quantise": ("{run}", "--out", "{out}"),
     "report": ("{run}",),
     "compare": ("{run}", "{other}"),
     "fleet report": ("{run}", "{log}", "--out", "{out}"),
@@ -29,7 +29,7 @@ ARGUMENTS = {
     "monitor fit": ("{run}", "{log}", "--out", "{out}"),
 }
 """How each command that opens a run is called; the help of its arguments says which commands these are."""
-WRITES = {"control", "tune"}
+WRITES = {"loop run", "loop tune"}
 """Commands whose run folder is the one that they write."""
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from edp.config.experiment import (
     AUTO,
+    SETTINGS,
     Experiment,
     TaskSettings,
     build,
@@ -65,11 +66,11 @@ class AutoSettings:
     task: TaskSettings = field(default_factory=TaskSettings)
     split: SplitSpec = field(default_factory=ByRecording)
     auto: Portfolio = field(default_factory=Portfolio)
-    judge: JudgeSpec = field(default_factory=JudgeSpec)
+    evaluation: JudgeSpec = field(default_factory=JudgeSpec)
 
     def experiment(self, model: ModelSpec, training: TrainingSpec) -> Experiment:
         """Return the experiment of a candidate."""
-        return Experiment(task=self.task, split=self.split, model=model, training=training, evaluation=self.judge)
+        return Experiment(task=self.task, split=self.split, model=model, training=training, evaluation=self.evaluation)
 
 
 def usual_preset(path: str | Path | None = None, overrides: Sequence[str] = ()) -> str:
@@ -94,7 +95,7 @@ def load_auto(path: str | Path | None = None, overrides: Sequence[str] = ()) -> 
     if path is not None:
         where = f"'{path}' with preset 'auto'"
     for layer in read_layers(path, overrides):
-        table = merged(table, layer)
+        table = merged(table, SETTINGS.renamed(AutoSettings, layer))
     return auto_settings(table, where)
 
 
