@@ -95,8 +95,8 @@ def check_unit(stated: str | None, where: str) -> str | None:
     near = _closest_units(unit)
     hint = f"did you mean {' or '.join(repr(name) for name in near)}?" if near else f"known: {', '.join(UNITS)}"
     raise DataError(
-        f"{where}: unknown unit {shown(unit)}; {hint} (docs/reference/channels.md lists all); correct it, or leave it out to "
-        "take the numbers unconverted"
+        f"{where}: unknown unit {shown(unit)}; {hint} (docs/reference/channels.md lists all); correct it, or leave "
+        "it out to take the numbers unconverted"
     )
 
 
