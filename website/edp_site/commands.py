@@ -15,7 +15,6 @@ from edp.cli import PANELS, app
 from edp.cli.exit_codes import EXIT_CODES
 from edp.cli.groups import RUN, RunByDefault
 from edp_site import markdown
-from edp_site.pending import as_today
 
 _SHELLS = ("", "sh", "bash", "console", "shell")
 ENDS = re.compile(r"\s(?:\||&&|;|>|2>)\s?")
@@ -57,10 +56,10 @@ def command_lines(text: str) -> Iterator[tuple[int, str]]:
             for offset, line in enumerate(joined.splitlines()):
                 start = re.match(r"\s*(?:\$ )?(?:\.venv/bin/)?(edp\s.*)", line)
                 if start:
-                    yield fence.line + offset, as_today(start[1])
+                    yield fence.line + offset, start[1]
     for number, code in markdown.code_spans(text):
         if code.startswith("edp "):
-            yield number, as_today(code)
+            yield number, code
 
 
 def problems_of(line: str, known: dict[tuple[str, ...], Command]) -> list[str]:
@@ -71,7 +70,7 @@ def problems_of(line: str, known: dict[tuple[str, ...], Command]) -> list[str]:
         known: of `commands`.
     """
     try:
-        words = shlex.split(ENDS.split(f"{as_today(line)} ")[0], comments=True)[1:]
+        words = shlex.split(ENDS.split(f"{line} ")[0], comments=True)[1:]
     except ValueError as error:
         return [f"'{line}' cannot be read: {error}"]
     named: tuple[str, ...] = ()

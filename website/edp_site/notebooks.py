@@ -21,8 +21,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from edp_site.pending import as_today, code_as_today
-
 Notebook = dict[str, Any]
 _NOTEBOOK_LINK = re.compile(r"(\]\([\w/.-]+)\.ipynb([#)])")
 PICTURE_DPI = 72
@@ -91,13 +89,18 @@ def run_line(line: str) -> str:
     Raises:
         RuntimeError: the command failed.
     """
-    today = as_today(line)
-    called = re.sub(r"^edp ", f"{sys.executable} -m edp ", today)
+    called = re.sub(r"^edp ", f"{sys.executable} -m edp ", line)
     place = os.pathsep.join(part for part in sys.path if part)
     environment = {**os.environ, "PYTHONPATH": place, "COLUMNS": "100", "TERM": "dumb"}
     done = subprocess.run(called, shell=True, env=environment, capture_output=True, text=True, check=False)
-    allowed = {"edp evaluate": (0, 6), "edp twin": (0, 6), "edp monitor run": (0, 5), "edp inspect": (0, 3)}
-    if done.returncode not in next((codes for words, codes in allowed.items() if today.startswith(words)), (0,)):
+    allowed = {
+        "edp evaluate": (0, 6),
+        "edp train": (0, 6),
+        "edp twin": (0, 6),
+        "edp monitor run": (0, 5),
+        "edp data check": (0, 3),
+    }
+    if done.returncode not in next((codes for words, codes in allowed.items() if line.startswith(words)), (0,)):
         raise RuntimeError(f"{line}: exit code {done.returncode}\n{(done.stdout + done.stderr)[-3000:]}")
     return done.stdout.replace(f"{Path.cwd()}/", "").replace(str(Path.cwd()), ".")
 
@@ -108,7 +111,7 @@ def _run_cell(source: str, space: dict[str, Any]) -> list[dict[str, Any]]:
     import matplotlib
 
     matplotlib.use("agg")
-    tree = ast.parse(code_as_today(source))
+    tree = ast.parse(source)
     # As a notebook does: the value of an expression at the end of a cell is shown.
     last = (
         tree.body.pop()
