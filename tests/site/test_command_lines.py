@@ -156,7 +156,8 @@ def test_every_command_line_of_a_block_is_parsed_by_the_command_line(page):
         named: tuple[str, ...] = ()
         while words and (*named, words[0]) in commands.commands():
             named = (*named, words.pop(0))
-        named = ("search", "run") if named == ("search",) and words else named
+        if words and (*named, "run") in commands.commands():
+            named = (*named, "run")
         parsed = commands.commands()[named].parsed
         if hasattr(parsed, "commands"):
             assert not words or words[0].startswith("-"), text
