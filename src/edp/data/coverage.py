@@ -27,15 +27,15 @@ from edp.wording import typed
 
 Array = NDArray[np.float64]
 CELLS = 6
-"""Cells of each stroke in the occupancy."""
+"""Number of cells per stroke in the occupancy."""
 BINS = 24
-"""Bins of each side of a joint histogram."""
+"""Number of bins per axis of a joint histogram."""
 TAIL = 5e-4
 """Fraction of the samples at either end that a joint histogram omits."""
 QUANTILES = 32
-"""Bins of equal content for the mutual information."""
+"""Number of bins with equal content for the mutual information."""
 INFORMED = 200_000
-"""Samples for the mutual information, evenly spread."""
+"""Maximum number of samples for the mutual information, evenly spaced."""
 MEASURED, INTEGRATED = "strokes", "integrated velocity"
 
 

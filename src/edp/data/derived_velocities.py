@@ -14,9 +14,9 @@ from edp.recording import Recording
 from edp.signals import Channel, Kind
 
 SUFFIX = "_velocity"
-"""Suffix for the name of a position to name its change per second."""
+"""Suffix added to the name of a position signal to name its rate of change."""
 RATE_OF = {integral: velocity for velocity, integral in INTEGRAL.items()}
-"""Kind of the change per second of a position, by its kind."""
+"""Kind of a rate of change, by the kind of the position signal."""
 
 
 def complete_velocities(

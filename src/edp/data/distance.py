@@ -14,11 +14,13 @@ from edp.recording import Recording
 
 Array = NDArray[np.float64]
 REFERENCES, QUERIES = 20_000, 4_000
-"""Samples searched in and searched for: distances shrink with the references, so both sides get equally many."""
+"""Maximum number of reference samples and of query samples. Distances decrease with the number of references, so both
+data sets use equally many."""
 MAX_STATES = 1 << 20
-"""Maximum number of states to draw from. Longer data are thinned evenly first."""
+"""Maximum number of states to select from. Longer data are thinned evenly first."""
 EARLIER_S = 0.2
-"""Commands are looked at now and this long ago: the delay of a hydraulic axis."""
+"""Age of the second command sample in a state, s, about the delay of a hydraulic axis. The first command sample is the
+current one."""
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,11 @@ from edp.data.folds import Folds
 from edp.data.lags import DoubleArray
 
 PENALTIES = tuple(10.0 ** (half / 2) for half in range(-14, 5))
-"""Penalties per row on columns of unit spread, half a decade apart: from almost none to strong."""
+"""Ridge penalties per row on columns with unit standard deviation, half a decade apart, from almost zero to strong."""
 
 MIN_GAIN = 1e-4
-"""A further set of columns or a weaker penalty must lower the squared error by this share; rounding does less."""
+"""Minimum relative reduction of the squared error that justifies additional columns or a weaker penalty. It is above
+rounding errors."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 BLOCK_ROWS = 4_096
-"""Rows taken to double precision at a time: a megabyte of 30 columns, which stays in the processor's cache."""
+"""Number of rows converted to double precision at a time. One megabyte of 30 columns fits the processor's cache."""
 Vector = NDArray[np.float64]
 
 

@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_LISTED = 1 << 24
-"""Things whose order is a list of 8 bytes each, 128 MB; 46 hours of windows at 100 Hz."""
+"""Maximum number of items whose random order is stored as a list (8 bytes each, 128 MB), or 46 hours of windows at 100
+Hz."""
 ROUNDS = 6
-"""Number of rounds of the network. Four make it indistinguishable from random for ideal functions (Luby and Rackoff,
-1988)."""
+"""Number of rounds of the Feistel network. Four rounds make the order indistinguishable from random for ideal functions
+(Luby and Rackoff, 1988)."""
 Numbers = NDArray[np.int64]
 
 

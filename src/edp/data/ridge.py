@@ -20,13 +20,13 @@ PENALTIES = tuple(10.0**power for power in range(-6, 2))
 """Ridge penalties per training row on standardised features, from almost none to strong."""
 
 HISTORIES = (5, 20)
-"""Histories tried beside the task's own."""
+"""History lengths in samples that are tried in addition to the length in the task."""
 
 CROSSED_HISTORIES = (3, 5, 10, 20)
-"""Histories tried by cross-validation beside the task's own."""
+"""History lengths in samples that cross-validation tries in addition to the length in the task."""
 
 BLOCK_ROWS = 16_384
-"""Rows taken to double precision at a time, so that memory does not grow with the recording."""
+"""Number of rows converted to double precision at a time, so that memory does not grow with the recording."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from edp.signals import Channel, Kind
 
 Array = NDArray[np.float64]
 COMMANDS = (Kind.PILOT_PRESSURE, Kind.CURRENT, Kind.VOLTAGE, Kind.RATIO)
-"""Kinds that stand for a command, in the order in which they are looked for."""
+"""Kinds of channels that can be commands, in order of preference."""
 _TABLE_A1 = (
     ("boom", ("BmUp", "BmDwn"), ("BmUpConf", "BmDwnConf")),
     ("arm", ("AmIn", "AmOut"), ("AmInConf", "AmOutConf")),

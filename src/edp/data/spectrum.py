@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 LAGS = 50
-"""Block rows of the Hankel matrix: the window of 50 samples that the thesis's networks read."""
+"""Number of block rows of the Hankel matrix: the window of 50 samples of the thesis's networks."""
 LAG_STEPS = (1, 2, 3, 5, 8, 12, 16, 20, 25, 30, 35, 40, 45, 50)
 FLAT_DB = 10.0
 """Maximum attenuation below the maximum of a spectrum that counts as flat."""

@@ -19,7 +19,7 @@ from edp.settings.bounds import MAX_NAMES, check_count
 from edp.signals import Channel, Kind
 
 INTEGRAL = {Kind.VELOCITY: Kind.POSITION, Kind.ANGULAR_VELOCITY: Kind.ANGLE}
-"""Kind of what a velocity integrates to, by its kind."""
+"""Kind of the integral of a velocity, by the kind of the velocity."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 Array = NDArray[np.float32]
 Indices = NDArray[np.uint16]
 Values = NDArray[Any]
-"""Values of a layer at several ticks of several streams, ``(time, stream, number)``."""
+"""Values of a layer for several samples and streams, ``(time, stream, number)``."""
 Memory = dict[str, Any]
-"""What a layer remembers, by slot: ``(stream, ...)``, rings ``(tick, stream, ...)``; an age is one for all streams."""
+"""Memory of a layer by slot: ``(stream, ...)``, ring buffers ``(tick, stream, ...)``. An age is one number for all
+streams."""
 
 INPUT = "input"
-"""The value that holds the inputs of the tick, SI units, in the order in which they are fed."""
+"""Name of the value that contains the inputs of the current sample, SI units, in input order."""
 
 
 class Number(StrEnum):
@@ -137,8 +138,8 @@ class Layer(ABC):
     without: ClassVar[Mapping[str, str]] = {}
 
     over_time: ClassVar[Callable[..., Any]] = _refuse_equations
-    """The equations: a method ``over_time(run, *inputs)`` from the values of the inputs, ``(time, stream, number)``, to
-    those of the layer; `run` is a `LayerRun`."""
+    """Method ``over_time(run, *inputs)`` that computes the layer's values from its inputs, both ``(time, stream,
+    number)``; `run` is a `LayerRun`."""
 
     name: str
     inputs: tuple[str, ...]

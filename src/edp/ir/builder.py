@@ -30,7 +30,7 @@ def constant(values: Any) -> Array:
 
 
 MAX_INDEX = 2**16 - 1
-"""Largest index of a table: tables of 16 bits take half of the flash of tables of words."""
+"""Maximum index in a table. Tables of 16-bit indices need half the flash memory of 32-bit tables."""
 
 
 def indices(values: Any) -> Indices:

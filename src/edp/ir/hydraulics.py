@@ -11,7 +11,7 @@ import numpy as np
 from edp.ir.base import Array, Indices, Layer, LayerRun, Memory, Slot, Values
 
 NONE = 2**16 - 1
-"""Entry of a table of places: there is no such thing."""
+"""Entry for a missing element in a table of positions."""
 VALVE_STATES = 5
 
 
@@ -145,4 +145,5 @@ class HydraulicTick(Layer):
 
 
 SOLVERS: list[Callable[[HydraulicTick, Mapping[str, Values], Memory, Values, Values], Values]] = []
-"""The solver of one tick (layer, constants, memory, commands, ports), entered by the equations' own room."""
+"""Solvers of one time step by name, called with layer, constants, memory, commands and ports. The module of the
+equations registers its solver here."""

@@ -16,7 +16,7 @@ from edp.ir.layers import Function, flat, split
 
 # Finite on purpose: minus infinity would give NaN where all scores of a row are hidden.
 UNSEEN = -1e30
-"""Score of a tick before the reset: no softmax notices it."""
+"""Attention score of a sample before the reset. The score is so low that the softmax ignores the sample."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

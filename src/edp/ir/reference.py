@@ -9,7 +9,7 @@ from edp.ir.arithmetic import EXACT
 from edp.ir.base import INPUT, Arithmetic, Graph, LayerRun, Memory, Number, Values
 
 RINGS = ("ring", "scores", "keys", "values")
-"""Slots whose first dimension is time."""
+"""Names of the memory slots whose first dimension is time."""
 
 
 class Interpreter:

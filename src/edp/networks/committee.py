@@ -20,7 +20,7 @@ NON_LINEAR: dict[str, tuple[Callable[[Tensor], Tensor], Operation, Function]] = 
     "tanh": (torch.tanh, Operation.TANH, Function.TANH),
     "relu": (torch.relu, Operation.RELU, Function.RELU),
 }
-"""Element-wise functions that members may have."""
+"""Element-wise activation functions of the hidden units, by name."""
 
 
 class Members(Streaming):

@@ -50,7 +50,7 @@ class OutputSpec(Protocol):
 
 OUTPUTS: Registry[type] = Registry("output")
 MAX_PAIRS = 99
-"""Quantiles or intervals: all whole per cent."""
+"""Maximum number of quantiles or intervals: one per whole per cent."""
 
 
 class Output(nn.Module):

@@ -27,13 +27,14 @@ class StreamStatus(IntEnum):
     """Result code of a stream step, with the values of `edp_status` in the exported C."""
 
     OK = 0
-    """A prediction from this tick's inputs."""
+    """Status of a prediction from the inputs of the current sample."""
     WARMING = 1
-    """Status after fewer samples than a whole window since the last reset: less accurate."""
+    """Status after a reset, before a whole window of samples was read. The predictions are less accurate."""
     HELD = 2
-    """Inputs were rejected or missed: a prediction from the last accepted ones."""
+    """Status of a prediction from the last accepted inputs, because the current inputs were rejected or missed."""
     RESTARTED = 3
-    """Nothing left to hold, or a result that is not finite: the memory was cleared, and there is no new prediction."""
+    """Status without a new prediction: the memory was cleared, because the last inputs are too old or a result was not
+    finite."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,8 @@ from edp.errors import ExportError
 from edp.ir.builder import Builder
 
 State = Any
-"""A tree (tuple, dict) of tensors whose first dimension is the batch; ``()`` for a module without memory."""
+"""State of a module: tree (tuple, dict) of tensors whose first dimension is the batch; ``()`` for a module without
+memory."""
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ from edp.ir.builder import indices
 from edp.networks.streaming import Cost, State, Streaming
 
 MAX_TREES = 2000
-"""Maximum number of trees per predicted value. Boosting at a rate of 0.05 ends far below."""
+"""Maximum number of trees per predicted value. Boosting with a learning rate of 0.05 stops far below this number."""
 MAX_DEPTH = 8
-"""256 leaves a tree: 768 numbers, 2.5 KB of flash."""
+"""Maximum depth of a tree. A tree of this depth has 256 leaves and 768 parameters, 2.5 KB of flash."""
 BLOCK = 2**20
-"""Nodes of all rows that are looked at together: 16 MB of single precision."""
+"""Maximum number of tree nodes evaluated at a time, over all rows: 16 MB in single precision."""
 
 
 class Trees(Streaming):

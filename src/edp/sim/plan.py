@@ -35,10 +35,11 @@ DEFAULT_MIX: Mapping[str, float] = {
     "end_stops": 0.09,
     "reversals": 0.06,
 }
-"""Share of the recordings by excitation."""
+"""Default fraction of the recordings per excitation."""
 
 MAX_RECORDINGS, MAX_MINUTES, MAX_MACHINES, MAX_SEED = 100_000, 1e6, 1000, 2**63
-"""Bounds of one data set; the plan of the most recordings takes some seconds."""
+"""Maximum number of recordings, minutes and machines, and maximum seed of a data set. A plan of this size takes some
+seconds."""
 BOUNDS = {
     "recordings": integer(1, MAX_RECORDINGS),
     "minutes": span(MIN_MINUTES, MAX_MINUTES),
@@ -49,7 +50,7 @@ BOUNDS = {
     "step_s": above(0.0, LARGEST_STEP_S),
 }
 AIR = "air"
-"""Free air in a mix of materials."""
+"""Name of free air in a mix of materials."""
 
 
 @dataclass(frozen=True, kw_only=True)

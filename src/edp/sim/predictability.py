@@ -37,14 +37,14 @@ from edp.storage.reading import Table
 Array = NDArray[np.float64]
 TARGETS = tuple(TABLE_A1)[:3]
 PAST = 40
-"""Samples of the past that sensors see before a branch: longer than any latency of the bus."""
+"""Number of samples before a branch that the sensors process. It exceeds every bus latency."""
 RESAMPLES = 2000
-"""Draws of the bootstrap of recordings."""
+"""Number of bootstrap samples of the recordings."""
 CONFIDENCE = 0.95
 MAX_BRANCHES, MAX_MOMENTS = 4096, 100_000
-"""Bounds; the usual 32 branches of 240 moments take minutes."""
+"""Maximum number of branches and of branching times. The usual 32 branches at 240 times take minutes."""
 MOST_AHEAD = 2000
-"""Samples, 20 s at 100 Hz."""
+"""Maximum horizon in samples, 20 s at 100 Hz."""
 KINDS = ("commands_unknown", "commands_known", "persistence")
 
 

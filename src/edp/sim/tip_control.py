@@ -23,7 +23,7 @@ GAINS = 6
 TIME, BEHIND, SUM, LEVER = 0, 1, 2, 5
 MEMORY = 8
 MAX_SUM = 0.1
-"""Most speed (m/s) that the integral may add: a blocked leg must not wind it up."""
+"""Maximum speed (m/s) from the integral part, which prevents wind-up while a leg is blocked."""
 
 
 @compiled

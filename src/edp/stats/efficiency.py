@@ -10,8 +10,8 @@ from itertools import pairwise
 from edp.errors import DataError
 
 GAIN_PER_DOUBLING = 0.04
-"""Relative gain that a doubling of the parameters must bring. The thesis turned down 13 % for 15 times the
-parameters (4.2.2), 3.3 % a doubling; this is the next rounder figure above it."""
+"""Minimum relative gain per doubling of the parameters. The thesis rejected a gain of 13 % for 15 times the parameters
+(4.2.2), which is 3.3 % per doubling; this value is the next round number above it."""
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,12 @@ from edp.errors import ConfigError, closest
 from edp.stats.checks import Array, Mask
 
 MAX_RUNS = 256
-"""Trainings of one screening; the search for columns grows with the third power of the factors."""
+"""Maximum number of training runs of a screening. The search for columns grows with the third power of the number of
+factors."""
 INTERACTION = 0.03
 """Assumed fraction of a run's variance per interaction, to weigh errors against aliases."""
 PASSES = 12
-"""Rounds of exchanges; a design of 14 factors in 32 runs settles in fewer."""
+"""Maximum number of rounds of coordinate exchange. A design of 14 factors in 32 runs converges in fewer rounds."""
 
 
 @dataclass(frozen=True, eq=False)

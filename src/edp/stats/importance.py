@@ -12,8 +12,8 @@ from edp.errors import DataError
 from edp.stats.checks import finite, lower_p
 
 PASS_AT = 0.30
-"""Largest one-sided p-value with which a module passes the screening: it is to lose few true modules, not to
-confirm any."""
+"""Maximum one-sided p-value of a module that passes the screening. The screening should lose few effective modules; a
+later test confirms them."""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from edp.errors import DataError
 
 COMPOSITE_WEIGHTS = {"mae": 0.40, "rmse": 0.15, "p95": 0.25, "p99": 0.20}
-"""Weights of the composite score, thesis eq. 3.41; they sum to one, so its unit is that of the errors."""
+"""Weights of the composite score, thesis eq. 3.41. They sum to one, so the score has the unit of the errors."""
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 MAX_EXACT = 1 << 20
-"""Values that are kept as they are, 8 MB."""
+"""Maximum number of values that are stored exactly, 8 MB."""
 FINE = 10
-"""Bits of the mantissa that tell bins apart: 1,024 bins an octave, so that a quantile is wrong by 0.05 % at most."""
+"""Number of mantissa bits that select a bin: 1,024 bins per octave, so the relative error of a quantile is at most 0.05
+%."""
 _SHIFT = 23 - FINE
 _BINS = 1 << (31 - _SHIFT)
 

@@ -16,9 +16,9 @@ from edp.stats.multiple import benjamini_hochberg
 from edp.stats.resampled import printed_p
 
 MIN_DZ = 0.5
-"""The thesis's gate of relevance (3.3.4): a medium effect in Cohen's words."""
+"""Minimum effect size in the thesis (3.3.4): a medium effect (Cohen's d)."""
 MIN_STABILITY = 0.75
-"""The thesis's third gate: three quarters of the pairs of runs won."""
+"""Minimum fraction of pairs of runs with an improvement, the third criterion of the thesis."""
 
 
 @dataclass(frozen=True)

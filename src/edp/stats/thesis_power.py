@@ -11,7 +11,7 @@ from scipy.special import ndtr, ndtri
 from edp.errors import ConfigError
 
 MAX_SPLITS = 25
-"""Upper bound of eq. 3.42: the sessions in the thesis's development set."""
+"""Maximum number of splits in eq. 3.42: the number of sessions in the thesis's development set."""
 
 
 @dataclass(frozen=True)

@@ -13,17 +13,19 @@ from edp.data.screening.result import Array, Flag, FlagKind
 from edp.data.screening.table import CandidateTable, chunks
 
 CLOCK = 0.98
-"""Rank correlation with time, in every piece, from which a channel only tells the time."""
+"""Minimum rank correlation with time, in every segment, of a channel that only contains the time."""
 STRONG = 0.6
-"""Correlation that a relation must have in every piece before a change of its sign counts."""
+"""Minimum correlation, in every segment, of a relation whose change of sign is reported."""
 EXACT = 0.97
-"""The same before a change of its gain counts."""
+"""Minimum correlation, in every segment, of a relation whose change of gain is reported."""
 GAIN = 1.5
-"""Ratio of the largest to the smallest gain."""
+"""Minimum ratio of the largest to the smallest gain that is reported as a change."""
 STEADY, SAME = 1.25, 1.05
-"""Largest ratio of gains (90 % to 10 %) that count as one gain where a sign turns, and where a relation is absent."""
+"""Maximum ratio of gains (90 % to 10 % quantile) that counts as one gain, for the detection of a changed sign and of an
+absent relation."""
 VISIBLE, ABSENT = 0.8, 0.3
-"""Correlation that gain and noise let expect, and the one found, where a relation is absent."""
+"""Minimum correlation expected from gain and noise, and maximum correlation found, in a segment with an absent
+relation."""
 
 
 def dead_flags(table: CandidateTable) -> list[Flag]:

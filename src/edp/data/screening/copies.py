@@ -24,36 +24,42 @@ from edp.data.screening.result import Array, Flag, FlagKind
 from edp.wording import number, typed
 
 LEAKING, DETERMINED = 0.25, 0.5
-"""Of what pasts leave unexplained of a channel, the share that may remain once the future is known, for a leak; the
-second where hardly anything remains, as from the ends of segments."""
+"""Maximum fraction of the unexplained variance that may remain after adding the future, for a leak. The second value
+applies if hardly any variance remains, for example at the ends of segments."""
 HARDLY = 0.01
-"""Share of the variance that counts as hardly anything."""
+"""Fraction of the variance below which a remainder counts as hardly any variance."""
 DIFFERENCING = 2.5
-"""Sum of the absolute weights of the future, from which it is differences of the future that explain: so do leaks that
-are derivatives, but also causes, whose effect is turned back. Shifts and means have a sum of 2 or less."""
+"""Sum of the absolute weights of the future above which the future enters as differences. Leaks that are derivatives
+have such weights, but also causes whose effect is inverted. Shifts and means have a sum of 2 or less."""
 EXACT_SHARE = 0.95
-"""Share that differences must take away to count as a leak: noise of sensors keeps a cause from being found so well."""
+"""Minimum fraction of the remaining variance that differences must explain for a leak. Sensor noise keeps causes below
+this fraction."""
 TELLING = 1e-4
-"""Less left unexplained by pasts than this share of the variance: nothing to learn from the future."""
+"""Minimum fraction of the variance unexplained by the past. Below it, a test for the future is not possible."""
 MATERIAL = 0.15
-"""Correlation of the rest of a copy with anything, above which it is more than noise."""
+"""Correlation of a copy's residual with any channel above which the residual contains more than noise."""
 SEEN = 0.7
-"""Largest lag of a noisy copy, as a share of the largest one searched."""
+"""Maximum lag of a noisy copy, as a fraction of the largest searched lag."""
 RELATED = 0.7
-"""Least correlation of a noisy copy with its original."""
+"""Minimum correlation of a noisy copy with its original."""
 EXPLAINED = 0.01
-"""Share of a channel's variance left by the presents and pasts of others, below which it is made of them."""
+"""Maximum fraction of a channel's variance unexplained by other channels (present and past), for a channel that is
+composed of them."""
 SLACK = 1
-"""Samples by which an exact copy may be off and still count as simultaneous."""
+"""Lag in samples up to which an exact copy counts as simultaneous."""
 _FAR = 30
-"""Samples ahead that a leak is searched at; one that is farther ahead is looked at around its peak."""
+"""Number of future samples searched for a leak. For a leak farther in the future, the samples around the correlation
+peak are searched."""
 _NEAR_PAST = range(21)
-"""Delays of the channels in question: densely, since what their past explains must not pass for the future."""
+"""Delays in samples of the source channels. They are dense, because effects of the past must not count as effects of
+the future."""
 _LONG_PAST = range(61)
 _SPARSE_PAST = (0, 1, 2, 4, 7, 12, 20)
-"""Delays of all others: the model has dozens of channels, and its solution grows with the third power of the taps."""
+"""Delays in samples of all other channels. They are sparse, because the model has dozens of channels and its cost grows
+with the third power of their number."""
 _MAX_TRUSTED = 40
-"""Strongest trusted channels in a model, for the same reason."""
+"""Maximum number of trusted channels in a model, which limits its cost. The channels with the strongest correlation are
+used."""
 _PARTNERS = 2
 
 

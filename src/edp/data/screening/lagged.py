@@ -20,7 +20,7 @@ from edp.data.screening.table import CandidateTable, Piece
 from edp.recording import FloatArray
 
 _SEGMENTS = 128
-"""Blocks whose spectra are held at once."""
+"""Number of blocks whose spectra are in memory at the same time."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,13 +25,14 @@ from edp.data.screening.stability import ABOVE_CHANCE, MIN_INFORMATION, Relation
 from edp.data.screening.table import CandidateTable
 
 NEGLIGIBLE = 0.002
-"""Share of the remaining error that a channel must take away, held out, to be kept for that alone."""
+"""Minimum fraction of the held-out error that a channel must remove to be kept."""
 LARGE = 0.01
-"""The same, from which a channel that relates is not redundant even where the held-out segments do not agree."""
+"""Fraction of the held-out error from which a related channel is not redundant, even if the held-out segments disagree.
+"""
 CLEAR = 0.2
-"""Correlation from which a lag counts for the window."""
+"""Minimum correlation at which a lag counts for the window length."""
 STEP = 5
-"""Windows are rounded up to so many samples."""
+"""Multiple to which window lengths are rounded up, in samples."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from edp.settings.results import json_value
 
 Array = NDArray[np.float64]
 OnProgress = Callable[[str, float], None]
-"""Called with the stage that begins or goes on, and the share of the whole screening that is done, 0 to 1."""
+"""Callback with the current stage and the completed fraction of the whole screening, 0 to 1."""
 
 
 class FlagKind(StrEnum):

@@ -22,9 +22,9 @@ from edp.data.screening.result import Array, Value
 HISTORY = (0, 1, 2, 4, 8, 16, 32)
 """Delays of each channel, samples."""
 WINDOWS = (5, 10, 15, 20, 25, 30, 40, 50, 60, 80, 100, 150, 200, 300, 400, 500)
-"""Histories tried, samples."""
+"""History lengths that are tried, in samples."""
 ENOUGH = 0.02
-"""A window is long enough when the held-out error is within this share of the best."""
+"""Maximum relative difference between the held-out error of a sufficient window and the best held-out error."""
 
 
 def choose_held_out(count: int, share: float, seed: int) -> NDArray[np.int64]:

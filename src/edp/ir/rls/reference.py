@@ -16,13 +16,13 @@ class RlsStatus(IntEnum):
     """Result code of an adaptation step."""
 
     NONE = 0
-    """Nothing: there is no prediction to correct."""
+    """No prediction is available for correction."""
     HOLDING = 1
-    """The prediction is corrected; nothing was learned: in steady state, frozen, or too few ticks in a row."""
+    """The prediction is corrected without learning: in steady state, frozen, or after too few consecutive samples."""
     LEARNING = 2
-    """The prediction is corrected, and the error of an earlier one has taught."""
+    """The prediction is corrected, and the error of an earlier prediction has updated the correction."""
     FALLBACK = 3
-    """At least one of the numbers goes out as it was, because its corrections were worse than none."""
+    """At least one output is passed uncorrected, because its correction increased the error."""
 
 
 @dataclass(frozen=True, eq=False)

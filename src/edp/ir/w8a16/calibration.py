@@ -21,7 +21,7 @@ from edp.ir.w8a16.quantise import Formats, formats, quantise, weights_of
 
 # 500 ticks are 5 s at 100 Hz: longer than the networks remember, so that a piece shows steady values.
 PIECE = 500
-"""Ticks of a piece, from reset."""
+"""Length of a calibration segment in samples; each segment starts from reset."""
 # Errors of neighbouring formats are noisy; one finer format without gain is no sign of the end.
 PATIENCE = 2
 

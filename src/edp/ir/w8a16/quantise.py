@@ -25,9 +25,9 @@ from edp.ir.w8a16.rounding import WeightRounding
 from edp.ir.w8a16.rows import halves, rows, to_gates
 
 Ranges = Mapping[str, float]
-"""Largest magnitude of each value, and of each slot as ``layer/slot``."""
+"""Largest magnitude of each value, and of each memory slot as ``layer/slot``."""
 ADVICE = "export in float32"
-"""For a layer without an integer form that gives no advice of its own."""
+"""Advice in the error message for a layer without an integer form and without its own advice."""
 
 
 @dataclass(frozen=True)
@@ -60,10 +60,10 @@ class _Work:
     fracs: Mapping[str, int]
     rounding: WeightRounding
     integer_fracs: dict[str, int]
-    """Fractional bits of values that are integers by now."""
+    """Number of fractional bits of each value that is already an integer."""
     out: list[Layer]
     slots: dict[tuple[str, str], int]
-    """Fractional bits of slots."""
+    """Number of fractional bits of each memory slot."""
 
     def rows(self, layer: Any, input_frac: int) -> dict[str, Any]:
         """Return the integer weights and biases of a layer."""
@@ -371,4 +371,4 @@ LOWER: dict[type[Layer], Lower] = {
     memory.TrailingMean: _mean,
     memory.AttentionPool: _pool,
 }
-"""By kind of layer that has an integer form."""
+"""Functions that convert a layer to integer arithmetic, by kind of layer."""

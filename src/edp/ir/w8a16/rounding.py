@@ -17,7 +17,7 @@ from edp.ir.w8a16 import arithmetic as fixed
 
 Array = NDArray[np.floating]
 DAMPING = 0.01
-"""Share of the mean diagonal that is added to ``H``: inputs that hardly move must not be given large weights."""
+"""Fraction of the mean diagonal that is added to ``H``. It prevents large weights for inputs that hardly change."""
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,11 @@ from edp.wording import typed
 
 Array = NDArray[np.floating]
 COARSER = 1.02
-"""More than a sum needs to fit: weights of least error are a little larger in sum than the nearest ones."""
+"""Safety factor of the scale at which a row's sum fits the accumulator. Weights of least error have a slightly larger
+sum than rounded weights."""
 MAX_COARSE = 4.0
-"""Times its own scale that a row may take, two bits of its weights; beyond, the network is refused."""
+"""Maximum factor by which the scale of a row may grow, a loss of two bits of its weights. A network that needs more is
+rejected."""
 
 
 def rows(

@@ -18,10 +18,11 @@ from torch.autograd.function import once_differentiable
 EPSILON = 1e-5  # in the variance of layer norm
 
 Shares = tuple[Tensor, Tensor] | float
-"""Fraction of the new h and c: draws of 0 and 1, ``(time, batch, units)`` each, or one number."""
+"""Fractions of the new h and c that an LSTM with zoneout takes: arrays of 0 and 1, each ``(time, batch, units)``, or
+one number."""
 
 Norm = tuple[Tensor, Tensor, Tensor]
-"""Gain of the normalised ``U h``, gain and shift of the normalised c."""
+"""Layer normalisation of an LSTM: gain of the normalised ``U h``, gain and shift of the normalised c."""
 
 
 def output_first(weight: Tensor) -> Tensor:

@@ -36,7 +36,7 @@ class LossSpec(Protocol):
     """Options of a main loss."""
 
     outputs: ClassVar[tuple[str, ...]]
-    """Kinds of output that it trains, names of `edp.networks.outputs.OUTPUTS`."""
+    """Names of the output kinds in `edp.networks.outputs.OUTPUTS` that this loss can train."""
 
     def evaluate(self, answer: Prediction, target: Tensor) -> Tensor:
         """Return the loss of each prediction, ``(batch, time, horizon, output)``.

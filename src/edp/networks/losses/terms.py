@@ -43,7 +43,7 @@ class TermSpec(Protocol):
 
     weight: float
     span: ClassVar[int]
-    """Consecutive predictions that it compares."""
+    """Number of consecutive predictions that the term compares."""
 
     def evaluate(self, course: Course) -> Tensor:
         """Return the unweighted term, a mean over the compared elements; zero without compared elements."""

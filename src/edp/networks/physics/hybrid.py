@@ -15,7 +15,7 @@ from edp.networks.physics.dynamic import Dynamic, DynamicSpec
 from edp.networks.physics.geometry import AXES, Pose
 
 HELD = 1e3
-"""Factor of its own inertia that holds an axis at standstill."""
+"""Factor by which the inertia of an axis is increased while dry friction holds the axis at standstill."""
 
 
 @PHYSICS.register("hybrid")

@@ -258,4 +258,4 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "zeros_like": lambda a: torch.zeros(a.shape),
     "stack": stack,
 }
-"""Torch's functions by name."""
+"""PyTorch functions by name, for recording equations as layers."""

@@ -14,7 +14,7 @@ from edp.networks.twin.adaptive_twin import REST, AdaptiveTwin
 Array = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 JUDGED_S = 10.0
-"""Seconds of motion over which errors of both are averaged, and before which nothing is moved."""
+"""Time of motion over which the errors with and without correction are averaged, s. The correction is zero before."""
 
 
 class TunedCorrection:

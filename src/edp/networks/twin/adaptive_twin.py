@@ -36,19 +36,19 @@ Doubles = NDArray[np.float64]
 STEP = 0.02
 """Relative step of a group to determine its effect: large compared with rounding, small compared with curvature."""
 CLIP = 3.0
-"""Units beyond which an error teaches no more."""
+"""Error in scaled units at which errors are clipped, so that outliers do not change the parameters more."""
 BOUND = 3.0
-"""Groups are held within so many prior deviations."""
+"""Maximum change of a parameter group, in prior standard deviations."""
 LEAST = 1e-3
-"""Minimum error, as a fraction of the velocity spread, below which nothing is adapted."""
+"""Minimum error for adaptation, as a fraction of the velocity's standard deviation."""
 LATELY = 30
-"""Stretches over which errors are averaged."""
+"""Number of recent segments over which errors are averaged."""
 HOTTEST_C = 150.0
-"""Maximum oil temperature, degC. A thermometer that reads more is broken."""
+"""Maximum plausible oil temperature, degC. A higher reading counts as a sensor fault."""
 WARMER = 0.02
-"""Change of a logarithm by temperature from which numbers are made again: about a kelvin."""
+"""Change of a parameter's logarithm with temperature at which the parameters are computed again: about one kelvin."""
 REST = 1e-3
-"""Speed (m/s or rad/s) below which a segment tells nothing of valves and friction."""
+"""Minimum speed (m/s or rad/s) of a segment that identifies valves and friction."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,10 +21,11 @@ from edp.settings.bounds import MOST_TICKS, integer
 from edp.wording import typed
 
 TwinState = dict[str, Array]
-"""All that a twin remembers, by name; the first dimension is the batch. ``answer`` is what its free ports read next."""
+"""State of a twin by name; the first dimension is the batch. ``answer`` contains the values that free ports read next.
+"""
 PREFIX = integer(1, MOST_TICKS)
 BEYOND = 0.05
-"""Fraction of a stroke by which a measured start may lie beyond an end stop, for noise and play."""
+"""Fraction of the stroke by which a measured start may exceed an end stop, to allow for noise and play."""
 
 
 class Twin(ABC):

@@ -26,11 +26,14 @@ GAINS = (1.0, 0.3, 0.1)
 simulated M22 predicts ten samples ahead with 0.78, 0.72 and 0.71 mm/s. ARX needs 1, since it reads its own past outputs
 as measurements."""
 CHOICE_LOGS, CHOICE_TICKS = 3, 1500
-"""Stretches and ticks of each on which a gain is chosen: thousands of moments settle errors to a few per cent."""
+"""Number of segments, and number of samples of each segment, on which an observer gain is selected. A few thousand
+samples determine the errors to a few per cent."""
 BLOCK, BLOCK_NUMBERS = 4096, 4_000_000
-"""Moments that look ahead at a time, and numbers of their runs: states of a few MB, runs of some tens of MB."""
+"""Maximum number of predictions computed at a time, and maximum number of values in these simulations. The states need
+a few MB, the simulations some tens of MB."""
 MOST_AHEAD = 1000
-"""Ticks: with the commands held nothing of a machine can be foretold for as long; each tick of a log runs so far."""
+"""Maximum prediction horizon in samples. Predictions assume constant commands, which is not useful over longer times.
+"""
 
 
 def check_horizons(horizons: Sequence[int]) -> None:

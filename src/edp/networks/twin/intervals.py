@@ -15,7 +15,8 @@ from edp.storage.reading import Table
 
 Array = NDArray[np.float32]
 KNOTS_A_DECADE = 12
-"""Horizons of a decade at which widths are calibrated: neighbouring ticks of a run are nearly one tick."""
+"""Number of horizons per decade at which interval widths are calibrated. Errors at neighbouring samples are nearly
+equal."""
 TICKS = integer(1, MAX_ROWS)
 
 

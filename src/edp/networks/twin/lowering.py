@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 ADD, MULTIPLY = BinaryOperation.ADD, BinaryOperation.MULTIPLY
 MEASURED = 0.5
-"""A flag above it means that a port reads what was measured."""
+"""Threshold of a port flag. A port reads the measured value if its flag is above the threshold."""
 
 
 def plant_graph(twin: Twin) -> Graph:

@@ -33,24 +33,26 @@ MAX_WINDOWS = 40_000
 """Maximum number of windows, evenly selected from long logs. Their factorisation takes seconds, and neighbouring
 windows are nearly equal."""
 CHUNK = 4096
-"""Windows that are factorised at once: bounds the memory."""
+"""Number of windows factorised at a time, which bounds the memory."""
 SLOWEST = 0.999
-"""Largest modulus of a pole: 10 s at 100 Hz. Slower ones are drifts that the strokes, which are integrals, have."""
+"""Maximum modulus of a pole, a time constant of 10 s at 100 Hz. Slower poles describe drift, which the integrated
+strokes already contain."""
 FARTHEST = 1e4
-"""Bound of a state, which is of the size of 1: whatever is commanded, outputs stay finite numbers."""
+"""Bound of a model state. States have a magnitude of about 1, and the bound keeps outputs finite for all commands."""
 STRETCHES, STRETCH_TICKS = 128, 150
-"""Stretches from which B is solved, each with an own start, and their length."""
+"""Number of segments from which B is computed, each with its own initial state, and their length in samples."""
 JUDGED_S, JUDGED_EACH = 10.0, 4
-"""Length of the free runs that choose the order, and how many there are in a recording."""
+"""Length (s) of the free-run simulations that select the order, and number of simulations per recording."""
 KEPT_BACK = 5
-"""Every fifth recording is kept back from the models whose orders compete."""
+"""Interval of the recordings that are held out to select the order: every fifth recording."""
 SMALL = 1e-9
-"""Fraction of the largest direction below which a direction counts as rounding."""
+"""Minimum singular value of a direction, as a fraction of the largest one. Smaller ones are rounding errors."""
 MIN_SHARE = 1e-4
-"""Fraction of the largest singular value below which a state counts as noise. Filters of such states amplify
-rounding."""
+"""Minimum singular value of a state, as a fraction of the largest one. Smaller ones are noise, which filters would
+amplify."""
 MIN_NOISE = 1e-2
-"""Minimum sensor noise, in standard deviations. On exact data a filter would trust one sample more than the model."""
+"""Minimum sensor noise, in standard deviations. On exact data a filter would follow each sample instead of the model.
+"""
 
 
 @TWINS.register("n4sid")
@@ -181,7 +183,8 @@ class N4sidTwin(Twin):
 
 
 Pair = tuple[Doubles, Doubles]
-"""Commands, behind them a one, and solved outputs of a segment, scaled ``(tick, command + 1)``, ``(tick, output)``."""
+"""Commands followed by a one, and computed outputs of a segment, both scaled: ``(tick, command + 1)``, ``(tick,
+output)``."""
 
 
 def _append_ones(commands: Array) -> Doubles:

@@ -19,9 +19,9 @@ Doubles = NDArray[np.float64]
 NORMAL = 1.96
 """Half-width of a 95 % confidence interval of a normal distribution in standard deviations."""
 UNEXCITED = 0.7
-"""Fraction of the prior standard deviation. If the data leave more of it, they say little about a parameter."""
+"""Posterior standard deviation, as a fraction of the prior's, above which the data do not identify a parameter."""
 FARTHEST = 12.0
-"""Largest change of a positive parameter in prior standard deviations of its logarithm."""
+"""Maximum change of a positive parameter, in prior standard deviations of its logarithm."""
 TEXT_NAME = "datasheet.txt"
 
 

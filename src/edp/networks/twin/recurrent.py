@@ -24,12 +24,12 @@ from edp.networks.twin.steps import BranchResults, run_branches, run_forward
 from edp.settings.bounds import MAX_UNITS, check_bounds, integer
 
 PIECE = 256
-"""Ticks that a run without gradients keeps at once: the loop writes what only a backward run would read."""
+"""Number of samples per block of a simulation without gradients. Intermediate results are kept for one block only."""
 MAP = "map_"
-"""Prefix of the names of a static map's parameters within the twin."""
+"""Prefix for the names of the static map's parameters within the twin."""
 MAX_MEMBERS = 32
 MEMBER_SEED = 1000
-"""Seed increment between members, so that few runs share a seed."""
+"""Seed increment between members, chosen so that seeds of different runs rarely coincide."""
 
 
 @TWINS.register("recurrent")

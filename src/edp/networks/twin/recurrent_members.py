@@ -17,15 +17,18 @@ from edp.networks.twin.scales import TwinScales
 from edp.networks.twin.static_map import StaticTwin
 
 AT_STOP = 0.002
-"""Fraction of a stroke within which two visits to a stroke end count as the same position: a few millimetres."""
+"""Fraction of a stroke within which two outermost positions count as equal: a few millimetres."""
 APART_S = 1.0
-"""Time away from an end after which the next visit is another one."""
+"""Minimum time away from an outermost position before a further visit counts as a new visit, s."""
 VISITS = 2
-"""Visits to the same outermost place that make it an end stop: turns on the way hardly come to the same place."""
+"""Minimum number of visits to the same outermost position that identify an end stop. Reversals within the stroke rarely
+occur at equal positions."""
 PUSHED_S = 1.0
-"""Time at an outermost place with its own lever pushing on that makes it an end stop at the first visit."""
+"""Minimum time at an outermost position with the lever pushing outwards that identifies an end stop at the first visit,
+s."""
 PUSHED = 0.5
-"""Fraction of the largest command above which a lever would move an actuator anywhere but at its stop."""
+"""Minimum command, as a fraction of the largest command, that would move an actuator at any position except an end
+stop."""
 
 
 def scales_for(twin: RecurrentTwin, own: TwinScales, train: list[Series]) -> TwinScales:

@@ -21,10 +21,11 @@ from edp.storage.reading import Table
 from edp.wording import typed
 
 OBSERVED = (*TABLE_A1, "CylStroke_1", "CylStroke_2", "CylStroke_3")
-"""What is shown unless told otherwise: Table A.1, and the strokes, which have no model of a sensor."""
+"""Default observations: the signals of Table A.1, and the strokes, which are observed without a sensor model."""
 MAX_LATENCY = 1000
 MAX_SAMPLES = 10_000_000
-"""Of an episode: its random values are drawn at reset, 152 bytes a tick."""
+"""Maximum number of samples of an episode. The random values of an episode are generated at reset, 152 bytes per
+sample."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ _FAULTY = (
     blocks.FINE_FILTERS,
     blocks.SOIL_NUMBERS,
 )
-"""Blocks that hold what faults of the machine change, in the order of `edp.sim.faults.course.BLOCKS`."""
+"""Blocks that machine faults change, in the order of `edp.sim.faults.course.BLOCKS`."""
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,10 @@ from edp.sim.sensors import chain, logbook
 Array = NDArray[np.float64]
 LOG_WIDTH = at.LOG_GROUND + at.GROUND_POINTS
 SOURCES = chain.SENSED + LOG_WIDTH
-"""What an observation may show: the signals that are sensed, then every column of the log."""
+"""Possible observations: the sensed signals, then every column of the log."""
 Out = tuple[NDArray[np.float32], Array, NDArray[np.bool_]]
-"""Observations, shape (episode, column); present rows of the log, shape (episode, LOG_WIDTH); which have ended."""
+"""Results of a time step: observations ``(episode, column)``, current rows of the log ``(episode, LOG_WIDTH)``, and
+mask of ended episodes."""
 KELVIN = 273.15
 
 # what `step_all` reports
@@ -62,7 +63,7 @@ def scratch_of(scratch: Array) -> tuple[Array, ...]:
 
 SCRATCH = places.FROZEN + 28 + 3 * at.OPENINGS + 4 * places.SLOPES + terramechanics.CONTACTS + 5 * at.STATES
 MAX_PAST = 256
-"""Samples of dead time that a machine may have."""
+"""Maximum dead time of a machine in samples."""
 
 
 @pasted

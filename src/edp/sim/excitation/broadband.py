@@ -20,16 +20,19 @@ class Broadband(Excitation):
 
     by_hand = False
     LOW_HZ, HIGH_HZ = 0.1, 4.5
-    """The last half octave is given away to the filter of what is measured."""
+    """Frequency range of the commands, Hz. The last half octave below the sensor bandwidth is reserved for the filters
+    of the measurement."""
     COURSE_S = 10.0
     PEAK = (0.5, 0.95)
-    """Drawn size of a course: of the lever, most of which small courses spend within the dead band."""
+    """Range of the random peak of a lever command, as a fraction of the full lever. Smaller peaks would mostly stay
+    within the dead band."""
     DRAWS = 16
     LEAN = 1.2
-    """Lever per share of the stroke from where the pose should be: slow, so that it adds no power above 0.2 Hz."""
+    """Lever command per stroke fraction of distance from the target pose. The gain is low, so that it adds no power
+    above 0.2 Hz."""
     MAX_LEAN = 0.3
     POSES = (0.1, 0.9)
-    """Strokes that courses lean to, as shares."""
+    """Target strokes, as fractions of the full stroke."""
     PIECE_S = 0.1
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:

@@ -21,14 +21,14 @@ class SwingDig(Dig):
 
     swings = True
     SIDE_RAD = (0.8, 2.4)
-    """Angle to dump at, either side: 45 to 140 deg."""
+    """Range of the swing angle for dumping to either side, rad (45 to 140 degrees)."""
     LEVEL = (0.55, 1.0)
     BRAKES_AT = 0.4
-    """rad/s^2 that the operator takes for the deceleration of a closed valve."""
+    """Swing deceleration with a closed valve that the operator expects, rad/s^2."""
     CLOSE_RAD, NEAR_RAD = 0.06, 0.25
-    """Angle left at which the swing is not moved any more, and at which the bucket is lowered or emptied."""
+    """Remaining swing angles (rad) at which the swing command ends, and at which the bucket is lowered or emptied."""
     TRAVELS = 0.3
-    """Fraction of cycles with travel."""
+    """Fraction of the cycles with travel."""
     TRAVEL_S, TRAVEL_LEVEL = (0.6, 2.5), (0.4, 1.0)
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:

@@ -30,22 +30,23 @@ class Tracked(Excitation):
     """
 
     CONTROL_HZ = 20.0
-    """Rate of control steps; each takes 33 us of Python (journal), so a higher one slows the simulation."""
+    """Rate of the controller, Hz. Each control step takes 33 us of Python (journal), so a higher rate slows the
+    simulation."""
     RAMP_S = 0.5
-    """Time to speed up and to slow down on a leg."""
+    """Time to accelerate and to decelerate in each leg, s."""
     LEAD_S = 0.2
     PROPORTIONAL = 2.0
-    """1/s, on the stroke error."""
+    """Proportional gain on the stroke error, 1/s."""
     INTEGRAL = 0.8
-    """1/s^2."""
+    """Integral gain on the stroke error, 1/s^2."""
     REST_SPEED = 0.004
-    """Wanted speeds below this (m/s) leave the lever centred."""
+    """Reference speed (m/s) below which the lever stays centred."""
     WAITS_BEHIND = 0.12
-    """Stroke error (m) at which the reference does not move."""
+    """Stroke error (m) above which the reference waits."""
     PATIENCE_S = 1.5
-    """A leg that is blocked for so long is given up: the boom is raised instead."""
+    """Time (s) after which a blocked leg is abandoned and the boom is raised instead."""
     RESCUE = 0.15
-    """Fraction of the boom's stroke by which it is then raised."""
+    """Fraction of the boom stroke by which the boom is raised after a blocked leg."""
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
         super().__init__(rng, rate_hz, machine)

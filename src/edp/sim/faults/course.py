@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 STEPS = 1024
 """Maximum number of parameter changes during one ramp."""
 BLOCKS = ("axes", "plant", "delays", "coarse", "fine", "soil")
-"""Arrays of `MachineNumbers` in order."""
+"""Arrays of `MachineNumbers` that faults can change, in order."""
 CHANGE = 4
 """Number of values per change: sample, index in `BLOCKS`, position in the block, new value."""
 

@@ -23,7 +23,7 @@ from edp.sim.machine import layout as at
 from edp.sim.physics import terramechanics, valve
 
 LEAK_PRESSURE = 200e5
-"""Pa across the gap at which a leak has its size, at 40 degC."""
+"""Pressure difference at which the size of a leak is defined, at 40 degC, Pa."""
 
 
 def _add_attachment_mass(numbers: MachineNumbers, site: str, size: float) -> None:

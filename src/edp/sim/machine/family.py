@@ -43,12 +43,13 @@ from edp.wording import typed
 BASE_MASS_T = 21.7
 """Operating weight of M22, t."""
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
-"""Step of a sequence that fills a range evenly for any number of members (multiples of the golden ratio, modulo 1)."""
+"""Increment of the golden-ratio sequence modulo 1, which fills a range evenly for any number of members."""
 LIGHTEST_T, HEAVIEST_T = 1.0, 200.0
 MASSES_T = (10.0, 50.0)
-"""Range of masses of a family, unless another is asked for."""
+"""Default range of the operating weights in a family, t."""
 WIDEST = 2.5
-"""Most scatter: three times the ranges of pump and hoses would reach below zero."""
+"""Maximum scatter of the parameters. With three times the scatter, the ranges of pump and hoses would reach below zero.
+"""
 
 
 @dataclass(frozen=True)

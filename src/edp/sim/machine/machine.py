@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 Triple = tuple[float, float, float]
 PumpNumbers = tuple[int, int, int]
-"""Pump 1 or 2 of each cylinder; integers, since they index pumps."""
+"""Pump index (1 or 2) of each cylinder, as integers."""
 Rating = tuple[float, float]
-"""A flow in L/min at a pressure difference in bar."""
+"""Rated flow (L/min) and the pressure difference (bar) of this flow."""
 Ratings = tuple[Rating, Rating, Rating]
 
 

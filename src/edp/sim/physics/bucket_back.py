@@ -22,15 +22,17 @@ Array = NDArray[np.float64]
 SHARE, WEIGHT, HOLD, LIFT = range(4)
 VALUES = 4
 MIN_FRICTION = math.radians(0.1)
-"""Friction (rad) below which that of cohesion alone, 2 c, is reached to 0.2 %."""
+"""Friction angle (rad) below which the cohesive limit 2 c is accurate to 0.2 %."""
 AHEAD_CELLS, BEHIND_CELLS, ASIDE_CELLS = 4, 2, 3
-"""Cells over which soil spreads ahead of the back, behind it, and on either side of the heel."""
+"""Number of ground cells over which soil spreads ahead of the bucket's back, behind it, and to either side of the heel.
+"""
 TRIMMED = 0.005
-"""Travel (m) within which soil below the floor plate that lies above its line has gone."""
+"""Travel (m) within which soil above the line of the floor plate is removed below the plate."""
 FURTHER_M = 1.0
-"""Way (m) ahead of the back at which no heap of it stands: at its angle of repose one of 0.4 m is shorter."""
+"""Distance (m) ahead of the bucket's back beyond which its heap does not reach. A heap of 0.4 m at its angle of repose
+is shorter."""
 HEEL_CELLS = 2
-"""Cells on either side of the heel's that its 0.2 m press."""
+"""Number of cells on either side of the heel's cell that are pressed by its length of 0.2 m."""
 
 
 def passive_coefficient(friction: float, wall: float) -> float:

@@ -12,7 +12,8 @@ from edp.sim.physics.jit import compiled
 
 Array = NDArray[np.float64]
 LEVER_BANDWIDTH_HZ, LEVER_RATE = 2.5, 5.0
-"""Hand on the lever: second-order smoothing and the largest rate in full strokes per second."""
+"""Bandwidth (Hz) of the second-order smoothing by the operator's hand, and maximum lever rate (full strokes per
+second)."""
 
 
 @compiled

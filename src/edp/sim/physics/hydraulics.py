@@ -13,9 +13,9 @@ from edp.sim.physics.jit import inlined
 
 Array = NDArray[np.float64]
 SMOOTH2 = 1e5**2
-"""Square of the pressure (Pa) below which an orifice turns laminar."""
+"""Square of the pressure difference (Pa) below which the flow through an orifice is laminar."""
 UNLOADING = 1.5
-"""Margins above the highest load at which a block for load sensing unloads its pump."""
+"""Pressure of the unloading valve of a load-sensing block above the highest load, in load-sensing margins."""
 
 
 @inlined

@@ -45,10 +45,11 @@ from edp.sim.physics.scratch import (
 
 Array = NDArray[np.float64]
 GAMMA = 1.0 - 1.0 / math.sqrt(2.0)
-"""One of the two values at which ROS2 is L-stable; the other, 1 + 1/sqrt(2), has the larger error constant."""
+"""Coefficient of the ROS2 method with L-stability. The other L-stable value, 1 + 1/sqrt(2), has the larger error
+constant."""
 
 ANCHORED = 0.03
-"""Turn (rad) from its anchor up to which the series of `turned` are exact to rounding."""
+"""Maximum rotation (rad) from the anchor for which the series of `turned` are exact to rounding."""
 
 
 @inlined

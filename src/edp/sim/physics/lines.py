@@ -25,7 +25,7 @@ from edp.sim.physics.jit import inlined
 
 Array = NDArray[np.float64]
 DENSITY = 860.0
-"""kg/m^3 of mineral oil, as of the viscosity grade that machine files name."""
+"""Density of mineral oil of the viscosity grade in the machine files, kg/m^3."""
 
 
 def modelled(cylinders: Cylinders) -> bool:

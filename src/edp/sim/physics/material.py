@@ -33,7 +33,7 @@ BOUNDS = {
     "back_push": span(0.0, 1.0),
     "back_friction_deg": span(0.0, 40.0),
 }
-"""Of a material; the softest mud has a cone index of some kPa, rock has no cone index."""
+"""Bounds of the parameters of a material. The softest mud has a cone index of some kPa; rock has no cone index."""
 
 
 @dataclass(frozen=True)

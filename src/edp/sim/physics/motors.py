@@ -29,9 +29,9 @@ from edp.sim.physics.jit import compiled, inlined, pasted
 Array = NDArray[np.float64]
 Motors = tuple[Array, ...]
 STILL = 5e-3
-"""Speed (rad/s, m/s) below which dry friction fades, so that it needs no state of its own."""
+"""Speed (rad/s, m/s) below which dry friction decreases to zero, so that the friction model has no state."""
 NEVER = 1e12
-"""Pa, at which no relief opens."""
+"""Opening pressure of a relief valve that never opens, Pa."""
 
 # Motors[...]
 (

@@ -13,10 +13,10 @@ from edp.sim.physics.jit import compiled, inlined
 
 Array = NDArray[np.float64]
 FILM = 4e5
-"""N s/m that the grease in a pin resists being squeezed; E: 12 pi mu L (R / c)^3 of a full journal, with mu 1 Pa s,
-L 0.1 m, R 35 mm and c 0.75 mm."""
+"""Squeeze-film damping of the grease in a pin, N s/m; E: 12 pi mu L (R / c)^3 of a full journal, with mu 1 Pa s, L 0.1
+m, R 35 mm and c 0.75 mm."""
 PARTS = 10
-"""Parts of a sample in which a crossing is followed."""
+"""Number of substeps of a step in which the pin play is crossed."""
 
 
 @compiled

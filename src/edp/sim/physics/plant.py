@@ -24,9 +24,9 @@ from edp.sim.sensors import logbook
 Array = NDArray[np.float64]
 
 FINE = 4
-"""A step is cut in this many near the ends of the stroke, where cushions and stops are stiff."""
+"""Number of substeps of a step near the ends of the stroke, where cushions and stops are stiff."""
 RESTING_PRESSURE = 10e5
-"""Pa, of pump lines and of the less loaded chamber at the start: no chamber begins in vacuum."""
+"""Initial pressure of pump lines and of the less loaded chamber, Pa. It prevents a start in vacuum."""
 Clock = tuple[int, float, float, Array]
 
 

@@ -26,7 +26,8 @@ from edp.sim.physics.motors import Motors
 
 Array = NDArray[np.float64]
 DROOP = 0.3
-"""Share of the margin by which a pump that senses loads falls from no flow to its full one; usual 20 to 30 %."""
+"""Pressure drop of a load-sensing pump from zero flow to full flow, as a fraction of the margin. Usual values are 20 to
+30 %."""
 
 
 @inlined

@@ -19,7 +19,7 @@ from edp.storage.reading import Table
 
 SCHEMA = 4
 MOST_BYTES = 1 << 30
-"""Largest file of a snapshot: days of a simulation's log."""
+"""Maximum size of a snapshot file, bytes: the log of several days of simulation."""
 _FACTS = "facts"
 _LIMITS = ArchiveLimits(MOST_BYTES, MOST_BYTES, 100_000)
 

@@ -14,11 +14,11 @@ from edp.sim.physics.material import Material
 
 Array = NDArray[np.float64]
 SPACING_M = ground_profile.SPACING
-"""Cell (m) of the height profile."""
+"""Cell size of the height profile, m."""
 BEYOND_M = 1.0
-"""How far the ground goes on beyond the machine's reach."""
+"""Distance by which the ground extends beyond the machine's reach, m."""
 UNEVENNESS_M = 0.04
-"""Deviation (m) of the surface at its bends, a metre apart."""
+"""Standard deviation of the surface height at its support points, which are one metre apart, m."""
 
 
 class Ground:

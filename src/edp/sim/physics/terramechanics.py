@@ -44,23 +44,23 @@ CONTACTS = 41
 CREEP = 0.02
 """Speed (m/s) over which the direction of soil forces is smoothed."""
 STONE_STEP = 0.005
-"""Travel (m) a cell of the stones' column."""
+"""Travel per cell of the array of stone forces, m."""
 COURSE = 8192
-"""Cells of a course; its stones repeat after 41 m of travel in soil."""
+"""Number of cells of the periodic array of soil resistance. The stones repeat after 41 m of travel in soil."""
 MIN_RAKE, MAX_RAKE = 10, 120
-"""Rake (deg) to which the table of cutting factors is limited."""
+"""Rake angles (degrees) to which the table of cutting factors is limited."""
 MIN_LEAN, MAX_LEAN = 0.17, 2.1
-"""Rake (rad) within which the direction of the cutting force follows it."""
+"""Rake angles (rad) within which the direction of the cutting force follows the rake."""
 EDGE_DEPTH = 0.05
-"""Depth (m) at which the whole edge is in the ground."""
+"""Depth at which the whole edge is in the ground, m."""
 HEEL_CONTACT = 0.2
-"""Length (m) of floor plate that bears on the ground; E."""
+"""Length of the floor plate in contact with the ground, m; E."""
 PIN_STIFFNESS = 1.2e7
-"""Stiffness (N/m) of the front behind the heel; E."""
+"""Stiffness of the front attachment that supports the heel, N/m; E."""
 TURNING = 0.05
-"""Horizontal speed (m/s) over which the soil before the edge changes from one side to the other."""
+"""Horizontal speed (m/s) over which the soil ahead of the edge changes from one side to the other."""
 PUSHED_BACK = 0.5
-"""Share of the cutting force that the back of the bucket meets where it moves no soil (`back_push` is 0); E."""
+"""Fraction of the cutting force on the bucket's back while the back does not move soil (`back_push` is 0); E."""
 
 
 def cutting_factors(rake_deg: float, friction_deg: float, metal_deg: float) -> tuple[float, float, float]:

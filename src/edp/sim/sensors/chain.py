@@ -16,19 +16,20 @@ from edp.sim.sensors import alterations, filters, transducers
 
 Array = NDArray[np.float64]
 REFERENCE_TEMPERATURE = 313.15
-"""Oil temperature in K at which pressure transmitters are adjusted (40 degC)."""
+"""Oil temperature at which pressure transmitters are calibrated, K (40 degC)."""
 MEASURED = 24
-"""Signals of Table A.1."""
+"""Names of the signals of Table A.1."""
 STROKES, PUMPS, OIL = 24, 27, 29
 SENSED = 30
-"""What is shown in all: behind Table A.1 strokes, pump pressures and oil temperature, which have no noise."""
+"""Names of all observable signals: Table A.1, then strokes, pump pressures and oil temperature, which have no noise."""
 VELOCITIES, PRESSURES, PILOTS = 0, 6, 12
 
 # drawn[tick, ...]: when the values that each ECU shows were read, in ticks; bias and errors of joint rates (rad/s),
 # errors of cylinder velocities (m/s) and pressures (Pa)
 AT_JOINTS, AT_PRESSURES, AT_VALVES, RATE_BIAS, RATE_ERROR, VELOCITY_ERROR, PRESSURE_ERROR = 0, 1, 2, 3, 6, 9, 12
 DRAWS = 18
-"""Behind them, one column a fault of the sensors: its number of the tick, see `edp.sim.sensors.alterations`."""
+"""Number of random values per sample. One column per sensor fault follows with the fault value of the sample, see
+`edp.sim.sensors.alterations`."""
 # numbers[...]: sizes of one machine's sensors at one rate
 (
     NOISY, STEP_S, PILOT_FULL, DERIVATIVE, LAGGED, LAG, RANGE, QUANTUM, DRIFT, ANGLE_QUANTUM, LEVERED, PLAYING, PLAY,
@@ -43,7 +44,7 @@ SENSOR_MEMORY = 30
 VELOCITY, ANGLE, RATE, PRESSURE, TEMPERATURE, DEMAND = 0, 3, 6, 9, 15, 16
 REMEMBERED = 22
 Setup = tuple[Array, Array, Array, Array]
-"""Numbers of the sensors, `axes` and `plant` of the machine as built, and the table of faults."""
+"""Configuration of the sensors: sensor parameters, `axes` and `plant` of the machine as built, and table of faults."""
 State = tuple[Array, Array, Array, Array]
 
 

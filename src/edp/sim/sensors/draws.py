@@ -15,7 +15,7 @@ from edp.sim.sensors import alterations, can, chain, filters, transducers
 
 Array = NDArray[np.float64]
 ECUS = ("joints", "pressures", "valves")
-"""Senders on the bus: rates of the joints, cylinder pressures, and pilot demands."""
+"""Names of the control units that send on the bus: joint rates, cylinder pressures and pilot demands."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,8 @@ from edp.sim.physics.jit import compiled, inlined
 
 Array = NDArray[np.float64]
 DERIVATIVE_DAMPING = 0.7
-"""Share of critical: nearly flat up to the bandwidth, with hardly any overshoot of the acceleration."""
+"""Damping ratio of the derivative filter: nearly flat up to the bandwidth, with little overshoot of the acceleration.
+"""
 
 
 @inlined

@@ -12,7 +12,7 @@ from edp.sim.sensors import alterations, chain, draws
 Array = NDArray[np.float64]
 OIL = "OilTemperature"
 KELVIN = 273.15
-"""0 degC: logs of the plant have degC, recordings K."""
+"""Offset from degC to K. Plant logs use degC, recordings use K."""
 
 
 def measure_signals(

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 RENEWED_TICKS = 5
-"""After how many ticks in the ground the effect of a force on the velocities is asked for again."""
+"""Interval in samples at which the effect of a force on the velocities is computed again while the bucket is in the
+ground."""
 
 
 class GroundContact(ABC):

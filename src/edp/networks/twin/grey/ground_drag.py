@@ -42,14 +42,15 @@ PARAMETERS = [
 ]
 PARAMETERS += [Parameter("ground", "across_by_depth", "N/m", 1.0, 0.0, 5e4, positive=False)]
 PLAUSIBLE = Priors.from_parameters(PARAMETERS).width
-"""Prior standard deviations of the numbers."""
+"""Prior standard deviations of the ground parameters."""
 MIN_DEPTH, MIN_SPEED = -0.1, 0.03
-"""Rows of a fit are at least as deep (m), and at least as fast (m/s): in steady state friction outputs, whatever the
-ground."""
+"""Minimum depth (m) and minimum speed (m/s) of the rows of a fit. In steady state the force is determined by friction
+and not by the ground."""
 CLEAR_M = 0.3
-"""Above the surface; forces that the logs show there are errors of the equations, and are taken off."""
+"""Height above the ground surface at which the bucket is in free air, m. Ground forces estimated there are model errors
+and are subtracted."""
 BLOCK = 200
-"""Ticks whose errors are taken as one: they lie close together."""
+"""Number of consecutive samples whose errors count as one, because neighbouring errors are correlated."""
 ROUNDS, HUBER = 4, 1.345
 MIN_ROWS = 500
 METRES, BUCKET = span(-20.0, 20.0), above(0.0, 20.0)

@@ -21,19 +21,21 @@ from edp.networks.twin.grey.parameters import ParameterTable
 
 Array = NDArray[np.float64]
 REACH = 2
-"""Ticks before and after over which velocities are differenced: noise falls, and swings of a few Hz stay."""
+"""Number of samples before and after a sample over which velocities are differentiated. The interval reduces noise and
+keeps oscillations of a few Hz."""
 FEW = 40_000
-"""Rows that are solved for at most."""
+"""Maximum number of rows in the initial fit of the load."""
 MIN_INERTIA = 0.02
-"""Of what is plausible."""
+"""Minimum inertia as a fraction of the prior mean."""
 SHARE_RANGE = (0.2, 1.0)
-"""Of rod area by head area; values outside are not believed."""
+"""Accepted ratio of rod-side area to head-side area. Estimates outside this range are not used."""
 MIN_ERROR = 0.02
-"""Of the forces, as a share of their deviation: rows never agree better with what the bodies leave out."""
+"""Minimum error of the forces, as a fraction of their standard deviation: the rigid-body model omits some effects."""
 INDEPENDENT = 1_000
-"""Rows that many rows count as: neighbours say the same."""
+"""Number of independent rows that all rows count as, because neighbouring rows are correlated."""
 LIMITS = DescentLimits(steps=30, tries=12, radius=np.inf, ftol=1e-9)
-"""The balance is nearly linear in the bodies, so steps are not bounded."""
+"""Limits of the initial fit. The force balance is nearly linear in the body parameters, so the step size is unlimited.
+"""
 
 
 def load_start(

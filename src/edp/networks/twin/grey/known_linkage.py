@@ -20,16 +20,18 @@ from edp.wording import typed
 Array = NDArray[np.float64]
 Singles = NDArray[np.float32]
 BODY_NAMES = ("boom", "arm", "bucket")
-"""Cylinders by what they turn, from the first joint on, as in machine files."""
+"""Names of the bodies that the cylinders turn, from the first joint on, as in machine files."""
 GIGA = 1e6
 """Factor from Gg to kg."""
 BEYOND = 0.03
-"""Fraction of the machine's stroke by which recordings may leave it, for sensor offsets and compliant stops."""
+"""Fraction of the machine's stroke by which recorded strokes may exceed its ends, to allow for sensor offsets and
+compliant stops."""
 ANGLE_STEP = 1e-5
-"""rad by which a lever arm is differenced: half of the digits are left, 1e-10 of it."""
+"""Angle step for the numerical derivative of a lever arm, rad. The relative error is about 1e-10."""
 MASS_WIDTH, CENTRE_WIDTH, INERTIA_WIDTH = 0.5, (0.15, 0.1), 0.6
-"""Plausible deviations of a body from that of the machine file: of the logarithms of mass and inertia, and of its
-centre of gravity along and across, as shares of its length. Buckets are changed, lines and oil are rarely weighed."""
+"""Prior standard deviations of a body relative to the machine file: logarithm of the mass, centre of mass along and
+across the body (fractions of its length), and logarithm of the inertia. They allow for other buckets and for the mass
+of lines and oil."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,15 +33,17 @@ from edp.networks.twin.parameters import Parameter, Priors
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 MAX_ACTUATORS, MAX_VALVES = 12, 48
-"""Maximum numbers of elements: their equations are compiled, which takes seconds and a gigabyte at these sizes."""
+"""Maximum number of actuators and of valves. The equations are compiled, which takes seconds and a gigabyte of memory
+at these sizes."""
 MAX_OF_LOAD = 5_000
-"""Numbers of a load: a fit holds their matrix, 200 MB of it."""
+"""Maximum number of load parameters. The matrix of a fit needs 200 MB at this number."""
 LEFT_OUT = {
     "power_limit": {"power_limit": 1e6},
     "cushions": {"cushion_length": 1.0, "cushion_least": 1.0},
     "play": {"play": 0.0},
 }
-"""What can be left out of the equations: its numbers, and where they do nothing (1 TW, whole outflow, no width)."""
+"""Optional parts of the equations, each with the parameter values that disable the part (1 TW, full outflow, zero
+width)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,11 +15,12 @@ from edp.networks.twin.scales import TwinScales
 
 Doubles = NDArray[np.float64]
 MAX_ELEMENTS = 32
-"""Of a kind; tangents of all numbers run side by side, and twice the elements take four times as long."""
+"""Maximum number of elements of one kind. All derivatives are computed in parallel, so twice the elements take four
+times as long."""
 ZERO = 0.04
-"""Plausible height of a gauge's zero above the orifice, or below it, as a share of the highest level."""
+"""Prior standard deviation of a level gauge's zero relative to the orifice, as a fraction of the highest level."""
 LONGEST_NAME = 64
-"""Of an element: a line of the datasheet holds it."""
+"""Maximum length of an element name. The name must fit a line of the datasheet."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,7 @@ from edp.networks.twin.lumped.constants import EDGE, EMPTY, SLIP, SPILL
 from edp.networks.twin.lumped.jit import compiled, inner
 
 Values = NDArray[Any]
-"""Real, or complex where the imaginary part carries a derivative."""
+"""Real array, or complex array whose imaginary part carries a derivative."""
 Doubles = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Wiring = tuple[Integers, Integers, Integers, Doubles, Doubles, Doubles, tuple[int, int, bool], float]
@@ -25,7 +25,7 @@ or -1, hidden state or -1. Then low and high of each output, width of each comma
 are measured), and ticks in a second.
 """
 SMALL = 1e-8
-"""Below it log(1 + x) is x (1 - x / 2) to rounding, and its argument would lose digits."""
+"""Argument below which log(1 + x) is computed as x (1 - x / 2), because 1 + x would lose digits."""
 
 
 @inner
