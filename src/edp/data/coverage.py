@@ -68,7 +68,7 @@ class Occupancy:
         source: ``strokes``, or ``integrated velocity`` where no stroke is measured.
         names: channels, an axis of `samples` each.
         span: lowest and highest value of each, m.
-        full_stroke: whether the span is the cylinder's; else it is what was seen.
+        full_stroke: whether the span is the cylinder's stroke; otherwise it is the recorded range.
         samples: count of samples, shape ``(CELLS,) * axes``.
     """
 
@@ -89,7 +89,7 @@ class JointHistogram:
     """Joint histogram of two signals in report units: `counts` has shape ``(x bin, y bin)``.
 
     Attributes:
-        filled: share of the bins with a sample.
+        filled: fraction of the bins with a sample.
         correlation: Pearson's, over all samples.
         information: mutual information in nat between quantile bins at the same instant, bias of chance removed.
     """
@@ -117,7 +117,7 @@ class Coverage:
         singular: smallest singular value of the input Hankel matrix by lags; inputs of deviation 1.
         constant: inputs that never change, left out of `singular`.
         absent: figures that could not be computed, each with the reason.
-        contradictions: strokes that are no integrals of their velocities, and what to do.
+        contradictions: strokes that are not integrals of their velocities, and the suggested action.
     """
 
     recordings: int
@@ -151,9 +151,9 @@ def cover(
 
     Args:
         recordings: recordings with one sample rate and equal channels.
-        inputs: channels that command, where neither name nor kind tells.
-        split: also say how far its tests lie from its training.
-        dead_band: share of the largest command that moves nothing.
+        inputs: command channels, required if neither name nor kind identifies them.
+        split: whether to also compute the distance between its test data and its training data.
+        dead_band: fraction of the largest command up to which an axis does not move.
 
     Raises:
         DataError: no recordings, mixed rates, an unknown input, or neither a command nor a velocity.

@@ -31,7 +31,8 @@ class Distance:
         signals: number of signals in a state.
         test: median and 95 % quantile over test samples.
         train: reference distances from one half of the training segments to the other half, with equally many samples.
-        beyond: share of test samples farther away than 95 % of the training samples; 5 % where both are alike.
+        beyond: fraction of the test samples farther away than 95 % of the training samples; 5 % for equally distributed
+            data.
     """
 
     signals: int

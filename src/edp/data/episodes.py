@@ -21,7 +21,7 @@ class EpisodeSampler:
     Args:
         series: training segments that know their machine.
         horizons: look-ahead samples.
-        spec: length of a piece, lanes of a batch, burn-in.
+        spec: length of a segment, batch size and burn-in.
         shots: segments of support, and of query, of a machine.
         seed: root of the random order.
 

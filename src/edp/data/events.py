@@ -31,7 +31,7 @@ class Activity:
     Attributes:
         reversals: changes of the sign of a command that left the dead band.
         crossings: times the command left its dead band, in either direction.
-        active: share of the time outside the dead band.
+        active: fraction of the time outside the dead band.
     """
 
     axis: str

@@ -78,7 +78,7 @@ def anchors(inputs: FloatArray, task: LagTask, means: DoubleArray) -> DoubleArra
 
     Args:
         inputs: ``(row, input)``.
-        task: says which column holds which target's present value.
+        task: task that defines the column with the present value of each target.
         means: training means ``(target,)``.
 
     Returns:

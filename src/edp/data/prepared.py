@@ -21,7 +21,7 @@ class Prepared:
 
     Attributes:
         task: channels to read and to predict.
-        train: training segments; `validation` and `test` likewise.
+        train: training segments.
         inputs: the logged input channels.
         feature_kinds: kind of each feature, in order.
         target_kinds: kind of each target.

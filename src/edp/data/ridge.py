@@ -117,7 +117,7 @@ def cross_validate_ridge(
     Args:
         parts: all segments that may be learned from.
         task: channels to read and to predict.
-        folds: segments of nearly equal duration; neighbouring ones share the history and future of their ticks.
+        folds: segments of nearly equal duration. Neighbouring segments share history and future samples.
         penalties: penalties to try, see `ridge_solution`.
         histories: histories to choose from, in samples; cut to the task's.
 

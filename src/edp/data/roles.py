@@ -29,7 +29,7 @@ class Axis:
     Attributes:
         name: name for reports.
         command: channels that command it: extend and retract, one signed channel, or none.
-        velocity: its velocity, extension positive; where kinds tell none, another signal that answers.
+        velocity: velocity of the axis, extension positive; if unknown, another signal that responds to the command.
         pressures: head and rod pressure, or as many as there are.
         stroke: its position.
         conflux: channels that give it the second pump.
@@ -66,7 +66,7 @@ def roles_of(recording: Recording, inputs: Sequence[str] = ()) -> Roles:
 
     Args:
         recording: recording whose channels are searched.
-        inputs: names of the channels that command, where neither name nor kind tells.
+        inputs: names of the command channels, required if neither name nor kind identifies them.
 
     Raises:
         DataError: no such input channel.

@@ -33,7 +33,7 @@ def stretch_folds(series: Sequence[Series], count: int, gap: int, shortest: int,
             driving tasks.
         count: folds, at least 2.
         gap: ticks beside a fold that it does not learn from.
-        shortest: ticks of a segment that says something; what is cut shorter is in neither part.
+        shortest: minimum length of a segment in samples; shorter segments are omitted.
         seed: random seed of the order.
 
     Raises:

@@ -29,7 +29,7 @@ class TwinChannelSettings:
     Attributes:
         commands: commands of operator or controller; by default pilot pressures, else currents, voltages, ratios.
         velocities: one for each actuator; by default every velocity.
-        strokes: the position of each of them, in the same order; by default where positions fit the velocities.
+        strokes: position of each of these axes, in the same order; by default the positions that match the velocities.
         pressures: pressures of chambers and pumps; by default every pressure that is not a command.
 
     Raises:
@@ -55,7 +55,7 @@ class TwinChannels:
     """Channels by role; outputs are ordered velocities, strokes, pressures.
 
     Attributes:
-        commands: read at each tick.
+        commands: command channels that are read in each sample.
         velocities: velocities of the actuators.
         strokes: position of each, in the order of the velocities, or none at all.
         pressures: pressures of chambers and pumps.
@@ -118,7 +118,7 @@ def twin_channels(recording: Recording, settings: TwinChannelSettings | None = N
 
     Args:
         recording: recording whose channel names and kinds are searched.
-        settings: names where these do not tell.
+        settings: channel names, required if the kinds do not identify the channels.
 
     Raises:
         DataError: a channel that is named, but not recorded.

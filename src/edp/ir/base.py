@@ -44,7 +44,7 @@ class Slot:
     Attributes:
         name: within the layer.
         shape: shape; a ring has samples first, the oldest one in row 0.
-        fill: every number's value after a reset, unless the graph says otherwise.
+        fill: value of every number after a reset, unless the graph has another value.
         number: meaning of the numbers.
     """
 
@@ -125,7 +125,7 @@ class Layer(ABC):
         counted: whether its C state has a ring or a counter.
         stays_float: whether it stays in single precision in an integer network: it has no weights, or a few gains.
         bit_exact: whether its equations in the arithmetic of the C runtime give the bits of the C code.
-        tick_by_tick: whether its equations compute one tick at a time, since other layers wait for what they change.
+        tick_by_tick: whether the equations compute one sample at a time, because other layers depend on their changes.
         without: forms that this kind of layer does not have (``integers``, ``tangent``, ``onnx``, ``matlab``), each
             with what to do instead.
     """
@@ -206,7 +206,7 @@ class Graph:
     Attributes:
         inputs: numbers fed at each tick.
         layers: every layer reads `INPUT` and layers before it.
-        results: values that are given back, by what they mean: ``prediction``, and ``lower`` and ``upper`` bounds.
+        results: values that the graph returns, by meaning: ``prediction``, and ``lower`` and ``upper`` bounds.
         initial: values of slots after a reset that are not all one number, by ``(layer, slot)``.
         window: ticks after a reset until predictions rest on a whole window.
     """

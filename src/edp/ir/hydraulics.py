@@ -30,8 +30,8 @@ class HydraulicTick(Layer):
         scale: see there.
         offset: offset of each output, in internal units; `answer_width` is its width.
         answer_width: see there.
-        linkage: of three cylinders, as `edp.networks.twin.grey.parameter_index` orders it; one zero: the load is
-            polynomials.
+        linkage: linkage of three cylinders in the order of `edp.networks.twin.grey.parameter_index`; a single zero if
+            the load consists of polynomials.
         sides: commands that extend and retract ``(valve, 2)``.
         valve_at: places of each valve's numbers ``(valve, 13)``.
         valve_actuator: actuator of each valve.

@@ -69,7 +69,7 @@ class Reference(Interpreter):
 
     Args:
         graph: the layers.
-        dtype: float64 shows what the graph means, float32 what single precision makes of it.
+        dtype: float64 for the exact result of the graph, float32 for its result in single precision.
     """
 
     # Double precision by default: the reference judges single-precision forms, so its own rounding must not show.

@@ -24,7 +24,7 @@ class AdaptedStream(Stream):
 
     Attributes:
         adapter: learned correction; `adapter.learned` is saved across a restart, `adapter.restore` loads it.
-        learn: False freezes what was learned.
+        learn: whether the correction continues to learn; False keeps the learned correction constant.
         status: status of the adaptation in the last step.
         correction: added correction ``(horizon, target)``, SI units.
     """

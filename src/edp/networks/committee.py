@@ -86,7 +86,7 @@ class Committee(Streaming):
     A linear head on it is a linear model plus a weighted mean of perceptrons, a kernel machine and sums of trees.
 
     Args:
-        bank: gives what the others read.
+        bank: lag bank that computes the inputs of all other parts.
         groups: groups of perceptrons.
         radial: nearness to typical rows; None for none.
         near: nearness in few columns, each one to typical rows.

@@ -63,7 +63,7 @@ class LagBank(Streaming):
     Attributes:
         gain: factor of each change, ``(lag + smoothed, width)``; training sets it to the inverse standard deviation.
         low: least value of each column, ``(columns,)``, of a bounded bank; until it is set it holds nothing back.
-        high: largest likewise.
+        high: largest value of each column, ``(columns,)``, of a bounded bank.
     """
 
     gain: Tensor

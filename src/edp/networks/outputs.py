@@ -89,7 +89,7 @@ class Output(nn.Module):
         """Add lower and upper bounds, ``coverage * horizon * output`` standardised elements each; None for a point.
 
         Args:
-            build: takes the layers.
+            build: builder of the layer graph.
             center: the prediction, ``horizon * output``.
             y: output of the heads, ``horizon * value * output``.
         """
@@ -179,7 +179,8 @@ class Quantiles:
 
     Attributes:
         levels: increasing, between 0 and 1, symmetric about the median 0.5.
-        calibrated: segment the intervals after training so that they hold their share of the validation part.
+        calibrated: whether the intervals are scaled after training, so that they contain their fraction of the
+            validation data.
 
     Raises:
         ConfigError: levels that are not as said.
@@ -252,7 +253,8 @@ class _Law:
 
     Attributes:
         coverages: coverages of the calibrated and evaluated intervals, decreasing.
-        calibrated: segment the intervals after training so that they hold their share of the validation part.
+        calibrated: whether the intervals are scaled after training, so that they contain their fraction of the
+            validation data.
 
     Raises:
         ConfigError: coverages that are not decreasing between 1 and 0.

@@ -34,7 +34,7 @@ class ModelSpec:
         backbone: options of a registered backbone.
         head: options of registered per-output heads.
         activation: options of a registered output activation.
-        output: options of a registered output: what is said of each target in addition to a prediction.
+        output: options of a registered output: point, quantiles or an error distribution per target.
         blocks: options of registered blocks; absent means not built.
         window: W, samples of trailing context of pooling, and the length of the window regime.
         physics: options of a registered physics base; None for no base.

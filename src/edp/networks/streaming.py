@@ -109,7 +109,7 @@ class Streaming(nn.Module, ABC):
         """Add the layers that compute this part tick by tick to a graph, as in evaluation.
 
         Args:
-            build: takes the layers.
+            build: builder of the layer graph.
             x: name of the value that the part reads.
 
         Returns:

@@ -53,8 +53,8 @@ class SimulationOrder(DataSetSpec):
     Attributes:
         suffix: ending of the logs, which settles their format.
         layout: layout of MAT files, a name in `edp.logs.LAYOUTS`; empty for the plain one.
-        truth: where the channels go that only a simulation knows, see `edp.logs.WriteOptions`; empty for ``apart``
-            in a layout that was asked for, else ``with`` the others.
+        truth: place of the channels that only a simulation provides, see `edp.logs.WriteOptions`. Empty means ``apart``
+            for a requested layout, else ``with``.
     """
 
     suffix: str = ".parquet"
@@ -142,7 +142,7 @@ def simulate_data_set(
 
     Args:
         out: folder; it may hold nothing but an earlier part of the same data set.
-        order: what to simulate; an hour of machine M22 by default.
+        order: data set to simulate; by default one hour of machine M22.
         workers: who simulates; nodes see the folder under the same path.
         on_done: called with the scenario of each log and whether the log was there already.
 
@@ -248,7 +248,7 @@ def find_data_set_limit(
 
     Args:
         folder: the folder of the data set.
-        order: what was simulated into it.
+        order: data set that was simulated.
         spec: moments, branches and horizons.
         workers: who simulates; recordings that are done are not done again after a stop.
         progress: receiver of the progress; its units are recordings.

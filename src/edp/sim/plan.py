@@ -65,12 +65,12 @@ class DataSetSpec:
         family: number of random machines that replace `machine`; 0 for none.
         masses: lightest and heaviest machine of the family, t.
         scatter: scatter of the machines of the family about the laws of scaling: a factor, at most 2.5.
-        mix: share of the recordings by excitation.
-        materials: share of the recordings of families that work the ground (grading, dig) by soil; ``air`` is none.
-            The other families always move in free air.
+        mix: fraction of the recordings per excitation.
+        materials: fraction of the recordings per soil, for excitations that work the ground (grading, dig); ``air`` is
+            free air. All other excitations move in free air.
         rate_hz: samples per second.
         step_s: integration step.
-        start_strokes: range of the strokes to start from, as shares of full.
+        start_strokes: range of the initial strokes, as fractions of the full stroke.
         sensor_noise: False logs the truth.
         sensors: values that replace those of the machine's ``[sensors]``.
         faults: faults of machine and sensors in every recording; see `edp.sim.faults`.

@@ -39,7 +39,7 @@ class Scenario:
         step_s: integration step; cut in four near the ends of the stroke.
         sensor_noise: False logs the truth.
         material: soil that the bucket works in, see `edp.sim.physics.material.material_names`; empty for free air.
-        start_strokes: range of the strokes to start from, as shares of full.
+        start_strokes: range of the initial strokes, as fractions of the full stroke.
         sensors: values that replace those of the machine's ``[sensors]``, by key: to switch faults on or off.
         seed: random seed. Equal seeds give equal bits on the same machine.
         faults: faults of machine and sensors, each as a text or as a table; see `edp.sim.faults`.

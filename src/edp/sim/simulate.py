@@ -167,7 +167,7 @@ def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None
 
     Args:
         scenario: scenario to simulate.
-        progress: called with the share done, 0 to 1, now and then.
+        progress: callback with the completed fraction, 0 to 1.
 
     Returns:
         The 24 channels of Table A.1 as sensors show them, then `EXTRA_CHANNELS` without noise; float32, SI units.

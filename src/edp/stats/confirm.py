@@ -26,7 +26,7 @@ class Rule:
 
     Attributes:
         alpha: level of the adjusted p-value.
-        least_gain: improvement of the mean score over the baseline's that is worth having, as a share.
+        least_gain: minimum improvement of the mean score over the baseline's that is relevant, as a fraction.
         interim_analyses: interim analyses of the race; empty to run every module to the end.
         level: confidence level of the intervals.
     """
@@ -61,7 +61,7 @@ class ModuleEvidence:
         paired_p: p-value of the plain t-test on run means.
         mixed_p: p-value of the thesis's mixed model on run means.
         d_z: effect size of the run means; None with fewer than two runs.
-        stability: share of the runs in which the module won.
+        stability: fraction of the runs in which the module improved the score.
     """
 
     module: str

@@ -28,8 +28,8 @@ class Factorial:
         factors: names.
         levels: ``(run, factor)``, True where on.
         exclusive: groups of factors of which at most one is on.
-        alias: the largest share of a two-factor interaction that gets into a main effect; 0 in resolution IV.
-            Main effects are averages over the other factors at the rates with which the design has them on.
+        alias: largest fraction of a two-factor interaction that adds to a main effect; 0 in resolution IV. Main effects
+            are averages over the other factors at the rates of the design.
         error: the largest standard error of a main effect (on minus off) over the noise of one run.
     """
 

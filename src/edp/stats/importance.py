@@ -25,7 +25,7 @@ class MainEffect:
         effect: mean score with the factor minus mean score without it, in the unit of the scores; negative is better.
         error: standard error.
         p: one-sided, small where on is better.
-        importance: the factor's share of the variance that all factors explain, 0 to 1.
+        importance: fraction of the explained variance that belongs to the factor, 0 to 1.
         passed: p is at most the screening's level.
     """
 

@@ -119,7 +119,7 @@ def interval_score(lower: ArrayLike, upper: ArrayLike, truth: ArrayLike, coverag
         lower: ``(sample,)`` in the unit of the score.
         upper: upper bounds, same shape.
         truth: true values, same shape.
-        coverage: share of the truth that the interval is meant to hold, between 0 and 1.
+        coverage: intended fraction of the truth within the interval, between 0 and 1.
 
     Raises:
         DataError: see `interval_scores`; also for a coverage outside 0 to 1.

@@ -19,7 +19,7 @@ def fill_worst(scores: ArrayLike, tested: ArrayLike | None = None, worst: ArrayL
     Args:
         scores: ``(arm, run, session)``, lower is better; NaN or infinite where a run failed.
         tested: ``(run, session)``, the planned cells; None: all.
-        worst: ``(session,)``, the least that a failure costs; None: what was seen.
+        worst: minimum loss of a failed run ``(session,)``; None uses the recorded losses.
 
     Returns:
         ``(arm, run, session)``, finite; zero outside the planned cells.

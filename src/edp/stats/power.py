@@ -24,7 +24,7 @@ class ConfirmationPlan:
         runs: training runs of each arm, a whole number of repeats; None where no number suffices.
         power: power for this number of runs.
         limit: power with endlessly many runs on these sessions.
-        sessions_needed: sessions with which `runs` of them would do; None where these suffice.
+        sessions_needed: number of sessions for which `runs` runs suffice; None if the present sessions suffice.
         reason: the answer as a sentence.
     """
 

@@ -20,7 +20,7 @@ class InterimAnalysis:
     """Interim analysis of the data until now.
 
     Attributes:
-        runs: after which it is taken.
+        runs: number of runs after which the analysis takes place.
         drop_above: a module with a larger one-sided p-value is dropped.
     """
 
@@ -87,9 +87,9 @@ class RaceRates:
     """Operating characteristics of a race for a module of known effect, over simulated studies.
 
     Attributes:
-        confirmed: share with p below alpha at the end.
+        confirmed: fraction with p below alpha at the end.
         confirmed_without: fraction confirmed without interim analyses.
-        dropped: share dropped at each interim analysis, by its number of runs.
+        dropped: fraction dropped at each interim analysis, by number of runs.
         mean_runs: mean number of runs of the module.
     """
 

@@ -79,7 +79,7 @@ def changing_flags(
 
     Args:
         names: channels.
-        lagged: covariances of every piece.
+        lagged: lagged covariances of every segment.
         judged: columns that may be flagged.
         trusted: columns that a channel is held against.
         support: largest correlation of each channel with a target over all segments, ``(channel,)``. Of two channels

@@ -203,7 +203,7 @@ def copy_flags(
         names: channels.
         pairs: pairs of equal channels, usually in both directions.
         trusted: columns of the channels known to be measured; never flagged.
-        innovation: share of each channel's variance that its own past does not explain, ``(channel,)``.
+        innovation: fraction of each channel's variance that its own past does not explain, ``(channel,)``.
         settled: columns that are flagged already, of no use as originals.
     """
     flags: dict[int, Flag] = {}

@@ -30,8 +30,8 @@ class Lagged:
     Attributes:
         live: columns of the table that the channels here are, ``(channel,)``.
         reach: largest lag.
-        sums: ``[p, reach + lag, i, j]`` sums ``x_i[t + lag] x_j[t]`` over piece p, float32.
-        samples: rows of each piece, ``(segment,)``.
+        sums: sums of ``x_i[t + lag] x_j[t]`` over segment p, as ``[p, reach + lag, i, j]``, float32.
+        samples: number of rows of each segment, ``(segment,)``.
         chance: correlations of channels with targets of other segments, ``(segment, shift, lag, channel, target)``.
     """
 
@@ -121,7 +121,7 @@ def compute_lagged_covariances(
         table: the data.
         reach: largest lag, samples.
         shifts: number of other segments with which each segment is paired to estimate the level of chance.
-        on_share: hears the share that is done.
+        on_share: callback with the completed fraction.
     """
     live = np.flatnonzero(table.live)
     spectra = _Spectra(table, reach, live)

@@ -44,7 +44,7 @@ class ScreeningEvidence:
         live: columns of the table that change.
         correlations: correlations of live channels over all segments, ``[reach + lag, i, j]``.
         relations: tests of live channels against targets.
-        pieces: correlation of each piece at the best lag with the best target, ``(segment, live channel)``.
+        pieces: correlation at the best lag with the best target in each segment, ``(segment, live channel)``.
         curves: lag curves.
         importance: permutation importance in the forest, all entries.
         values: Granger gains in linear models.

@@ -92,12 +92,12 @@ def linear_values(
 
     Args:
         names: names of the channels of `lagged`.
-        lagged: covariances of every piece.
+        lagged: lagged covariances of every segment.
         used: columns that a model may read; targets too, unless the horizon is 0.
         targets: columns of the targets.
         horizon: samples ahead.
         held_out: segments that evaluate; the others train.
-        on_share: hears the share that is done.
+        on_share: callback with the completed fraction.
     """
     train = _correlations(lagged, np.setdiff1d(np.arange(len(lagged.samples)), held_out))
     read = [k for k in used if horizon > 0 or k not in targets]
@@ -142,7 +142,7 @@ def window_needed(
     """Return the shortest history for which a linear prediction is about as good as for the longest history evaluated.
 
     Args:
-        lagged: covariances of every piece.
+        lagged: lagged covariances of every segment.
         used: columns that a model may read.
         targets: columns of the targets.
         horizon: samples ahead.

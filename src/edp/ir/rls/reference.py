@@ -116,7 +116,7 @@ class RlsCorrector:
             inputs: inputs of this sample ``(I,)``, SI units.
             prediction: the network's from them ``(H, J)``, SI units.
             fresh: whether they are this tick's own, and the prediction rests on a whole window.
-            learn: False freezes what was learned; it is evaluated all the same.
+            learn: whether the correction learns; False keeps it constant, and it is still evaluated.
 
         Returns:
             The corrected prediction ``(H, J)`` in SI units, and what was done. Numbers that are not finite are given

@@ -42,7 +42,7 @@ def calibrate(
     Args:
         graph: the float network.
         recordings: inputs ``(time, input)`` in SI units, of the training part.
-        ticks: about how many of them run through the whole network.
+        ticks: approximate number of samples that run through the whole network.
         error_of: the network's error when its standardised inputs have so many fractional bits and the others are as
             they were; None keeps the format in which nothing is clipped.
 

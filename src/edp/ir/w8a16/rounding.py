@@ -26,8 +26,8 @@ class WeightRounding:
 
     Attributes:
         weights: integers found before, by matrix.
-        moments: mean ``x x'`` of what a matrix is multiplied by, ``(terms, terms)``, or ``(row, terms, terms)`` where
-            each row has its own input.
+        moments: mean ``x x'`` of a matrix's inputs x, ``(terms, terms)``, or ``(row, terms, terms)`` if each row has
+            its own input.
     """
 
     weights: Mapping[str, NDArray[np.int8]] = field(default_factory=dict)

@@ -49,7 +49,7 @@ class OutputSpace:
         features: scaled features.
         horizons: look-ahead times.
         outputs: targets.
-        present: for each target, the feature with its present value; None if it is not measured.
+        present: index of the feature with the present value of each target; None if the target is not measured.
         gain: ``(horizon, output)``; a present value in the standardised space of its target is its scaled feature
             times `gain` plus `shift`.
         shift: ``(horizon, output)``.

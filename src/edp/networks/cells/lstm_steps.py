@@ -45,7 +45,8 @@ def lstm_steps(
         norm: layer normalisation, optional: ``U h`` is normalised and multiplied by ``(4 units,)``; ``tanh`` acts on c
             after normalisation, multiplication and addition of ``(units,)`` each.
         state: h and c, each ``(batch, units)``.
-        share: ``h = h_before + share (h~ - h_before)``, and likewise c; 1 without zoneout.
+        share: fraction of the new state, ``h = h_before + share (h~ - h_before)``, and equally for c; 1 without
+            zoneout.
 
     Returns:
         h at every tick, ``(time, batch, units)``, and (h, c) after the last.

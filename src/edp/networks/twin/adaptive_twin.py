@@ -56,9 +56,9 @@ class NumberGroup:
     """Numbers of a grey box that grow and shrink together.
 
     Attributes:
-        powers: for each prefix of parameter names, the power of the group's factor that multiplies these parameters.
+        powers: power of the group's factor that multiplies the parameters of a name prefix, by prefix.
         deviation: prior deviation of the logarithm of the factor.
-        shared: one group for the machine; else one for each actuator, its valves included.
+        shared: whether all actuators share one group; otherwise each actuator has a group that includes its valves.
         per_kelvin: change of the logarithm per kelvin of oil temperature, if that is measured.
     """
 
@@ -85,11 +85,11 @@ class TunedSpec:
     Attributes:
         groups: names in `NUMBER_GROUPS` of the groups to adapt.
         learn_ticks: length of a segment that is run again.
-        forgetting_s: seconds of motion after which what was learned has 1/e of its weight.
+        forgetting_s: time constant of forgetting, in seconds of motion.
         gain: gain of the observer, as a fraction of the innovation.
         load_share: fraction of a new force that the estimate adopts per sample; 0 to estimate no forces.
-        oil_c: temperature of the oil (degC) in the logs to which the twin was fitted, for ticks that tell theirs; NaN:
-            not known.
+        oil_c: oil temperature (degC) in the recordings of the twin's fit, for samples with a measured oil temperature;
+            NaN if unknown.
 
     Raises:
         ConfigError: a value out of range or a group that does not exist.
@@ -211,9 +211,10 @@ class AdaptiveTwin:
         """Process one sample.
 
         Args:
-            command: ``(command,)``; one that is missing interrupts, since nothing is known of what moves then.
+            command: commands, shape ``(command,)``. A missing command interrupts the segment, because the motion is
+                then unknown.
             measured: ``(output,)``, NaN where a sensor is missing: that port runs free.
-            oil_c: temperature of the oil (degC); NaN, or beyond what oil can have: not measured.
+            oil_c: oil temperature (degC); NaN or an implausible value counts as not measured.
         """
         self._warm(oil_c)
         if not np.isfinite(command).all():

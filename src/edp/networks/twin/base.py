@@ -96,7 +96,7 @@ class Twin(ABC):
         """Return the state after a measured segment.
 
         Args:
-            commands: ``(batch, tick, command)``, at least `prefix_ticks` of them.
+            commands: commands of the prefix, ``(batch, tick, command)``, at least `prefix_ticks` samples.
             measured: ``(batch, tick, output)``; NaN where a sensor is missing, but not at the first tick.
 
         Raises:
@@ -118,7 +118,7 @@ class Twin(ABC):
 
         Args:
             command: ``(batch, command)``.
-            state: before it.
+            state: state of the twin before the command.
             measured: ``(batch, output)``, NaN where a port is free; None frees all.
 
         Returns:
@@ -133,7 +133,7 @@ class Twin(ABC):
 
         Args:
             commands: ``(batch, tick, command)``.
-            state: before the first tick.
+            state: state of the twin before the first sample.
             measured: ``(batch, tick, output)``, NaN where a port is free; None frees all.
 
         Returns:
@@ -200,7 +200,7 @@ class Twin(ABC):
 
         Args:
             feedback: feedback inputs ``(batch, output)``.
-            velocity: proposed velocities ``(batch, velocity)``; `pressure` likewise.
+            velocity: proposed velocities ``(batch, velocity)``.
             pressure: proposed pressures.
         """
         count, strokes = len(self.channels.velocities), len(self.channels.strokes)
@@ -284,7 +284,7 @@ class TwinRunner:
 
         Args:
             command: ``(command,)``, finite.
-            state: before it, a batch of one; it stays as it is.
+            state: state before the command, a batch of one; it is not changed.
             measured: ``(output,)``, NaN where a port is free.
         """
         return self.twin.step(command[None], state, measured[None])[1]

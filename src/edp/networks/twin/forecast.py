@@ -65,7 +65,7 @@ def choose_gain(twin: Twin, series: Sequence[Series], horizons: Sequence[int]) -
 
     Args:
         twin: any formulation.
-        series: inputs are commands, targets are what the twin outputs; the first ones are used.
+        series: segments with commands as inputs and twin outputs as targets; only the first segments are used.
         horizons: horizons in samples.
     """
     ends, parts = sorted({min(horizons), max(horizons)}), list(series)[:CHOICE_LOGS]

@@ -66,7 +66,7 @@ class N4sid:
     segments, K from the covariance of what is left by a Riccati equation.
 
     Attributes:
-        orders: numbers of states to choose from; those beyond what the rows of outputs can tell are cut to that.
+        orders: candidate numbers of states. Orders above the rank of the output rows are reduced to this rank.
         horizon: rows of past and of future, in ticks.
         prefix_ticks: measured ticks before a free run.
 
@@ -201,7 +201,8 @@ class _Projections:
     Attributes:
         horizon: rows of past and of future.
         pairs: the segments.
-        left: left singular vectors of what the past tells of the freed future ``(horizon * output, rank)``.
+        left: left singular vectors of the future outputs' projection on the past, without the effect of future
+            commands, ``(horizon * output, rank)``.
         sizes: their singular values.
         by_past: future outputs by past commands and outputs ``(horizon * output, horizon * (command + output))``.
     """

@@ -43,8 +43,8 @@ class Recurrent:
     Attributes:
         units: width of its memory, that of all members together.
         members: networks whose changes are averaged.
-        valve_map: whether velocities and pressures are also pulled to what a static map (`StaticMap`) says of the
-            commands; how strongly is learned. A twin that has learned nothing else is that map.
+        valve_map: whether velocities and pressures are also pulled to the outputs of a static map (`StaticMap`) of the
+            commands. The strength of the pull is trained. Without training, the twin equals the static map.
         prefix_ticks: measured ticks before a free run, in which its memory forms.
 
     Raises:
@@ -122,8 +122,8 @@ class RecurrentTwin(Twin):
     State: ``answer`` scaled, ``h`` ``(batch, units)``, and with a static map the ``commands`` of its delay.
 
     Args:
-        channels: what commands it and what it outputs.
-        scales: of its numbers, and the bounds of its outputs.
+        channels: commands and outputs of the twin.
+        scales: scales of commands and outputs, and bounds of the outputs.
         prefix_ticks: least number of measured ticks before a free run.
         network: the cell.
         static: the map to which its outputs are pulled; None where the network has no pull.
@@ -159,9 +159,9 @@ class RecurrentTwin(Twin):
         """Simulate scaled outputs ``(time, batch, output)`` from measured starts, with gradients by the weights.
 
         Args:
-            commands: what `drive` made of them ``(time, batch, number)``.
+            commands: result of `drive` ``(time, batch, number)``.
             measured: scaled ``(time, batch, output)``, any finite number where `port` is 0.
-            port: 1 where a port reads what was measured; all of the first tick.
+            port: 1 if a port reads the measured value, which is required in the first sample; else 0.
         """
         count = len(self.channels.commands)
         mapped = None if self.static is None else commands[..., count:]
@@ -204,7 +204,7 @@ class RecurrentTwin(Twin):
 
         Args:
             commands: SI units.
-            state: of one machine, that of all batch.
+            state: state of one machine, used for all runs.
         """
         if self.static is None:
             return np.zeros((0, 0, 0), np.float32), np.zeros((0, 0, 0), np.float32)
@@ -334,7 +334,7 @@ def averaged(twins: Sequence[RecurrentTwin]) -> RecurrentTwin:
     gates are theirs side by side and whose outputs have their weights over the number of twins.
 
     Args:
-        twins: at least one; none with a static map, or all, with the same corners and delay.
+        twins: at least one twin; all or none with a static map, and the maps with equal corners and delay.
     """
     first, count = twins[0], len(twins)
     if count == 1:

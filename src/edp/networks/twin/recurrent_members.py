@@ -61,9 +61,9 @@ def _is_stop(there: Sequence[np.ndarray], pushes: Sequence[np.ndarray], rate_hz:
     """Return whether an outermost place is an end stop.
 
     Args:
-        there: of each segment, tick by tick, whether it is there.
-        pushes: the lever towards that place, as a share of its largest value; empty: nothing tells which lever it is.
-        rate_hz: of the ticks.
+        there: mask of the samples at the position, one array per segment.
+        pushes: lever command towards the position, as a fraction of its maximum; empty if the lever is unknown.
+        rate_hz: sample rate, Hz.
     """
     if sum(_visits(one, round(APART_S * rate_hz)) for one in there) >= VISITS:
         return True

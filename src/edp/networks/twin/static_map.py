@@ -107,8 +107,8 @@ class StaticTwin(Twin):
         """Return the weighted mean of maps with equal corners and delay.
 
         Args:
-            maps: at least one.
-            weights: of each map and output ``(map, all answers but strokes)``, their sum over maps 1.
+            maps: list of at least one map.
+            weights: weight of each map and output ``(map, all answers but strokes)``, with sum 1 over the maps.
         """
         first = maps[0]
         if all(one is first for one in maps):

@@ -109,14 +109,14 @@ def run_forward(
         inputs: the commands' part of the gates ``(time, batch, 3 units)``, biases included; measured values ``(time,
             batch, output)``, any finite number where a port is free; ports of that shape, 1 where one reads what was
             measured, 0 where it reads the last output; and what the static map says, of that shape, empty without one.
-        weights: of feedback ``(output, 3 units)``, of h ``(units, 3 units)``, bias of n's inner sum ``(units,)``, of
-            the outputs ``(units, output)`` and their bias ``(output,)``, and p ``(output,)``, zero for strokes; without
-            a map p is empty.
+        weights: weights of the feedback ``(output, 3 units)`` and of h ``(units, 3 units)``, bias of n's inner sum
+            ``(units,)``, weights ``(units, output)`` and bias ``(output,)`` of the outputs, and pull p ``(output,)``,
+            zero for strokes; p is empty without a map.
         bounds: scale of changes, low, high ``(output,)``, and the trapezoid ``(stroke,)``.
         velocities: number of velocities, the first outputs.
         start: last output ``(batch, output)`` and h ``(batch, units)``.
-        saved: written: outputs, fed values, and where no bound acts, each ``(time, batch, output)``; gates ``(time,
-            batch, 3 units)``; inner ``(time, batch, units)``; h ``(time + 1, batch, units)``.
+        saved: results: outputs, fed-back values and mask of inactive bounds, each ``(time, batch, output)``; gates
+            ``(time, batch, 3 units)``; inner sums ``(time, batch, units)``; h ``(time + 1, batch, units)``.
     """
     projected, measured, port, mapped = inputs
     feedback_weight, h_weight, inner_bias, out_weight, out_bias, pull = weights
@@ -171,16 +171,16 @@ def run_branches(
     """Simulate branches of one run in free run; the common part before each branch is computed once.
 
     Args:
-        inputs: commands in SI units ``(time, run, command)``, and what the static map says ``(time, run, output)``,
-            empty without one.
-        weights: of commands in SI units and feedback ``(command + output, 3 units)`` and bias of the gates
-            ``(3 units,)``; of h, bias of n's inner sum, of the outputs, their bias, and p as in `run_forward`, those of
-            the outputs already scaled; offset and width of the outputs ``(output,)``.
-        bounds: of the outputs.
-        velocities: number of them.
-        start: what the ports read at the first tick ``(output,)``, and h ``(units,)``, of all batch.
-        first: tick at which each lane branches off lane 0 ``(run,)``, ascending, that of lane 0 zero.
-        results: written.
+        inputs: commands in SI units ``(time, run, command)``, and outputs of the static map ``(time, run, output)``,
+            empty without a map.
+        weights: weights of commands in SI units and feedback ``(command + output, 3 units)``, and bias of the gates
+            ``(3 units,)``; then weights of h, bias of n's inner sum, scaled weights and bias of the outputs, and p, as
+            in `run_forward`; then offset and width of the outputs ``(output,)``.
+        bounds: bounds of the outputs.
+        velocities: number of velocities.
+        start: port readings at the first sample ``(output,)``, and h ``(units,)``, equal for all runs.
+        first: sample at which each run branches off run 0 ``(run,)``, ascending; 0 for run 0.
+        results: buffers for the results.
     """
     answers = results.outputs
     commands, mapped = inputs
@@ -240,11 +240,11 @@ def gates_back(
     Args:
         by_h: gradient by the next h ``(batch, units)``; written: by h, but for its part in the products.
         from_out: gradient by the next h that its outputs add.
-        gates: of the forward run; `inner` and `h` likewise.
+        gates: gates of the forward run.
         inner: sums of n.
-        h: before.
-        grads: written: by the pre-activations ``(batch, 3 units)``, by `inner`, and both as the products with h see
-            them ``(batch, 3 units)``.
+        h: h before the sample.
+        grads: results: gradients by the pre-activations ``(batch, 3 units)``, by `inner`, and both combined for the
+            products with h ``(batch, 3 units)``.
     """
     by_gates, by_inner, by_up = grads
     batch, units = by_h.shape
@@ -278,14 +278,14 @@ def run_backward(
 
     Args:
         grad_answers: gradient by the outputs ``(time, batch, output)``.
-        port: as in the forward run; `weights`, `bounds`, `velocities` and `saved` likewise.
-        weights: of the cell.
-        bounds: of the outputs.
-        velocities: number of them.
-        saved: what the forward run wrote.
-        grads: written: by the gates' pre-activations ``(time, batch, 3 units)``, by n's inner sum ``(time, batch,
-            units)``, by o ``(time, batch, output)``; and by the start: last output and h. The last one comes in as the
-            gradient by the final h, the one before it as that by the final output.
+        port: port flags of the forward run.
+        weights: weights of the cell.
+        bounds: bounds of the outputs.
+        velocities: number of velocities.
+        saved: results of the forward run.
+        grads: results: gradients by the gates' pre-activations ``(time, batch, 3 units)``, by n's inner sum ``(time,
+            batch, units)``, by o ``(time, batch, output)``, and by the start (last output and h). On entry the last two
+            contain the gradients by the final output and by the final h.
     """
     feedback_weight, h_weight, _, out_weight, _, pull = weights
     scale, _, _, trapezoid = bounds

@@ -25,7 +25,7 @@ class SimulatorBatch(PlantBatch):
     """Simulated excavator fronts, each with its own machine, soil and seed.
 
     Args:
-        settings: of each machine; they show the same channels at the same rate.
+        settings: settings of each machine, with equal channels and sample rates.
 
     Attributes:
         models: the nominal machine of each present episode, or of the next one where none has begun.

@@ -28,7 +28,7 @@ class SingleEnvironment(gymnasium.Env[Observation, Observation]):
     """An environment that is a batch of one episode.
 
     Args:
-        batch: of one episode.
+        batch: batch of one episode.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012  as Gymnasium declares it
@@ -44,7 +44,7 @@ class SingleEnvironment(gymnasium.Env[Observation, Observation]):
         """Begin an episode.
 
         Args:
-            seed: of all that is random in the episode; None goes on with the environment's own generator.
+            seed: seed of all random values in the episode; None continues with the environment's generator.
             options: settings for this episode alone.
 
         Returns:
@@ -89,7 +89,7 @@ class ExcavatorEnv(SingleEnvironment):
     ``material`` and ``truth``, which each step says as well.
 
     Args:
-        settings: what is simulated and shown.
+        settings: settings of the machine and its observations.
         render_mode: None; there is nothing to render.
         changes: settings of an `EnvironmentSpec` laid over these.
 

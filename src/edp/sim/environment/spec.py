@@ -41,13 +41,13 @@ class EnvironmentSpec:
         sensor_noise: False shows the truth.
         hand: whether an operator's hand smooths the levers, as in `Simulation`.
         loop_latency: ticks by which observations come later.
-        lost_frames: share of ticks at which the observation before is shown again.
-        start_strokes: range of the strokes to start from, as shares of full.
+        lost_frames: fraction of the samples at which the previous observation is repeated.
+        start_strokes: range of the initial strokes, as fractions of the full stroke.
         observed: names of the channels shown, of Table A.1 or of those that `simulate` logs beside it.
         sensors: values that replace those of the machine's ``[sensors]``, by key.
         randomise: True or a spread draws a machine of the family of M22 at each reset; the spread widens its scatter.
         masses_t: range of the masses of that family.
-        faults: of machine and sensors; each may be given as a text or as a table, see `edp.sim.faults`.
+        faults: faults of machine and sensors, each as a text or as a table, see `edp.sim.faults`.
 
     Raises:
         ConfigError: a value is out of range, or a machine, material or channel is unknown (the closest is offered).

@@ -37,8 +37,8 @@ class Truth(Mapping[str, object]):
         rows: the present row of the plant's log, shape (columns,), or one for each of many machines.
         pilot_pressure: full pilot pressure, Pa; for many machines shape (machine,).
         in_soil: whether there is ground to name.
-        faults: how many faults are named at most.
-        shares: gives how much of each fault is there, shape (machine, fault); None where there are none.
+        faults: maximum number of faults in the truth.
+        shares: function that returns the current fraction of each fault, shape (machine, fault); None without faults.
     """
 
     __slots__ = ("_faults", "_pilot_pressure", "_rows", "_shares", "_sources")

@@ -42,11 +42,11 @@ class EpisodeStart:
 
     Attributes:
         scenario: machine, soil, rate, seed and length; its excitation is not used.
-        machine: the machine itself, which may be drawn or changed.
+        machine: machine parameters, which may be randomised or changed.
         hand: whether an operator's hand smooths the levers.
         loop_latency: ticks by which observations come later.
-        lost_frames: share of ticks at which the observation before is shown again.
-        strokes: where the cylinders start, shares of full; drawn where None.
+        lost_frames: fraction of the samples at which the previous observation is repeated.
+        strokes: initial strokes as fractions of the full stroke; random if None.
     """
 
     scenario: Scenario
@@ -71,12 +71,12 @@ class Episodes:
     """Machines under way, one a row.
 
     Args:
-        count: how many.
-        columns: what observations show, numbers of `tick.SOURCES`.
+        count: number of machines.
+        columns: observed columns, as indices of `tick.SOURCES`.
 
     Attributes:
-        starts: how each began; None where none has.
-        most_faults: largest number of faults that one of them has.
+        starts: start of each episode; None before the first reset.
+        most_faults: largest number of faults of any episode.
     """
 
     def __init__(self, count: int, columns: NDArray[np.int64]) -> None:

@@ -181,10 +181,10 @@ def step_all(
 
     Args:
         memory: rows that change, shape (episode, ...).
-        drawn: rows that were drawn, shape (episode, ...).
+        drawn: rows of random values, shape (episode, ...).
         levers: positions, shape (episode, 3); beyond [-1, 1] they stand at the end.
         active: episodes to step, shape (episode,).
-        columns: what is shown, see `SOURCES`.
+        columns: observed columns, see `SOURCES`.
         scratch: at least `SCRATCH` and ``6 (MAX_PAST + 2) + 9`` values.
         out: filled for the active ones.
     """

@@ -89,9 +89,10 @@ def push(points: Array, moved: float, share: float, heights: Array, memory: Arra
     Args:
         points: x and y of tip and of heel (m).
         moved: way outwards in this step (m).
-        share: of the soil, which goes ahead; the rest flows around the bucket and lies behind it.
+        share: fraction of the soil that moves ahead of the bucket; the rest flows around the bucket and stays behind
+            it.
         heights: profile.
-        memory: of the ground, with its ruts.
+        memory: memory of the ground, including its ruts.
     """
     rear, front, low, high = points[0], points[2], points[1], points[3]
     if front < rear:

@@ -47,10 +47,11 @@ class Material:
         swell: loose over bank volume.
         roughness: spread of the logarithm of the resistance along the way.
         roughness_length: length over which it varies, m.
-        sawtooth: share of the resistance lost when a chip breaks off.
-        compaction: share of the heel's lasting sinkage, up to 0.1 m of it, that stays as a rut once the heel has left.
-        back_push: share of the soil in the way of the bucket's back that it pushes ahead; the rest flows around it and
-            lies behind. 0: the back meets resistance and moves no soil.
+        sawtooth: fraction of the resistance that is lost when a chip breaks off.
+        compaction: fraction of the heel's permanent sinkage, up to 0.1 m, that remains as a rut after the heel has
+            left.
+        back_push: fraction of the soil in front of the bucket's back that the bucket pushes ahead; the rest flows
+            around the bucket and stays behind it. With 0, the back meets resistance and does not move soil.
         back_friction_deg: friction angle of the soil on the back while it pushes, at most that of the soil.
 
     Raises:

@@ -199,8 +199,8 @@ def rates(
 
     Args:
         joints: rates of the front, rad/s.
-        supply: both pumps' pressures, then what compensated sections show them, Pa.
-        motors: at their state where slopes are asked for, otherwise at that of the second stage.
+        supply: pressures of both pumps, and the load pressures that compensated sections signal to the pumps, Pa.
+        motors: state of the motors: the current one if derivatives are requested, otherwise that of the second stage.
         plant: parameters.
         jacobian: whether slopes are asked for.
         front: torque balance of the front, to which the torques are added that fling it outwards.

@@ -137,9 +137,9 @@ class Plant:
 
     Args:
         machine: the parameter set.
-        strokes: initial strokes as a share of each cylinder's stroke, shape (3,).
+        strokes: initial strokes as fractions of each cylinder's stroke, shape (3,).
         rate_hz: logging and command rate.
-        step_s: integration step; a whole number of them must fill a sample.
+        step_s: integration step, s; the sample time must be a multiple of it.
         ground: ground that the bucket digs in; None in free air.
         spare_s: dead time that may be added while it runs, s.
         moves: whether swing and travel move, too; without them both do not move and take no oil.

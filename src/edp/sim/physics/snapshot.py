@@ -29,11 +29,11 @@ class Snapshot:
     """A simulation at one instant.
 
     Attributes:
-        scenario: what is simulated, as plain data.
+        scenario: simulated scenario, as a dictionary of JSON types.
         samples: samples done so far.
         state: everything that changes, as JSON-able data; arrays are places in `arrays`.
         arrays: the arrays.
-        log: what was logged so far, shape (samples, columns).
+        log: logged samples, shape (samples, columns).
     """
 
     scenario: Table

@@ -18,7 +18,7 @@ class Bus:
         period: time between two frames of an ECU.
         latency: shortest and longest time from taking a value to its arrival at the logger.
         jitter: rms of the latency from frame to frame, before it is cut to its bounds.
-        loss: share of frames that never arrive.
+        loss: fraction of lost frames.
     """
 
     period: float
@@ -52,7 +52,7 @@ def frames(samples: int, rate_hz: float, bus: Bus, phase: float, latency_s: floa
         samples: samples of the recording.
         rate_hz: their rate.
         bus: timing of the bus.
-        phase: the ECU's clock against the logger's, as a share of the period.
+        phase: time offset between the clocks of the ECU and of the logger, as a fraction of the period.
         latency_s: usual latency of this ECU.
         rng: source of jitter and losses.
     """

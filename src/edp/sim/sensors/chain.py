@@ -167,7 +167,7 @@ def sense(
         sample: the tick's row of the log, shape (1, columns).
         kelvin: oil temperature.
         tick: counted from 0.
-        drawn: the tick's row of `draws.draw`.
+        drawn: random values of the sample, a row of `draws.draw`.
         setup: result of `draws.pack_sensors`.
         state: memory, history (a ring of ticks), scratch of shape (2, 3) and memory of the faults.
         out: filled.

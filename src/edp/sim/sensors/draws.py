@@ -23,9 +23,9 @@ class Instance:
     """Properties that differ between machines of one type and are constant over recordings.
 
     Attributes:
-        pressure_offset: offsets of the six cylinder pressures as a share of full scale.
-        phase: clock of each of `ECUS` against the logger's, as a share of the frame period.
-        latency_s: usual latency of each of them.
+        pressure_offset: offsets of the six cylinder pressures, as fractions of full scale.
+        phase: time offset between the clocks of each of `ECUS` and of the logger, as a fraction of the frame period.
+        latency_s: mean latency of each of `ECUS`, s.
     """
 
     pressure_offset: Array

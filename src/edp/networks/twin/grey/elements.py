@@ -147,7 +147,7 @@ class ValveElement:
         retract: channel that commands retraction.
         supply: name of the pump; empty: a supply of constant pressure.
         meter_out: whether it opens the other chamber to the tank, too; a second spool may only feed.
-        regeneration: whether a part of what leaves goes to the other chamber.
+        regeneration: whether a part of the outflow returns to the other chamber.
     """
 
     name: str

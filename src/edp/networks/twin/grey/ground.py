@@ -36,7 +36,7 @@ class GroundContact(ABC):
         """Return forces against the actuators (N) in the next sample.
 
         Args:
-            strokes: before it, of each actuator, m.
+            strokes: strokes of all actuators before the sample, m.
             free: velocities after it without any ground, m/s.
             slopes: derivatives of the velocities by a force against each actuator ``(actuator, actuator)``, m/s per N.
         """
@@ -51,7 +51,7 @@ class GroundLaw(ABC):
 
     Attributes:
         numbers: parameters of the law, SI units.
-        deviations: standard errors of these; an infinite one says that the logs do not tell.
+        deviations: standard errors of the parameters; infinite if the logs do not identify a parameter.
     """
 
     numbers: Array
@@ -65,7 +65,7 @@ class GroundLaw(ABC):
         Args:
             twin: twin with a known linkage.
             logs: strokes, velocities and estimated forces against each actuator, ``(tick, actuator)`` each, SI units.
-            machine: name or file of the machine, which says where the surface is.
+            machine: name or file of the machine, which defines the height of the ground surface.
 
         Raises:
             DataError: the logs are hardly ever in the ground.

@@ -49,8 +49,8 @@ def tip_at(linkage: Array, bucket_m: float, strokes: Array, tip: Array, slopes: 
         linkage: linkage of `parameter_index`.
         bucket_m: length of the last body, m.
         strokes: ``(actuator,)``, m.
-        tip: written ``(2,)``, m.
-        slopes: written ``(2, actuator)``.
+        tip: result: position of the tip ``(2,)``, m.
+        slopes: result: derivatives of the position by the strokes, ``(2, actuator)``.
     """
     slopes[:] = 0.0
     x, y, angle = 0.0, 0.0, 0.0
@@ -139,12 +139,12 @@ def hold(
 
     Args:
         front: linkage and length of the bucket, as `tip_at` reads them.
-        strokes: before the tick ``(actuator,)``, m.
+        strokes: strokes before the sample ``(actuator,)``, m.
         free: velocities after it without any ground ``(actuator,)``, m/s.
         slopes: derivatives of the velocities by a force against each actuator ``(actuator, actuator)``, m/s per N.
         numbers: parameters of the law ``(NUMBERS,)``.
         memory: profile, which is cut, and x of the tip before ``(1,)``.
-        forces: written ``(actuator,)``, N.
+        forces: result: ground forces ``(actuator,)``, N.
     """
     profile, last = memory
     n = len(strokes)
@@ -191,8 +191,8 @@ def follow(
         strokes: ``(tick, actuator)``, m.
         velocities: ``(tick, actuator)``, m/s.
         profile: cut along the log.
-        tips: written: depth (m) and speed (m/s) ``(tick, 2)``.
-        terms: written ``(tick, NUMBERS, actuator)``, N by each number.
+        tips: result: depth (m) and speed (m/s) of the tip ``(tick, 2)``.
+        terms: result: force per unit of each ground parameter ``(tick, NUMBERS, actuator)``, N.
     """
     ticks, n = strokes.shape
     tip, by, one = np.empty(2), np.empty((2, n)), np.zeros(NUMBERS)

@@ -49,9 +49,9 @@ def load_start(
     """Return nominal parameters; the load parameters come from the force balance if everything is measured.
 
     Args:
-        table: of numbers.
+        table: parameters with their priors.
         train: training segments.
-        columns: of velocity, stroke, head and rod pressure of each actuator among the outputs; -1: not measured.
+        columns: output columns of velocity, stroke, head and rod pressure of each actuator; -1 if not measured.
         z_of: middle and scale of the strokes.
         rate_hz: samples per second.
         declared: whether the areas of each actuator are known, or one follows of the other.

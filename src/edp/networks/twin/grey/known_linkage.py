@@ -39,7 +39,8 @@ class KnownLinkage:
     """Three bodies in a row, each turned by one cylinder.
 
     Attributes:
-        values: as `parameter_index` orders them ``(LINKAGE_VALUES,)``, rounded to what a bundle keeps.
+        values: linkage parameters in the order of `parameter_index` ``(LINKAGE_VALUES,)``, rounded to the precision of
+            a bundle.
         bodies: mass (Gg), centre of gravity (m) and inertia about it (Gg m^2) of each body, in that order; a fit
             starts from them ``(BODIES * BODY_VALUES,)``.
     """
@@ -57,9 +58,9 @@ class KnownLinkage:
         """Read the linkage of a machine.
 
         Args:
-            name: of the machine, or of its file.
-            elements: with cylinders called as `BODY_NAMES`.
-            channels: of the twin.
+            name: name of the machine, or path of its file.
+            elements: elements whose cylinders have the names in `BODY_NAMES`.
+            channels: channels of the twin.
             scales: whose bounds are the ends of the strokes in the recordings.
 
         Raises:

@@ -134,12 +134,12 @@ def number_table(
 
     Args:
         elements: connected.
-        travels: of each cylinder.
+        travels: travel of each cylinder.
         highest_pump: highest pressure of each pump's line, MPa.
-        degrees: of the polynomials of L and of U.
+        degrees: degrees of the load polynomials L and U.
         left_out: keys of `LEFT_OUT`.
         front: linkage whose bodies are the load; None: polynomials.
-        stretches: of each opening curve, one of `STRETCHES`.
+        stretches: number of segments of each opening curve, one of `STRETCHES`.
 
     Raises:
         ConfigError: the load would have more numbers than can be fitted.

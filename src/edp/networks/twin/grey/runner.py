@@ -31,8 +31,8 @@ class GreyRunner(TwinRunner):
     """See `TwinRunner`; states that it makes are in double precision.
 
     Args:
-        twin: that runs.
-        names: of the parts of its state, as compiled code orders them.
+        twin: grey box to simulate.
+        names: names of the state's parts, in the order of the compiled code.
     """
 
     def __init__(self, twin: GreyTwin, names: tuple[str, ...]) -> None:

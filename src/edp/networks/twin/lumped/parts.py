@@ -28,7 +28,7 @@ class TankElement:
     """A tank that is filled by a pump or by another tank, and leaves through an orifice and over its edge.
 
     Attributes:
-        name: that other tanks call it by.
+        name: name of the tank, to which other tanks refer.
         source: channel that commands the pump, or name of the tank above.
         level: stroke of the twin that measures it; empty: a state that forms in the prefix.
     """
@@ -43,7 +43,7 @@ class MassElement:
     """A mass (or inertia) with a drive and friction.
 
     Attributes:
-        name: for readers.
+        name: name of the mass in reports.
         command: channel of the drive.
         velocity: channel.
     """
@@ -58,7 +58,7 @@ class LagElement:
     """A pressure that follows a command with a lag of first order.
 
     Attributes:
-        name: for readers.
+        name: name of the lag in reports.
         command: channel.
         pressure: channel.
     """

@@ -167,10 +167,10 @@ def free_run(numbers: Values, commands: Doubles, answer: Values, hidden: Values,
     """Simulate outputs ``(run, tick, output)`` from commands only.
 
     Args:
-        numbers: of each lane ``(run, number)``; `commands` ``(run, tick, command)``.
-        commands: see above.
-        answer: before the first tick ``(run, output)``; `hidden` likewise ``(run, level)``.
-        hidden: see above.
+        numbers: parameters of each run ``(run, number)``.
+        commands: commands in SI units ``(run, tick, command)``.
+        answer: outputs before the first sample ``(run, output)``.
+        hidden: unmeasured levels before the first sample ``(run, level)``.
         wiring: see `Wiring`.
     """
     lanes, ticks = commands.shape[0], commands.shape[1]
