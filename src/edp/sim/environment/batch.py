@@ -62,7 +62,7 @@ class EpisodeBatch(ABC):
         Args:
             index: index of the episode.
             seed: seed of all random values in the episode; None chooses a random seed.
-            rng: draws the seed.
+            rng: random generator for the seed.
             options: options of this episode.
 
         Raises:

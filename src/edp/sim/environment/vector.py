@@ -66,7 +66,7 @@ class VectorEnvironment(gymnasium.vector.VectorEnv[Observations, Observations, N
                 selects the environments to reset.
 
         Returns:
-            Observations, shape (num_envs, value), and what began, as arrays beside masks such as ``_seed``.
+            Observations, shape (num_envs, value), and infos about the start as arrays, with masks such as ``_seed``.
 
         Raises:
             ConfigError: an option or the number of seeds is not possible.
@@ -107,7 +107,7 @@ class VectorEnvironment(gymnasium.vector.VectorEnv[Observations, Observations, N
         return self._batch.observation(ALL), rewards, terminated, truncated, {**self._batch.info(ALL), **infos}
 
     def _begin(self, mask: Bools, seeds: Sequence[int | None], options: Options, infos: Infos) -> Infos:
-        """Begin the masked episodes; return the infos with what began."""
+        """Begin the masked episodes; return infos about their start."""
         for index in np.flatnonzero(mask).tolist():
             seed = seeds[index]
             if seed is not None:

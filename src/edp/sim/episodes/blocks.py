@@ -31,8 +31,8 @@ NUMBERS = 7
 SENSOR_DRAWS, LOST, SOIL_TABLES, SOIL_COURSE, CHANGES = range(25, 30)
 BLOCKS = 30
 CHANGING = 25
-# changes[number, ...]: what a fault makes of a number of the row that changes: at which tick, its block, its place in
-# that, and its value from then on
+# changes[number, ...]: change of a parameter by a fault: sample, block, position in the block, and new value from this
+# sample on
 AT_TICK, BLOCK, WITHIN, VALUE = range(4)
 ENTRY = 3
 """Number of values per entry of the block table: offset in the row, rows and columns of the block."""

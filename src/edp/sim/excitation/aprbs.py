@@ -16,7 +16,7 @@ from edp.sim.view import View
 class Aprbs(Excitation):
     """Steps between nine levels on all levers, with chirps on one lever in between.
 
-    Levels are zero and four of each sign, just inside, just beyond and clear of the dead band, and well open.
+    The levels are zero and four of each sign: just inside, just outside and well outside the dead band, and well open.
     A chirp rises from 0.05 to 5 Hz, 0.1-0.3 in amplitude, on a bias that keeps it beyond the dead band; its sign
     turns where the cylinder nears an end.
     """

@@ -13,9 +13,9 @@ from edp.sim.view import View
 class Broadband(Excitation):
     """Multisine on all levers at once with equal amplitudes from `LOW_HZ` to `HIGH_HZ` and independent phases.
 
-    A course lasts `COURSE_S`, in which every sine completes whole periods; phases, sizes and the pose that the levers
-    lean to are then drawn again. Of `DRAWS` draws of phases that with the least peak is taken, so that most of the
-    lever's range is used by power and not by rare peaks (Pintelon and Schoukens, System Identification, 2.3).
+    A signal lasts `COURSE_S`, in which every sine completes whole periods; then phases, amplitudes and the target pose
+    are drawn again. The phases with the lowest crest factor of `DRAWS` random sets are used, so that the signal power
+    uses the range of the lever (Pintelon and Schoukens, System Identification, 2.3).
     """
 
     by_hand = False
@@ -48,7 +48,7 @@ class Broadband(Excitation):
             self._begin()
         count = min(max(1, round(self.PIECE_S * self._rate)), len(self._course) - self._done)
         asked = np.clip(self.LEAN * (self._pose - view.strokes), -self.MAX_LEAN, self.MAX_LEAN)
-        # A lean that follows the stroke with a second of delay: steps of it would be power at all frequencies.
+        # The correction follows the stroke with a lag of one second, because steps would add power at all frequencies.
         share = 1.0 - np.exp(-np.arange(1, count + 1)[:, None] / self._rate)
         leans = self._lean + (asked - self._lean) * share
         self._lean = leans[-1].copy()
@@ -60,7 +60,7 @@ class Broadband(Excitation):
         """Draw another signal."""
         rng, samples = self._rng, max(1, round(self.COURSE_S * self._rate))
         seconds = np.arange(samples) / self._rate
-        # No sine above what the rate can show; at low rates fewer of them are left, one at least.
+        # Omit sines above the Nyquist limit; at low rates at least one sine remains.
         highest = min(self.HIGH_HZ, 0.4 * self._rate)
         lines = np.arange(1, max(1, int(highest * self.COURSE_S)) + 1) / self.COURSE_S
         lines = lines[lines >= min(self.LOW_HZ, lines[-1])]

@@ -23,8 +23,8 @@ class Dig(Tracked):
 
     The operator lowers the open bucket to the surface and below it, drags it towards the machine at a chosen depth
     while closing it somewhat, curls and lifts, reaches out and dumps, and returns. Where the drag stalls the
-    bucket is raised, as an operator does; a full bucket ends it. Without ground the same is mimed over a surface
-    that is drawn again for each cycle.
+    bucket is raised, as an operator does; a full bucket ends it. In free air the cycles follow a virtual surface that
+    is drawn again for each cycle.
     """
 
     works_ground = True

@@ -48,7 +48,7 @@ class Grading(Tracked):
         if self._passes > 0:
             self._raised = False
             x, y, attitude = self.reference_pose()
-            # The reference stands above the line's start: down to it first.
+            # The reference is above the start of the line, so the tip moves down first.
             if np.hypot(x - self._from[0], y - self._from[1]) > 0.05:
                 return self.cartesian_leg((x, y, attitude), tuple(self._from), self.LIFT_S)
             self._passes -= 1

@@ -14,9 +14,9 @@ from edp.sim.view import View
 class SwingDig(Dig):
     """Dig cycles as in `dig`, which swing to a side while the bucket is lifted, dump there, and swing back.
 
-    The swing's lever is let go where the angle left is what the brake valves need. In some cycles the machine travels
-    on while it swings back, both tracks alike but for a small difference. The soil's profile swings and travels with
-    the machine: each dig meets the ground that the last one left.
+    The swing lever is released when the remaining angle equals the braking angle. In some cycles the machine travels
+    while it swings back, with a small difference between both tracks. The soil profile moves with the machine, so each
+    dig starts from the ground of the previous dig.
     """
 
     swings = True
@@ -38,7 +38,7 @@ class SwingDig(Dig):
         self._tracks = np.zeros(2)
 
     def next_leg(self, view: View) -> Array:
-        """Return the motion of the next phase, or a wait while the swing is not there.
+        """Return the motion of the next phase, or a wait until the swing arrives.
 
         Swing and travel follow the phase.
         """

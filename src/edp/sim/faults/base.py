@@ -251,7 +251,7 @@ def _check_size(what: str, kind: FaultKind, size: float | None, unit: str) -> No
     if not isinstance(unit, str) or unit not in kind.units:
         raise ConfigError(f"{what}: unit {shown(unit)} of the size is unknown{among(str(unit), kind.units)}")
     in_first = size * kind.units[unit] / kind.units[kind.unit]
-    # The product may miss a bound by rounding: 900 % as a share of 9.
+    # The product may exceed a bound by rounding: 900 % as the fraction 9.
     if not kind.bound.low - 1e-9 <= in_first <= kind.bound.high + 1e-9:
         raise ConfigError(
             f"{what}: size = {setting_text(size)} {unit}; {kind.bound.rule('size')} {kind.unit} must hold"

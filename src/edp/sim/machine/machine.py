@@ -51,7 +51,7 @@ class BucketLinkage:
 class Cylinders:
     """Sizes, cushions, stops and leakage; SI units.
 
-    What `edp.sim.physics.lines` needs may be left out; then a line is a part of its chamber.
+    The parameters of `edp.sim.physics.lines` are optional; without them a line is part of its chamber.
 
     Attributes:
         line_bore: bore of the line from the valve to each chamber, m; its length follows from `hose_volume`.
@@ -104,12 +104,12 @@ class Oil:
 class Pumps:
     """Two equal pumps with electronic positive control, or with load sensing; SI units.
 
-    The numbers of the engine may be left out; then it turns at one speed, whatever the load.
+    The engine parameters are optional; without them the engine speed is constant.
 
     Attributes:
-        load_margin: Pa by which each pump stays above its highest load; 0 for positive control.
+        load_margin: pressure of each pump above its highest load, Pa; 0 for positive control.
         engine_droop: speed drop of the engine from no load to full power, as a fraction of the governed speed.
-        engine_power: its full power, W.
+        engine_power: full power of the engine, W.
         engine_inertia: inertia of engine, flywheel and pumps, kg m^2.
         engine_speed_rpm: governed speed without load, 1/min; `max_flow` belongs to it.
     """
@@ -137,7 +137,7 @@ class Valves:
 
     Attributes:
         flow_sharing: one of `edp.sim.machine.parameters.FLOW_SHARING`.
-        compensator_drop: Pa that a pressure compensator leaves across its section; for `pre_compensated` alone.
+        compensator_drop: pressure drop that a compensator keeps across its section, Pa; only for `pre_compensated`.
     """
 
     pilot_pressure: float
@@ -205,7 +205,7 @@ class Chassis:
 
     Attributes:
         boom_foot_height: height of the boom foot above level ground.
-        pitch_inertia: about the tipping line, kg m^2.
+        pitch_inertia: moment of inertia about the tipping line, kg m^2.
         pitch_frequency: frequency of rocking on the tracks, Hz.
         pitch_damping: damping ratio of the pitch motion.
         lift_moment: pitching moment at which the front of the tracks leaves the ground, N m.
@@ -328,7 +328,7 @@ class Sensors:
 class Machine:
     """One parameter set of the simulator; order of triples: boom, arm, bucket.
 
-    What swings and travels may be left out, both or none; it moves only where a way of driving uses it.
+    Swing and travel are optional, but only together. They move only with excitations that use them.
     """
 
     name: str

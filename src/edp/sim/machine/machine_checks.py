@@ -359,7 +359,7 @@ def _check_levers(axis: int, low: float, high: float, axes: Any, plant: Any, whe
     closes = linkage.bucket_closes(psi, plant) if axis == 2 else np.full(len(psi), True)
     # By convention extension raises the boom angle and lowers those of arm and bucket.
     sign = 1.0 if axis == 0 else -1.0
-    # Where the loop cannot close there is no lever arm: worse than any that is too short.
+    # Without a closed loop there is no lever arm, which is reported before a short lever arm.
     levers = [sign * linkage.cylinder(axis, p, plant)[1] if ok else -math.inf for p, ok in zip(psi, closes)]
     worst = int(np.argmin(levers))
     least = MIN_LEVER * float(axes[axis, at.STROKE])

@@ -63,8 +63,8 @@ def pack(material: Material, width: float) -> Array:
 def pressure(depth: float, grown: float, back: Array) -> float:
     """Return the horizontal force (N) of the soil on the back immersed by `depth` (m).
 
-    `grown`: how far (m) it stands below the level of the ground `FURTHER_M` ahead. What is heaped up above that weighs,
-    and holds together no more.
+    `grown` is the depth (m) below the ground level `FURTHER_M` ahead. Soil heaped above this level adds weight but no
+    cohesion.
     """
     force: float = back[WEIGHT] * depth * depth + back[HOLD] * min(max(grown, 0.0), depth)
     return force
@@ -87,11 +87,11 @@ def push(points: Array, moved: float, share: float, heights: Array, memory: Arra
     """Move the soil above the floor plate's line that an outward motion has reached to both sides.
 
     Args:
-        points: x and y of tip and of heel (m).
-        moved: way outwards in this step (m).
+        points: x and y of tip and heel (m).
+        moved: outward travel in this step (m).
         share: fraction of the soil that moves ahead of the bucket; the rest flows around the bucket and stays behind
             it.
-        heights: profile.
+        heights: height profile of the ground.
         memory: memory of the ground, including its ruts.
     """
     rear, front, low, high = points[0], points[2], points[1], points[3]

@@ -38,7 +38,7 @@ def rut_depth(x: float, heights: Array, memory: Array) -> float:
 def press(x: float, bottom: float, share: float, heights: Array, memory: Array) -> None:
     """Keep the rut that a heel at `x` makes down to `bottom` (m): its cells are never less deep than before.
 
-    `share` of it lasts. Deeper than `DEEPEST_RUT` soil is no longer pressed but flows aside and back, without a rut.
+    The fraction `share` of the rut is permanent. Below `DEEPEST_RUT` soil flows aside and back without a rut.
     """
     middle = int(x / SPACING + 0.5)
     for k in range(max(middle - 2, 0), min(middle + 3, heights.shape[0])):

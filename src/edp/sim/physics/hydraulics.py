@@ -69,8 +69,9 @@ def section(
 ) -> tuple[float, float, float]:
     """Flow from a pump line through a load check into a chamber, and its slopes by pump pressure and by load.
 
-    `highest` is the pressure that a section with its compensator behind the spool shows its pump instead of its own
-    lower load; `most` the drop (Pa) that a compensator before the spool leaves it, whatever pump and load.
+    `highest` is the load pressure that a section with a compensator after the spool signals to its pump instead of its
+    own lower load. `most` is the pressure drop (Pa) that a compensator before the spool keeps, independent of pump and
+    load.
     """
     if area <= 0.0:
         return 0.0, 0.0, 0.0

@@ -38,15 +38,15 @@ BOUNDS = {
 
 @dataclass(frozen=True)
 class Material:
-    """One soil; SI units, angles in degrees. `cone_index` is a range from which each ground draws.
+    """One soil; SI units, angles in degrees. Each ground has a random `cone_index` within its range.
 
     Attributes:
         density: density in the bank, kg/m^3.
         bekker_exponent: n of p = (k_c / b + k_phi) z^n.
-        shear_length: Janosi's K.
-        swell: loose over bank volume.
-        roughness: spread of the logarithm of the resistance along the way.
-        roughness_length: length over which it varies, m.
+        shear_length: Janosi's shear deformation modulus K, m.
+        swell: ratio of loose volume to bank volume.
+        roughness: standard deviation of the logarithm of the resistance along the path.
+        roughness_length: correlation length of the resistance, m.
         sawtooth: fraction of the resistance that is lost when a chip breaks off.
         compaction: fraction of the heel's permanent sinkage, up to 0.1 m, that remains as a rut after the heel has
             left.

@@ -1,4 +1,4 @@
-"""The state of a simulation as plain data: what any of its objects holds, to a file without pickle and back, exact."""
+"""Snapshots of a simulation: exact storage of its state in a file without pickle."""
 
 from __future__ import annotations
 
@@ -163,14 +163,14 @@ def restored(current: Any, plain: Any, arrays: tuple[NDArray[Any], ...]) -> Any:
     for name, part in content.items():
         old = getattr(current, name)
         new = restored(old, part, arrays)
-        # Frozen parts refuse to be set, and what was restored in place needs no setting.
+        # Frozen objects cannot be assigned, and values restored in place need no assignment.
         if new is not old:
             setattr(current, name, new)
     return current
 
 
 def _restore_array(current: Any, saved: NDArray[Any]) -> NDArray[Any]:
-    # In place where it fits: other parts may hold the same array.
+    # Restore in place if the shape fits, because other objects may refer to the same array.
     if isinstance(current, np.ndarray) and current.shape == saved.shape and current.dtype == saved.dtype:
         current[...] = saved
         return current

@@ -1,7 +1,7 @@
-"""Soil that is moved: swept cells, the load and its spilling, the heap before the edge, slopes that slide.
+"""Soil transport: excavated cells, bucket load and spilling, heap ahead of the edge, sliding slopes.
 
-Heights count soil at bank density: what leaves one place arrives at another, and the mass stays the same. What the
-heel has pressed lies lower by its rut; a cut takes the pressed soil with its mass, and leaves soil that bore nothing.
+Heights refer to soil at bank density, and the mass of soil is conserved. Compacted soil is lower by its rut. A cut
+removes the compacted soil with its mass and leaves soil that was not loaded before.
 """
 
 from __future__ import annotations

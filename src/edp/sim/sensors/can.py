@@ -65,10 +65,10 @@ def frames(samples: int, rate_hz: float, bus: Bus, phase: float, latency_s: floa
     count = before + int(np.ceil(samples / rate_hz / bus.period)) + 1
     sample_times = np.asarray((np.arange(count) - before + phase) * bus.period, dtype=np.float64)
     latency = np.clip(latency_s + rng.normal(0.0, bus.jitter, count), *bus.latency)
-    # Frames of one ECU keep their order: a late one holds up those behind it.
+    # Frames of one ECU keep their order: a late frame delays the following frames.
     arrivals = np.maximum.accumulate(sample_times + latency) * rate_hz
     lost = rng.random(count) < bus.loss
-    # The first frame always arrives, or the first samples would have nothing to show.
+    # The first frame always arrives, because the first samples need a value.
     lost[0] = False
     arrived = np.flatnonzero(~lost)
     seen = arrived[np.searchsorted(arrivals[arrived], ticks, side="right") - 1]

@@ -1,7 +1,7 @@
 """Sensor and bus model for one logged sample; the only implementation of the chain.
 
-Recordings and episodes run the same compiled function, the former over all rows of a log, the latter a row at a time.
-Everything random of a recording is drawn before it begins (`edp.sim.sensors.draws`), one row a tick.
+Recordings and episodes run the same compiled function: recordings for all rows of a log, episodes row by row. All
+    random values of a recording are generated before it begins (`edp.sim.sensors.draws`), one row per sample.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def between(history: Array, position: float) -> tuple[Array, Array, float]:
     """Return the stored rows around a position in samples, and the interpolation weight of the second."""
     low = int(position)
     part = position - low
-    # At a tick itself the one behind it may not have come yet.
+    # At the time of a sample the next sample may not be available.
     high = low + 1 if part > 0.0 else low
     return history[low % history.shape[0]], history[high % history.shape[0]], part
 
@@ -107,7 +107,8 @@ def read_joints(drawn: Array, setup: Setup, history: Array, out: Array) -> None:
             shown = transducers.quantised(angle, numbers[ANGLE_QUANTUM])
             lever = linkage.cylinder(i, shown, plant)[1]
             error = drawn[RATE_BIAS + i] + drawn[RATE_ERROR + i]
-            # The play is in the velocity already; added is what angle quantum and rate error change of J times rate.
+            # The velocity already includes the play; add the effect of angle quantisation and rate error on J times
+            # rate.
             v = v + (lever - linkage.cylinder(i, angle, plant)[1]) * rate + lever * error
         out[i] = v + drawn[VELOCITY_ERROR + i]
 
@@ -122,7 +123,7 @@ def read_pressures(drawn: Array, numbers: Array, history: Array, out: Array) -> 
         p = low[PRESSURE + n] + part * (high[PRESSURE + n] - low[PRESSURE + n])
         p = p + numbers[RANGE] * (numbers[OFFSET + n] + drift)
         p = p + drawn[PRESSURE_ERROR + n]
-        # In the order of a transmitter: the converter sees what the range has cut.
+        # In the order of a transmitter: first the range limit, then the converter.
         out[6 + n] = transducers.quantised(transducers.limited(p, numbers[RANGE]), numbers[QUANTUM])
 
 
@@ -161,12 +162,12 @@ def sense(
 ) -> None:
     """Write the 24 signals of Table A.1 and the additional observed values at one sample to `out`, shape (SENSED,).
 
-    Ticks must be taken in order from 0, which starts everything in steady state.
+    Samples must be processed in order from 0, which starts the chain in steady state.
 
     Args:
-        sample: the tick's row of the log, shape (1, columns).
-        kelvin: oil temperature.
-        tick: counted from 0.
+        sample: row of the log, shape (1, columns).
+        kelvin: oil temperature, K.
+        tick: index of the sample, from 0.
         drawn: random values of the sample, a row of `draws.draw`.
         setup: result of `draws.pack_sensors`.
         state: memory, history (a ring of ticks), scratch of shape (2, 3) and memory of the faults.

@@ -51,7 +51,7 @@ def draw(machine: Machine, samples: int, rate_hz: float, rng: np.random.Generato
     Args:
         machine: machine with the ``[sensors]`` to use.
         samples: number of samples.
-        rate_hz: their rate.
+        rate_hz: sample rate, Hz.
         rng: source of noise, bias, jitter and losses of this recording.
     """
     drawn = np.zeros((samples, chain.DRAWS))
@@ -92,7 +92,7 @@ def _bus(machine: Machine, samples: int, rate_hz: float, rng: np.random.Generato
     """Return the frames of each of `ECUS`, with independent random values."""
     own, instance = machine.sensors, instance_of(machine)
     bus = can.Bus(own.can_period, own.can_latency, own.can_jitter, own.can_loss)
-    # A generator each: what one ECU draws does not move the noise of the others.
+    # Each ECU has its own generator, so that one ECU does not change the noise of the others.
     each = zip(instance.phase, instance.latency_s, rng.spawn(len(ECUS)), strict=True)
     return [can.frames(samples, rate_hz, bus, phase, latency, child) for phase, latency, child in each]
 
