@@ -44,7 +44,7 @@ class Spectrum:
     """Inputs in the frequency domain; see `edp.data.spectrum`.
 
     Attributes:
-        names: commands; two one-sided ones as their difference.
+        names: names of the commands; two one-sided commands count as their difference.
         frequency_hz: shape ``(frequency,)``.
         density: power spectral density, shape ``(frequency, command)``.
         flat_to_hz: frequency up to which each spectrum stays within 10 dB of its maximum.
@@ -291,12 +291,12 @@ def _ends(occupancy: Occupancy) -> dict[str, tuple[float, float]]:
 
 def _integrate(recording: Recording, names: Sequence[str]) -> Array:
     way = np.cumsum(recording.select(names).astype(np.float64), axis=0) / recording.rate_hz
-    # An integral has no origin; its mean stands for mid stroke.
+    # An integral has no absolute position; its mean represents mid stroke.
     return np.asarray(way - way.mean(axis=0))
 
 
 def _cell(values: NDArray[Any], low: float, high: float, count: int) -> NDArray[np.intp]:
-    # A channel that stands still falls into the first cell instead of dividing by zero.
+    # A constant channel is in the first cell; this avoids a division by zero.
     share = (np.asarray(values, dtype=np.float64) - low) / max(high - low, 1e-12)
     return np.clip(np.floor(share * count), 0, count - 1).astype(np.intp)
 
@@ -364,7 +364,8 @@ def mutual_information(x: Array, y: Array, bins: int = QUANTILES) -> float:
 
     Less its expected value for independent ones.
 
-    A value held for long (a command in steady state) takes a bin of its own, however many samples it has.
+    A value that is constant for a long time (a command in steady state) has its own bin, independent of its number of
+    samples.
     """
 
     def ranked(values: Array) -> NDArray[np.intp]:

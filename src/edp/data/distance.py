@@ -56,7 +56,7 @@ def split_distance(recordings: Sequence[Recording], axes: Sequence[Axis], split:
     # Infinity takes a constant signal out of the distance.
     scale = np.where(deviation > 0, deviation, np.inf) * max(int(np.count_nonzero(deviation)), 1) ** 0.5
 
-    from scipy.spatial import cKDTree  # here: whatever looks at coverage would wait for it
+    from scipy.spatial import cKDTree  # import here: modules that use coverage would otherwise load it
 
     def nearest(references: Array, queries: Array) -> Array:
         tree = cKDTree((_evenly(references, size) - mean) / scale)
@@ -73,7 +73,7 @@ def _states(recordings: Sequence[Recording], axes: Sequence[Axis], stretches: Se
     every = -(-sum(stretch.stop - stretch.start for stretch in stretches) // MAX_STATES)
     for stretch in stretches:
         recording = recordings[stretch.recording]
-        # A stretch shorter than the delay keeps its last sample.
+        # A segment shorter than the delay keeps its last sample.
         back = min(round(EARLIER_S * recording.rate_hz), stretch.stop - stretch.start - 1)
         rows = slice(stretch.start + back, stretch.stop)
         commands = [axis.read_signed_command(recording) for axis in axes if axis.command]

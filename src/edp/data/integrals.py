@@ -45,7 +45,7 @@ def integral_fit(pairs: Sequence[tuple[Rows, Rows]], rate_hz: float) -> Integral
     """Compare a stroke with the integral of its velocity by the trapezoidal rule, over windows of `WINDOW_S`.
 
     Args:
-        pairs: velocity and stroke of each segment ``(tick,)``, in units that belong together.
+        pairs: velocity and stroke of each segment ``(tick,)``, in consistent units.
         rate_hz: sample rate.
     """
     ticks = max(MIN_TICKS, round(WINDOW_S * rate_hz))

@@ -1,4 +1,4 @@
-"""Random orders of more things than a list of them would fit into memory."""
+"""Random order of more items than fit into memory as a list."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ Numbers = NDArray[np.int64]
 
 
 class RandomOrder:
-    """A permutation of ``range(count)`` that is computed where it is read.
+    """Random permutation of ``range(count)``, computed on access.
 
-    Up to `MAX_LISTED` it is NumPy's. Beyond, a Feistel network with random keys permutes the next power of four, and
-    numbers outside of the range are permuted again until they fall into it (cycle walking, Black and Rogaway 2002).
+    Up to `MAX_LISTED` items, NumPy computes the permutation. For more items, a Feistel network with random keys
+    permutes the next power of four; numbers outside the range are permuted again until they are inside (cycle walking,
+    Black and Rogaway 2002).
 
     Args:
-        rng: the source of chance.
+        rng: random generator.
         count: length of the permutation.
     """
 

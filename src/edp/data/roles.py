@@ -28,11 +28,11 @@ class Axis:
 
     Attributes:
         name: name for reports.
-        command: channels that command it: extend and retract, one signed channel, or none.
+        command: command channels of the axis: extend and retract, one signed channel, or none.
         velocity: velocity of the axis, extension positive; if unknown, another signal that responds to the command.
         pressures: head and rod pressure, or as many as there are.
-        stroke: its position.
-        conflux: channels that give it the second pump.
+        stroke: position of the axis.
+        conflux: channels that connect the second pump.
     """
 
     name: str

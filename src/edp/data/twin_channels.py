@@ -1,7 +1,6 @@
 """Channels of a plant model for free-run simulation: commands, and the simulated velocities, strokes and pressures.
 
-Which channel is which comes from names and kinds (`edp.data.roles`), or from settings: three cylinders of an excavator
-and one actuator of a test rig are the same thing here.
+The roles of the channels come from names and kinds (`edp.data.roles`) or from settings, for any number of actuators.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ class TwinChannels:
     Attributes:
         commands: command channels that are read in each sample.
         velocities: velocities of the actuators.
-        strokes: position of each, in the order of the velocities, or none at all.
+        strokes: positions of all actuators in the order of the velocities, or none.
         pressures: pressures of chambers and pumps.
         rate_hz: samples per second.
 
@@ -121,7 +120,7 @@ def twin_channels(recording: Recording, settings: TwinChannelSettings | None = N
         settings: channel names, required if the kinds do not identify the channels.
 
     Raises:
-        DataError: a channel that is named, but not recorded.
+        DataError: a named channel is not recorded.
         ConfigError: a part that nothing fills, or kinds that do not fit.
     """
     chosen = settings or TwinChannelSettings()
@@ -130,7 +129,7 @@ def twin_channels(recording: Recording, settings: TwinChannelSettings | None = N
         return tuple(recording.channels[recording.index(name)] for name in names)
 
     roles = roles_of(recording, chosen.commands)
-    # The second pump's pilot pressures are commands as well: which actuator gets its oil is for the lever to say.
+    # The second pump's pilot pressures are also commands, because the lever decides which actuator gets the oil.
     commands = chosen.commands or roles.inputs + tuple(name for axis in roles.axes for name in axis.conflux)
     axes = [axis for axis in roles.axes if axis.velocity]
     velocities = chosen.velocities or tuple(axis.velocity for axis in axes)

@@ -46,11 +46,12 @@ def two_level_design(
     """Return a design in which no main effect is aliased with a two-factor interaction.
 
     In N = 2^m runs the columns are products of an odd number of basic ones (the even ones left out, as in a
-    fold-over), so a product of two columns is never a third: resolution IV, for up to N / 2 factors. Among the
-    columns those are taken that give the fewest aliases between interactions.
+    fold-over), so a product of two columns is never a third: resolution IV, for up to N / 2 factors. The selected
+    columns have the fewest aliases between interactions.
 
-    Where factors exclude each other no such design exists. The clashes are then taken out and the levels exchanged
-    one at a time while that lowers the errors and aliases of the main effects; `alias` and `error` say what is left.
+    If factors exclude each other, such a design does not exist. Conflicting levels are then removed, and levels are
+    exchanged one at a time while this lowers the errors and aliases of the main effects; `alias` and `error` contain
+    the remaining ones.
 
     Args:
         factors: names, at least two.
@@ -142,7 +143,7 @@ def _exchange_levels(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
             trials = trials[(counts <= 1).all(axis=0)]
             costs = _quality(trials, groups)[0]
             cheapest = int(np.argmin(costs))
-            # A gain below rounding would let two equal designs take turns for ever.
+            # A gain below rounding would alternate between two equal designs for ever.
             if costs[cheapest] < cost - 1e-9:
                 best, cost = trials[cheapest], float(costs[cheapest])
         if cost == before:
@@ -167,7 +168,7 @@ def _quality(levels: Mask, groups: Sequence[tuple[int, ...]]) -> tuple[Array, Ar
     inverse = np.linalg.inv(moments + 1e-9 * np.eye(factors + 1))
     errors = 4.0 * np.diagonal(inverse, axis1=-2, axis2=-1)[..., 1:]
     alias = (inverse @ (design.swapaxes(-1, -2) @ (rest[..., first] * rest[..., second])))[..., 1:, :]
-    # What the small addition above leaves in designs without aliases.
+    # Remove the effect of the small addition above in designs without aliases.
     alias = np.where(np.abs(alias) < 1e-8, 0.0, alias)
     cost = errors.mean(axis=-1) + 4.0 * INTERACTION * np.square(alias).sum(axis=-1).mean(axis=-1)
     cost = np.where((errors > 0.0).all(axis=-1) & (errors < 1e6).all(axis=-1), cost, np.inf)

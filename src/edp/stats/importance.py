@@ -47,14 +47,14 @@ def main_effects(
     """Regress the scores on all factors at once, and on covariates such as randomised rates.
 
     Args:
-        levels: ``(run, factor)``, True where on; a repeated design is stacked.
+        levels: ``(run, factor)``, True if the factor is on; a repeated design is stacked.
         factors: names.
         scores: ``(run,)``; failed runs filled with the worst.
         covariates: ``(run, covariate)``; None: none.
         pass_at: one-sided p-value up to which a factor passes.
 
     Returns:
-        One for each factor, in their order.
+        One effect per factor, in the order of the factors.
 
     Raises:
         DataError: shapes that do not fit, values that are not finite, a factor that never changes or cannot be
@@ -85,7 +85,7 @@ def main_effects(
         )
     inverse = np.linalg.inv(design.T @ design)
     coefficients = inverse @ (design.T @ y)
-    # Scores that are all the same leave rounding in the coefficients and in the residuals.
+    # Equal scores leave rounding errors in the coefficients and residuals.
     dust = 1e-13 * float(np.abs(y).max())
     coefficients = np.where(np.abs(coefficients) > dust, coefficients, 0.0)
     noise = float(np.square(y - design @ coefficients).sum()) / free

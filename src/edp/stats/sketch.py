@@ -20,7 +20,7 @@ _BINS = 1 << (31 - _SHIFT)
 class QuantileSketch:
     """Quantile sketch of non-negative values: exact up to `MAX_EXACT` values, beyond that to 0.05 %.
 
-    Bins are those of single precision with a shortened mantissa: two megabytes, however many values come.
+    A bin is a single-precision number with a shortened mantissa. The memory is two megabytes for any number of values.
     """
 
     def __init__(self) -> None:
@@ -57,7 +57,7 @@ class QuantileSketch:
         return {"bins": filled, "counts": self._bins[filled]}
 
     def add(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Take in what another one held, by its `state`: as if its values had come here."""
+        """Add the content of another sketch, given its `state`."""
         if "values" in state:
             self.update(state["values"])
             return

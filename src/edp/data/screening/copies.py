@@ -1,12 +1,12 @@
 """Channels that are copies of another channel, and channels that contain future values.
 
-A *copy* is a channel that equals another one, delayed, scaled and with noise of its own: what is left of it is related
-to nothing in a linear way, so that whoever has the past of the original gains nothing. A *leak of the future* is a
-channel that the presents and pasts of the trusted channels leave unexplained, but that the future of one of them
-explains: shifted, smoothed to both sides, differenced across the present. No sensor shows that.
+A *copy* is a channel that equals another channel with a delay, a scale and additional noise. Its residual has no linear
+relation to any channel, so the copy adds no information to the past of the original. A *leak of the future* is a
+channel that the present and past of the trusted channels do not explain, but that the future of one of them explains:
+shifted, smoothed to both sides, or differentiated across the present. A sensor cannot produce such a signal.
 
-A channel that *causes* a trusted one through dynamics that can be inverted without loss and without noise looks the
-same; who has one names it as trusted.
+A channel that *causes* a trusted channel through invertible, noise-free dynamics looks like a leak. Declare such a
+channel as trusted.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def find_leaks(
     def judge(channel: int) -> Flag | None:
         base = sorted((k for k in trusted if k != channel), key=lambda k: -strength[channel, k])[:_MAX_TRUSTED]
         sources = list(dict.fromkeys([*base[:_PARTNERS], *(k for k in targets if k != channel)]))
-        # a channel far ahead of its source is looked at as if it came at a moderate distance
+        # a channel far ahead of its source is treated as if its lead were moderate
         ahead = {k: max(far, min(reach - max(near), -int(lead[channel, k]) + 2)) for k in sources}
         past = [(k, a) for k in base for a in (near if k in sources else sparse)]
         future = [(k, -a) for k in sources for a in range(max(1, ahead[k] - far + 1), ahead[k] + 1)]
@@ -117,7 +117,7 @@ def _leak(
     future: list[Tap],
     left: tuple[float, float],
 ) -> Flag | None:
-    """Name the channel whose future explains most on its own, and how far ahead; None where it may be a cause."""
+    """Return the flag with the channel whose future explains most, and its lead; None if the channel may be a cause."""
     gains = {}
     for source in dict.fromkeys(k for k, _ in future):
         alone = unexplained(correlations, channel, past, [tap for tap in future if tap[0] == source])
@@ -163,9 +163,9 @@ def find_copies(correlations: Array, least: float) -> list[CopiedChannel]:
         # The peak may lie beyond the search.
         if abs(lag) >= reach:
             return None
-        # What leads may be a reference that a controlled machine follows closely: there the rest always counts.
+        # A leading channel may be the reference of a controlled machine, so its residual is always tested.
         exact = abs(value) >= least and lag >= -SLACK
-        # the rest can only be judged where enough lags lie on either side
+        # the residual can only be tested with enough lags on both sides
         if not exact and (abs(lag) > SEEN * reach or rest_related(correlations, i, j, lag, value) > MATERIAL):
             return None
         return CopiedChannel(i, j, lag, value)
@@ -176,8 +176,8 @@ def find_copies(correlations: Array, least: float) -> list[CopiedChannel]:
 def rest_related(correlations: Array, i: int, j: int, lag: int, value: float) -> float:
     """Return the largest correlation of ``x_i[t] - value x_j[t - lag]`` with any channel but i, at any lag.
 
-    Where i leads, also with the steps of the channels from sample to sample: what a reference tells of a machine that
-    follows it shows there, however slow both are.
+    If i leads, the changes of the channels from sample to sample are included. They show the relation between a
+    reference and a machine that follows it, even if both are slow.
     """
     reach = len(correlations) // 2
     shown = np.arange(max(-reach, lag - reach), min(reach, lag + reach) + 1) + reach
@@ -204,7 +204,7 @@ def copy_flags(
         pairs: pairs of equal channels, usually in both directions.
         trusted: columns of the channels known to be measured; never flagged.
         innovation: fraction of each channel's variance that its own past does not explain, ``(channel,)``.
-        settled: columns that are flagged already, of no use as originals.
+        settled: columns that are already flagged and cannot be originals.
     """
     flags: dict[int, Flag] = {}
     # Closest pairs first: of a chain of copies each is named after its nearest original.
@@ -250,8 +250,8 @@ def flag_explained(names: Sequence[str], correlations: Array, judged: Sequence[i
     Args:
         names: channels.
         correlations: ``[reach + lag, i, j]``, over all segments.
-        judged: columns in the order in which they may go.
-        base: columns that explain; those of `judged` are among them until they go.
+        judged: columns that can be removed, in this order.
+        base: explaining columns; they include the columns of `judged` that are not yet removed.
     """
     reach = len(correlations) // 2
     strength = np.abs(correlations).max(axis=0)

@@ -83,7 +83,7 @@ class _Spectra:
         mean = self.table.sums[0][piece_index, self.live]
         deviation = self.table.within[self.live]
         for stretch in self.table.pieces[piece_index].stretches:
-            # Single precision halves the memory of all pairs; `linear.RIDGE` allows for what it leaves uncertain.
+            # Single precision halves the memory of all pairs; `linear.RIDGE` covers its rounding errors.
             yield ((stretch[:, self.live] - mean) / deviation).astype(np.float32)
 
     def blocks(self, piece_index: int, columns: NDArray[np.int64] | None, around: bool) -> NDArray[np.complex64]:
@@ -136,7 +136,7 @@ def compute_lagged_covariances(
         sums = spectra.back(_product(around, spectra.blocks(p, None, around=False)))
         pairs = []
         for shift in range(1, shifts + 1):
-            # Channels of this piece with targets of another one, where nothing can relate: chance.
+            # Channels of this segment with targets of another segment are unrelated and give the chance level.
             other = (p + shift) % count
             shared = min(around.shape[1], answers[other].shape[1])
             products = spectra.back(_product(around[:, :shared], answers[other][:, :shared]))

@@ -37,16 +37,16 @@ class FlagKind(StrEnum):
 
 @dataclass(frozen=True)
 class Flag:
-    """Something wrong with a channel, and by which figures it shows.
+    """Defect of a channel, with the evidence for it.
 
     Attributes:
         channel: the channel.
         kind: type of the defect.
-        source: the channel of which it is a copy or whose future it knows; empty where there is none.
+        source: original of a copy, or channel whose future it contains; empty for other defects.
         lag: delay of the channel relative to `source` in samples: -12 means that it has the value of the source 12
             samples later.
         value: value that decided about the flag (a correlation or a fraction), 0 to 1.
-        evidence: a sentence with the figures.
+        evidence: sentence with the numerical evidence.
     """
 
     channel: str
@@ -90,7 +90,7 @@ class LagCurve:
         low, high: 95 % interval of the best lag over the segments.
         agreement: fraction of the segments whose correlation at `best` has this sign.
         certain: the correlation at `best` differs from chance over the segments.
-        at_edge: the best lag is the end of the search, so that the true one may lie beyond.
+        at_edge: whether the best lag is at the end of the search range, so that the true lag may be outside.
     """
 
     channel: str
@@ -270,7 +270,7 @@ class ScreeningResult:
         stability: metrics per segment.
         importance: importance of groups, for each target and for all.
         values: linear value of each channel with its past.
-        clusters: collinear channels, those of one member left out.
+        clusters: groups of at least two collinear channels.
         flags: all flags.
         proposal: proposed feature set and memory.
         options: the options of the screening.

@@ -29,7 +29,7 @@ ENOUGH = 0.02
 
 def choose_held_out(count: int, share: float, seed: int) -> NDArray[np.int64]:
     """Choose the left-out segments: at least two, at most all but two."""
-    # Two on either side at least, or there is no spread to judge by.
+    # At least two on either side are needed to estimate the spread.
     piece_count = min(max(2, round(count * share)), count - 2)
     return np.sort(np.random.default_rng(seed).permutation(count)[:piece_count])
 
@@ -146,10 +146,10 @@ def window_needed(
         used: columns that a model may read.
         targets: columns of the targets.
         horizon: samples ahead.
-        held_out: segments that evaluate.
+        held_out: segments for evaluation.
 
     Returns:
-        The window in samples, and for each window tried the held-out error as a share of the change's variance.
+        The window in samples, and the held-out error of each tried window as a fraction of the change's variance.
     """
     train = _correlations(lagged, np.setdiff1d(np.arange(len(lagged.samples)), held_out))
     judge = _correlations(lagged, held_out)
