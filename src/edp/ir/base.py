@@ -42,10 +42,10 @@ class Slot:
     """Numbers that a layer carries from tick to tick.
 
     Attributes:
-        name: within the layer.
+        name: name within the layer.
         shape: shape; a ring has samples first, the oldest one in row 0.
         fill: value of every number after a reset, unless the graph has another value.
-        number: meaning of the numbers.
+        number: meaning of the values.
     """
 
     name: str
@@ -120,14 +120,14 @@ class Layer(ABC):
 
     Attributes:
         name: name of the layer and of its value; unique in its graph, lower case, parts joined by dots.
-        inputs: values that it reads.
-        matrices: constants that the C runtime multiplies with, which lie in panels there.
-        counted: whether its C state has a ring or a counter.
+        inputs: names of the values that the layer reads.
+        matrices: names of the weight matrices, which the C runtime stores in panels.
+        counted: whether its C state has a ring buffer or a counter.
         stays_float: whether it stays in single precision in an integer network: it has no weights, or a few gains.
-        bit_exact: whether its equations in the arithmetic of the C runtime give the bits of the C code.
+        bit_exact: whether its equations in the arithmetic of the C runtime are bit-identical to the C code.
         tick_by_tick: whether the equations compute one sample at a time, because other layers depend on their changes.
-        without: forms that this kind of layer does not have (``integers``, ``tangent``, ``onnx``, ``matlab``), each
-            with what to do instead.
+        without: unsupported forms of this kind of layer (``integers``, ``tangent``, ``onnx``, ``matlab``), each with
+            the suggested alternative.
     """
 
     matrices: ClassVar[tuple[str, ...]] = ()
@@ -180,7 +180,7 @@ class Layer(ABC):
         return self.scratch
 
     def products(self, x: Values, y: Values) -> dict[str, Values]:
-        """Return what its 8-bit matrices are multiplied by, ``(time, row, terms)``, by matrix.
+        """Return the inputs of its 8-bit matrices, ``(time, row, terms)``, by matrix.
 
         Args:
             x: its first input since a reset, ``(time, number)``.

@@ -278,8 +278,8 @@ class TreeSums(Layer):
 
     Output o is the sum of ``leaf[o, t, i - (2^D - 1)]`` over its trees t, the first one first. Node i is reached from
     node 0 by D steps ``i = 2 i + 1 + (x[feature[o, t, i]] > threshold[o, t, i])``, compared in single precision. A node
-    that does not split has `NEVER` as its threshold. A tick takes ``outputs trees D`` comparisons whatever it reads,
-    and no multiplication.
+    that does not split has `NEVER` as its threshold. A sample takes ``outputs trees D`` comparisons for any input, and
+    no multiplication.
 
     Attributes:
         feature: numbers of the input, ``(output, tree, 2^D - 1)``, uint16.

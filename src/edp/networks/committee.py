@@ -1,4 +1,4 @@
-"""A committee: several small networks, and regression trees, side by side on the same changes over time spans."""
+"""Ensemble of small networks and regression trees in parallel, on the same changes over several time spans."""
 
 from __future__ import annotations
 
@@ -88,8 +88,8 @@ class Committee(Streaming):
     Args:
         bank: lag bank that computes the inputs of all other parts.
         groups: groups of perceptrons.
-        radial: nearness to typical rows; None for none.
-        near: nearness in few columns, each one to typical rows.
+        radial: radial basis functions on all columns; None without them.
+        near: radial basis functions on few columns each.
         trees: number of trees for each prediction (horizon and target); None without trees.
     """
 

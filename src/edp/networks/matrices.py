@@ -44,7 +44,7 @@ def matrices_of(network: nn.Module, recurrent: bool = True) -> list[Matrix]:
 
     Args:
         network: network whose parts list the parameters of their multiplications (`Streaming.matrices`).
-        recurrent: False leaves out those of recurrent layers.
+        recurrent: whether to include the weights of recurrent layers.
     """
     stacks = [stack for stack in network.modules() if isinstance(stack, Stack)]
     recurring = {part for stack in stacks for layer in stack.layers for part in layer.modules()}

@@ -35,7 +35,7 @@ class OutputSpec(Protocol):
 
     @property
     def coverages(self) -> tuple[float, ...]:
-        """Shares of the targets that its intervals mean to hold, the widest first."""
+        """Intended fractions of the targets within the intervals, the widest interval first."""
         ...
 
     @property

@@ -82,8 +82,8 @@ class Predictor(Streaming):
     """A look-ahead predictor (eq. 3.6) that reads and writes SI units.
 
     ``forward`` maps inputs ``(batch, time, input)`` to standardised predictions ``(batch, time, horizon, target)``;
-    ``predict`` gives them in SI units. Both obey the streaming contract. Where the output says more than a point,
-    ``intervals`` gives lower and upper bounds too.
+    ``predict`` gives them in SI units. Both obey the streaming contract. For outputs with an uncertainty, ``intervals``
+    returns lower and upper bounds.
 
     Attributes:
         number_format: number format of the computation; bundles contain float32 only.

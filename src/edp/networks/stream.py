@@ -178,7 +178,7 @@ class Stream:
         if ticks < 1:
             raise DataError(f"{ticks} missed ticks were reported; give at least 1")
         if ticks > HOLD_TICKS:
-            # More than can be held: what came before is given up at once.
+            # The gap exceeds the holding time, so the memory is cleared at once.
             self._holding = HOLD_TICKS
             self.ticks += ticks - 1
             return self._tick(self._hold())
@@ -239,7 +239,7 @@ class Stream:
 
     def _hold(self) -> StreamStatus:
         """Process a sample without new inputs."""
-        # A stream without a tick since its reset has nothing to hold.
+        # A stream without a sample since its reset has no inputs to hold.
         if self._age > 0 and self._holding < HOLD_TICKS:
             self._holding += 1
             self.held += 1
@@ -251,7 +251,7 @@ class Stream:
         return StreamStatus.RESTARTED
 
     def _tick(self, status: StreamStatus) -> StreamTick:
-        # A copy: the caller may keep results while the stream goes on.
+        # Return a copy, because the caller may keep results while the stream continues.
         count = len(self._coverages)
         center, lower, upper = np.split(self._numbers.copy(), [1, 1 + count])
         return StreamTick(center[0], lower, upper, self._coverages, status)

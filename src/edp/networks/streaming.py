@@ -75,7 +75,7 @@ class Operation(StrEnum):
 
 
 class Streaming(nn.Module, ABC):
-    """A causal map from ticks to features with explicit state.
+    """Causal map from samples to features with explicit state.
 
     For any split of a sequence into chunks, running the chunks in order and handing the state on gives the same
     output as one call (chunk invariance); output t never depends on inputs after t (causality).

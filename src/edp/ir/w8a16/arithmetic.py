@@ -1,7 +1,7 @@
 """Integer arithmetic of W8A16 networks, the same bits in NumPy and in C.
 
 A value is ``q 2^-frac`` with q a 16-bit number in [-32767, 32767]; `frac` may be negative or beyond 15. Accumulators
-are 32-bit, what they are multiplied by afterwards gives 64 bits. Every rounding is half up, every overflow saturates.
+have 32 bits; their product with a scale has 64 bits. Every rounding is half up, every overflow saturates.
 """
 
 from __future__ import annotations

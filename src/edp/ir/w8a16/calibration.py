@@ -34,17 +34,17 @@ def calibrate(
 ) -> Formats:
     """Choose formats of all values and 8-bit weights from recordings.
 
-    What is computed before the first weights is seen at every tick, since clipped inputs cost most; the rest on
-    segments of `PIECE` ticks spread evenly over all recordings. All inputs share one format: where a few of them are
-    very large at rare moments (derivatives), a finer one that clips these may cost less than a coarse one costs the
-    others.
+    Values before the first weights are calibrated on all samples, since clipped inputs cause the largest errors; all
+    other values are calibrated on segments of `PIECE` samples spread evenly over all recordings. All inputs have one
+    format. If a few inputs (derivatives) are very large at rare times, a finer format that clips them may cause smaller
+    errors than a coarse format.
 
     Args:
         graph: the float network.
         recordings: inputs ``(time, input)`` in SI units, of the training part.
         ticks: approximate number of samples that run through the whole network.
-        error_of: the network's error when its standardised inputs have so many fractional bits and the others are as
-            they were; None keeps the format in which nothing is clipped.
+        error_of: function that returns the network's error for a number of fractional bits of the standardised inputs;
+            None selects the format without clipping.
 
     Raises:
         ExportError: a part of the network has no integer form.
@@ -109,7 +109,7 @@ def _follow(graph: Graph, rows: NDArray[np.floating], ranges: dict[str, float]) 
         _raise(ranges, name, value)
     for layer in graph.layers:
         if isinstance(layer, Rotation):
-            # Its value is its state, which has a format of its own.
+            # The value of the layer is its state, which has a separate format.
             _raise(ranges, f"{layer.name}/h", values[layer.name])
     return values
 

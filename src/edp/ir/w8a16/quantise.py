@@ -36,7 +36,7 @@ class Formats:
 
     Attributes:
         fracs: fractional bits by value of the float graph; slots with their own format are named ``layer/slot``.
-        weights: 8-bit weights by matrix; those that are left out are rounded to the nearest.
+        weights: 8-bit weights by matrix; missing matrices are rounded to the nearest.
     """
 
     fracs: Mapping[str, int]
@@ -153,7 +153,7 @@ def quantise(graph: Graph, chosen: Formats, moments: Mapping[str, NDArray[np.flo
 def outline(graph: Graph) -> Graph:
     """Return the structure of the W8A16 network: every constant has its shape and type, filled with zeros.
 
-    What a network takes of a controller depends on no number, so neither training nor recordings are needed.
+    The resources on a controller do not depend on the weights, so neither training nor recordings are needed.
 
     Raises:
         ExportError: a kind of layer that has no integer form.

@@ -27,7 +27,7 @@ def rows(
     """Return the weights ``(..., out, terms ...)``, biases ``(..., out)``, and the way from accumulators to `frac`.
 
     Args:
-        matrix: its name.
+        matrix: name of the matrix.
         weight: first dimensions as `bias`, the others are summed over.
         bias: one for each output.
         formats: fractional bits of the input and of the output.
@@ -77,7 +77,7 @@ def halves(gain: Array, most: int = 30) -> tuple[NDArray[np.int16], int]:
 
 def _check(name: str, weight: NDArray[np.int8], bias: Array) -> None:
     terms = tuple(range(bias.ndim, weight.ndim))
-    # The worst case over all inputs, since a sum that wraps around would be silent on the controller.
+    # Use the worst case over all inputs, since an overflow of the sum is not detected on the controller.
     sums = np.abs(weight.astype(np.int64)).sum(axis=terms) * fixed.LARGEST + np.abs(bias)
     worst = float(sums.max())
     if worst > fixed.ACCUMULATOR:

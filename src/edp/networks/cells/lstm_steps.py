@@ -40,7 +40,7 @@ def lstm_steps(
     """Run ``c~ = f c + i g``, ``h~ = o tanh(c~)`` over time, gates in the order o, i, f, g.
 
     Args:
-        projected: ``(time, batch, 4 units)``, the input's part of the pre-activations, with all that is added.
+        projected: input part of the pre-activations, including all biases, ``(time, batch, 4 units)``.
         recurrent: ``(4 units, units)``.
         norm: layer normalisation, optional: ``U h`` is normalised and multiplied by ``(4 units,)``; ``tanh`` acts on c
             after normalisation, multiplication and addition of ``(units,)`` each.

@@ -106,7 +106,8 @@ class PhysicsBase(Streaming):
     """Inputs ``(batch, time, input)`` in SI units to velocities ``(batch, time, horizon, target)`` in m/s.
 
     `is_velocity` is 1 for the targets that are cylinder velocities and 0 for others, which the base does not predict.
-    State: the strokes of the tick before and whether there was one, where strokes tell the pose; else none.
+    The state contains the previous strokes and a flag for them if the pose comes from strokes; otherwise there is no
+    state.
     """
 
     is_velocity: Tensor
@@ -213,7 +214,7 @@ class PhysicsBase(Streaming):
             return build.join("ahead", velocities.value)  # type: ignore[attr-defined]
 
     def costs(self) -> list[Cost]:
-        # Arithmetic of the pose itself, held to a trace of what runs by `edp.evaluation.mac_check`.
+        # Number of operations for the pose, verified against a trace by `edp.evaluation.mac_check`.
         count = (52 if self.spec.pose == "angles" else 101) + AXES + self.arithmetic()
         width = len(self.task.horizons) * len(self.task.targets)
         return [

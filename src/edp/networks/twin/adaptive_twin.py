@@ -9,9 +9,9 @@ covariance::
     P = (P^-1 + S' S / n)^-1,  x = x + P S' clip(e) / n,   n ticks of the segment, whose errors count as one tick's
     x = a x,  P = a^2 P + (1 - a^2) prior,                 a = exp(-learn_ticks / forgetting)
 
-which is a Kalman filter on numbers that fade to what they were. Forces that no number stands for, as those of soil, are
-estimated tick by tick (`DisturbanceObserver`). A forecast runs from the observer's state with the numbers and forces of
-now.
+which is a Kalman filter on parameters that decay to their initial values. Forces without a parameter, such as soil
+forces, are estimated in each sample (`DisturbanceObserver`). A forecast runs from the observer's state with the current
+parameters and forces.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ REST = 1e-3
 
 @dataclass(frozen=True, kw_only=True)
 class NumberGroup:
-    """Numbers of a grey box that grow and shrink together.
+    """Parameters of a grey box that are scaled by a common factor.
 
     Attributes:
         powers: power of the group's factor that multiplies the parameters of a name prefix, by prefix.
-        deviation: prior deviation of the logarithm of the factor.
+        deviation: prior standard deviation of the logarithm of the factor.
         shared: whether all actuators share one group; otherwise each actuator has a group that includes its valves.
         per_kelvin: change of the logarithm per kelvin of oil temperature, if that is measured.
     """
@@ -151,13 +151,13 @@ class AdaptiveTwin:
 
     Attributes:
         labels: labels of the groups.
-        moves: powers by which each number grows with each group's factor ``(number, group)``.
-        deviation: prior, of the logarithms of the factors ``(group,)``.
-        warmth: their change by a kelvin ``(group,)``.
-        logs: logarithms of the groups' factors, less `by_oil` ``(group,)``; 0 where nothing has changed.
+        moves: power of each group's factor in each parameter ``(number, group)``.
+        deviation: prior standard deviation of the factors' logarithms ``(group,)``.
+        warmth: change of the factors' logarithms per kelvin of oil temperature ``(group,)``.
+        logs: logarithms of the groups' factors without the part `by_oil` ``(group,)``; 0 for unchanged parameters.
         by_oil: factor of the oil temperature for each group ``(group,)``.
-        learn: False freezes them.
-        learned: segments that have taught.
+        learn: whether the factors are adapted; False keeps them constant.
+        learned: number of segments used for adaptation.
 
     Raises:
         ConfigError: a twin that is no grey box, or a group that it has no number of.
@@ -262,7 +262,7 @@ class AdaptiveTwin:
 
     def _port(self, state: TwinState, measured: Array) -> Array:
         own = np.asarray(state["answer"][0], np.float32)
-        # Without a measurement the difference is NaN, which is what leaves a port free.
+        # Without a measurement the difference is NaN, which marks a free port.
         return np.asarray(own + np.float32(self.spec.gain) * (measured - own), dtype=np.float32)
 
     def _take(self, measured: Array) -> None:

@@ -47,14 +47,14 @@ def force_slopes(
 
 
 class DisturbanceObserver:
-    """Resistance against each cylinder, from velocities one tick ahead.
+    """External force against each cylinder, estimated from one-step-ahead velocity errors.
 
-    In a tick chambers hardly give way, so that what a velocity differs by from what the model expects is a force on
-    what it moves. What the model knows wrongly of friction or gravity counts as one, too.
+    Within one sample the chambers are nearly incompressible, so a velocity error of the model is attributed to an
+    external force. Errors of the modelled friction or gravity are also attributed to this force.
 
     Args:
         runner: runner of a model with a load; the observer writes its `resistance`.
-        velocities: columns of its outputs, which begin with all velocities.
+        velocities: column indices of the velocities among the outputs; velocities are the first outputs.
         share: fraction of a new error that the estimate adopts per sample; 0 to switch the observer off.
     """
 

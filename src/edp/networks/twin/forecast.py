@@ -4,9 +4,9 @@ The observer is Luenberger's with one gain. Before tick t every port reads
 
     z[t] = a[t] + g (m[t] - a[t])
 
-a the twin's own output for tick t, m what was measured; a missing measurement leaves the port free. From the state
-that this gives, the commands of tick t are held and the twin runs free: ``f[t, k]`` is its output for tick t + k. It
-reads nothing after tick t.
+with the twin's own output a for sample t and the measurement m; a missing measurement leaves the port free. From the
+resulting state, the twin runs free with the constant commands of sample t: ``f[t, k]`` is its output for sample t + k.
+It does not read any data after sample t.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def choose_gain(twin: Twin, series: Sequence[Series], horizons: Sequence[int]) -
                 errors[row, at] += np.nansum(np.abs(apart))
     if not errors.any():
         return GAINS[0]
-    # Errors of near and far horizons differ by a factor: each is taken in shares of the best.
+    # Errors of short and long horizons differ by a factor, so each is divided by its best value.
     return GAINS[int(np.argmin((errors / errors.min(axis=0)).sum(axis=1)))]
 
 
@@ -120,7 +120,7 @@ def forecast(twin: Twin, commands: Array, measured: Array, horizons: Sequence[in
         states, ports = [], np.empty((block.stop - first, measured.shape[1]), np.float32)
         for row, t in enumerate(range(first, block.stop)):
             own = state["answer"][0]
-            # Without a measurement the difference is NaN, and so is the port, which is what leaves it free.
+            # Without a measurement the difference and the port are NaN, which marks a free port.
             ports[row] = own + np.float32(gain) * (measured[t] - own) if gain > 0.0 else np.nan
             states.append(state)
             state = runner.step(commands[t], state, ports[row])
@@ -135,7 +135,7 @@ def _begin(twin: Twin, measured: Array) -> int:
     """
     there = np.asarray(np.isfinite(measured).all(axis=1))
     possible = np.flatnonzero(there & twin.is_within_stops(np.where(there[:, None], measured, np.float32(0.0))))
-    # Where there is none, the reset at the first tick says what is wrong there.
+    # If there is none, the reset at the first sample raises the error.
     return int(possible[0]) if len(possible) and len(measured) - possible[0] >= twin.prefix_ticks else 0
 
 

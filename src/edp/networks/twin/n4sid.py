@@ -2,9 +2,10 @@
 
     x(t+1) = A x(t) + B [u(t); 1] + K e(t),   y(t) = C x(t) + e(t)
 
-The column space of the observability matrix is that of future outputs, freed from future commands, as far as the past
-tells them: PO-MOESP, with past commands and outputs as instruments (Verhaegen 1994; Van Overschee and De Moor 1996,
-ch. 2 to 4). The output to the command of tick t is the machine at t + 1, so nothing feeds through.
+The column space of the observability matrix is estimated from future outputs without the effect of future commands,
+    projected on the past: PO-MOESP, with past commands and outputs as instruments (Verhaegen 1994; Van Overschee and De
+    Moor 1996, ch. 2 to 4). The output for the command of sample t is the machine at t + 1, so there is no direct
+    feedthrough.
 """
 
 from __future__ import annotations
@@ -60,10 +61,10 @@ MIN_NOISE = 1e-2
 class N4sid:
     """Subspace identification of velocities and pressures with integrated strokes: a baseline of every twin.
 
-    The order is the one whose free runs on a fifth of the training recordings, kept back meanwhile, have the least
-    error; a single order is taken as it is. Poles outside the unit circle are reflected into it, and those slower than
-    a modulus of 0.999 are shrunk to it, so the model is stable. B is solved for by least squares on simulated
-    segments, K from the covariance of what is left by a Riccati equation.
+    The selected order has the smallest free-run error on a held-out fifth of the training recordings; a single order
+    needs no selection. Poles outside the unit circle are reflected into it, and those slower than a modulus of 0.999
+    are shrunk to it, so the model is stable. B is solved for by least squares on simulated segments, K from the
+    residual covariance by a Riccati equation.
 
     Attributes:
         orders: candidate numbers of states. Orders above the rank of the output rows are reduced to this rank.
@@ -127,8 +128,8 @@ class N4sid:
 class N4sidTwin(Twin):
     """State: ``answer`` (outputs) in SI units, and ``states`` of the model ``(batch, order)``.
 
-    What a port reads corrects the states by the Kalman gain; a free port reads its own last output, which lies where
-    the model put it but for its bounds, and then corrects nothing.
+    A measured port corrects the states by the Kalman gain. A free port reads its own last output, which equals the
+    model's output except for bounds, so it does not correct the states.
     """
 
     def __init__(
@@ -319,7 +320,7 @@ def _inputs_of(pairs: Sequence[Pair], a: Doubles, c: Doubles) -> Doubles:
         for t in range(length):
             rows[t] = c @ driven
             driven = a @ driven
-            # Plus the Kronecker product of a unit matrix and the command: state by state its own copy of it.
+            # Add the Kronecker product of a unit matrix and the command, one copy of the command per state.
             driven.reshape(order, order, commands)[own_state, own_state] += u[first + t]
         flat, goal = rows.reshape(length * answers, -1), y[first : first + length].reshape(-1)
         flat = flat - own @ (own.T @ flat)
@@ -337,7 +338,7 @@ def _gain(a: Doubles, c: Doubles, process: Doubles, output: Doubles) -> Doubles:
 
     rows = len(process)
     q, r, s = process.T @ process / rows, output.T @ output / rows, process.T @ output / rows
-    # Never singular: exact data leave no noise, and a filter of none is not defined.
+    # Add a minimum noise, because a Kalman filter without noise is undefined for exact data.
     q += SMALL * np.eye(len(q))
     r += MIN_NOISE**2 * np.eye(len(r))
     p = solve_discrete_are(a.T, c.T, q, r, s=s)

@@ -37,11 +37,11 @@ MEMBER_SEED = 1000
 class Recurrent:
     """GRU with feedback ports, trained with the free-run error (`edp.training.free_run`).
 
-    Several members are networks that are trained apart; the twin outputs with the mean of their changes. As they read
-    the same ports, they are one network, whose weights between members are zero.
+    Several members are trained separately, and the twin outputs the mean of their changes. Since they read the same
+    ports, they form one network with zero weights between members.
 
     Attributes:
-        units: width of its memory, that of all members together.
+        units: total number of hidden units of all members.
         members: networks whose changes are averaged.
         valve_map: whether velocities and pressures are also pulled to the outputs of a static map (`StaticMap`) of the
             commands. The strength of the pull is trained. Without training, the twin equals the static map.
@@ -81,7 +81,7 @@ class Recurrent:
     def member(self, channels: TwinChannels, scales: TwinScales, static: StaticTwin | None, seed: int) -> RecurrentTwin:
         """Return one of its members, untrained, on a fitted map."""
         network = self.alone()._network(channels)
-        # Answers that start at no change at all make the first free runs stand still.
+        # Outputs that start at zero change would make the first free runs stand still.
         network.draw(seed, 0.1)
         return RecurrentTwin(channels, scales, self.prefix_ticks, network, static)
 
@@ -330,8 +330,8 @@ def member_seed(seed: int, which: int) -> int:
 def averaged(twins: Sequence[RecurrentTwin]) -> RecurrentTwin:
     """Return a twin whose state change is the mean of the state changes of equally wide twins.
 
-    All of them read the same ports, and what an output adds up from h is linear: so their mean is one network, whose
-    gates are theirs side by side and whose outputs have their weights over the number of twins.
+    All twins read the same ports, and the outputs are linear in h. The mean is therefore one network that contains the
+    gates of all twins in parallel; its output weights are those of the twins divided by their number.
 
     Args:
         twins: at least one twin; all or none with a static map, and the maps with equal corners and delay.
@@ -369,6 +369,6 @@ def _mean_map(twins: Sequence[RecurrentTwin]) -> StaticTwin | None:
     pulls = [np.zeros(0) if twin.network.pull is None else twin.network.pull.detach().numpy() for twin in twins]
     shares = np.clip(np.stack(pulls), 0.0, 1.0).astype(np.float64)
     total = shares.sum(axis=0)
-    # Where nobody is pulled the map is not heard, but its numbers must be some.
+    # Without any pull the map has no effect, but its parameters must be defined.
     weights = np.where(total > 0.0, shares / np.where(total > 0.0, total, 1.0), 1.0 / len(maps))
     return StaticTwin.mean(maps, weights.astype(np.float32))

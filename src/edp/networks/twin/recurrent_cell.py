@@ -60,7 +60,7 @@ class TwinNetwork(CellWeights):
 
     def __init__(self, commands: int, answers: int, units: int, pulled: int = 0) -> None:
         super().__init__(commands, answers, answers, units)
-        # All the way in each tick: an untrained network leaves the map as it is.
+        # Start with full pull, so that an untrained network reproduces the static map.
         self.pull = nn.Parameter(torch.ones(pulled)) if pulled else None
 
     def forward(

@@ -110,7 +110,7 @@ def replace_scales(twin: RecurrentTwin, scales: TwinScales) -> RecurrentTwin:
 def separated(twin: RecurrentTwin) -> list[RecurrentTwin]:
     """Return the members of an averaged twin; the twin itself if it is a single network.
 
-    What the average keeps of all members alone (constants of the outputs, pulls, the map) each of them has.
+    Each member gets the parameters that the average stores only once (constants of the outputs, pulls, the map).
     """
     if len(twin.member_rows()) < twin.members or twin.members == 1:
         return [replace_scales(twin, twin.scales)]

@@ -1,7 +1,8 @@
 """A recurrent twin over time, forward and backward by hand, compiled: feedback makes every tick wait for the last one.
 
-One loop over the ticks, without Python and without a graph. What does not wait is left to the caller: the commands'
-part of the gates before it, the gradients of the weights after it. Everything is in scaled numbers, float32.
+One loop over the ticks, without Python and without a graph. The caller computes the parts without feedback: the
+commands' part of the gates before the loop, and the gradients of the weights after the loop. Everything is in scaled
+numbers, float32.
 
 The cell is PyTorch's GRU with feedback ports: at each tick it reads f, measured values or the last outputs, and outputs
 with f plus its change::
@@ -10,10 +11,10 @@ with f plus its change::
     velocity = clip(f + c o + p (m - f)),  pressure likewise,  o = V h' + d
     stroke = clip(f + trapezoid (velocity before + velocity)), and no velocity into an end stop
 
-Where a twin has a static map, m is what it says of the commands, and p the share of the way to it that an output is
-pulled in a tick; else p is zero.
+If a twin has a static map, m is the output of the map for the commands, and p is the fraction of the distance to m by
+which an output is pulled per sample; otherwise p is zero.
 
-All compiled code of a twin is in this file, whose content is the fingerprint of the code that is kept on disk.
+All compiled code of a twin is in this file. A hash of the file identifies the compiled code on disk.
 """
 
 from __future__ import annotations
@@ -106,9 +107,10 @@ def run_forward(
     """Run all ticks.
 
     Args:
-        inputs: the commands' part of the gates ``(time, batch, 3 units)``, biases included; measured values ``(time,
-            batch, output)``, any finite number where a port is free; ports of that shape, 1 where one reads what was
-            measured, 0 where it reads the last output; and what the static map says, of that shape, empty without one.
+        inputs: the commands' part of the gates ``(time, batch, 3 units)``, including biases; measured values ``(time,
+            batch, output)``, any finite number for a free port; port flags of the same shape, 1 if a port reads the
+            measured value, 0 if it reads the last output; and outputs of the static map of the same shape, empty
+            without a map.
         weights: weights of the feedback ``(output, 3 units)`` and of h ``(units, 3 units)``, bias of n's inner sum
             ``(units,)``, weights ``(units, output)`` and bias ``(output,)`` of the outputs, and pull p ``(output,)``,
             zero for strokes; p is empty without a map.

@@ -1,7 +1,7 @@
-"""Laws of the ground under a grey box with a known linkage: what resists the tip of the bucket below the surface.
+"""Ground laws for a grey box with a known linkage: forces on the bucket tip below the surface.
 
-A law is one file and one registration in `GROUNDS`. It is fitted to forces that logs in soil show (see
-`edp.training.ground_fit`); it belongs to the bundle of a twin and acts where a loop asks for a material.
+A law is one file and one registration in `GROUNDS`. It is fitted to forces estimated from logs in soil (see
+`edp.training.ground_fit`), is stored in the bundle of a twin, and acts in control loops with a material.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class GroundLaw(ABC):
         """Create the law from the result of `to_dict`.
 
         Raises:
-            ValueError: it is damaged; likewise KeyError and TypeError.
+            ValueError: the dictionary is damaged; KeyError and TypeError have the same cause.
         """
 
     @property
@@ -110,8 +110,8 @@ GROUNDS: Registry[type[GroundLaw]] = Registry("ground")
 class GroundedRunner(TwinRunner):
     """Runner whose machine is in contact with a ground.
 
-    What the ground does in a tick belongs to the velocity at its end, as a stage of the grey box does: an explicit
-    force of some 10 kN that turns with the velocity would swing from tick to tick.
+    The ground force of a sample depends on the velocity at its end, as in an implicit stage of the grey box. An
+    explicit force of about 10 kN that changes sign with the velocity would oscillate from sample to sample.
 
     Args:
         twin: a grey box with a known linkage.

@@ -2,8 +2,8 @@
 
     A_A p_A = A_B p_B + M v' + grad U(s) + F_C sign(v) + F_v v
 
-For a motor these are torques, and both areas are its displacement. The balance is linear in all that is not known, so
-it needs no starting values of its own. Pose-dependent inertia is left to the fit on free runs.
+For a motor these are torques, and both areas are its displacement. The balance is linear in all unknown parameters, so
+it needs no initial values. Pose-dependent inertia is fitted later on free-run simulations.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def load_start(
         columns: output columns of velocity, stroke, head and rod pressure of each actuator; -1 if not measured.
         z_of: middle and scale of the strokes.
         rate_hz: samples per second.
-        declared: whether the areas of each actuator are known, or one follows of the other.
+        declared: whether both areas of each actuator are known, or one area follows from the other.
     """
     values = table.nominal
     by_stroke = np.asarray(table.exponents.any(axis=0)) | (len(table.linkage) > 0)
@@ -97,7 +97,7 @@ def _balance_bodies(table: ParameterTable, matrix: Array, goal: Array) -> tuple[
         goal: forces in the same unit ``(row,)``.
     """
     bodies, others = matrix[:, : at.BASE], matrix[:, at.BASE :]
-    # All else is solved for, given the bodies: what is left is a square form in the nine numbers.
+    # All other parameters are eliminated for given bodies, which leaves a quadratic form in the nine body parameters.
     normal = others.T @ others
     normal += 1e-9 * np.diag(np.maximum(np.diag(normal), 1e-30))
     of_bodies, of_goal = np.linalg.solve(normal, others.T @ bodies), np.linalg.solve(normal, others.T @ goal)
@@ -159,7 +159,7 @@ def _insert_solution(table: ParameterTable, solution: Array, declared: Sequence[
     mass = np.zeros((n, n))
     for k, (p, r) in enumerate(inertia):
         mass[p, r] = mass[r, p] = solution[k]
-    # In plausible inertias of each actuator: those of a motor may be a millionth of a cylinder's.
+    # Scale by the prior inertia of each actuator: the inertia of a motor may be a millionth of a cylinder's.
     start = np.diag([values[table.inertia_at + k * table.inertia_terms] for k, (p, r) in enumerate(inertia) if p == r])
     moments, vectors = np.linalg.eigh(np.linalg.solve(start, np.linalg.solve(start, mass).T))
     # At least a fiftieth of it along each direction (200 kg): noise must not make an inertia negative.

@@ -115,7 +115,7 @@ class KnownLinkage:
         lengths = [*self.values[at.LENGTH : at.JOINTS], 0.0]
         rows = []
         for name, length, own in zip(BODY_NAMES, lengths, self.bodies.reshape(at.BODIES, -1), strict=True):
-            # The last body carries no other one: its centre says how long it is, about half of it.
+            # The last body carries no other body; its length is about twice the distance of its centre of mass.
             size = length or max(2.0 * float(np.hypot(own[at.CENTRE_X], own[at.CENTRE_Y])), 1e-3)
             element = f"{name}_body"
             along, across = (share * size for share in CENTRE_WIDTH)

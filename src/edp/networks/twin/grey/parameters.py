@@ -133,7 +133,7 @@ def number_table(
     """Return the parameters of connected elements, with initial values from the data.
 
     Args:
-        elements: connected.
+        elements: connected elements.
         travels: travel of each cylinder.
         highest_pump: highest pressure of each pump's line, MPa.
         degrees: degrees of the load polynomials L and U.
@@ -242,7 +242,7 @@ def _inertia(actuators: Sequence[Actuator], areas: Sequence[float], exponents: I
         unit = "kg^0.5 m" if isinstance(actuator, MotorElement) else "kg^0.5"
         for c in range(a + 1):
             for b, exponent in enumerate(exponents):
-                # 10 t on the diagonal of a cylinder: a start for where nothing is measured.
+                # Start with 10 t on the diagonal of a cylinder if there is no measurement.
                 start = 0.1 * size if a == c and b == 0 else 0.0
                 label = f"inertia_root_{actuator.name}_{actuators[c].name}_{_power(exponent)}"
                 numbers.append(Parameter("load", label, unit, 1e3, start, 0.05 * size, False))

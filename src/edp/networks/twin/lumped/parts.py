@@ -156,7 +156,7 @@ def lumped_parameters(parts: Parts, channels: TwinChannels, scales: TwinScales) 
     commands = {c.name: float(w) for c, w in zip(channels.commands, scales.command_width, strict=True)}
     rows: list[Parameter] = []
     measured = [answers.index(tank.level) for tank in parts.tanks if tank.level]
-    # A level crosses its own spread as fast as the changes from tick to tick say.
+    # Typical rate of a level: standard deviation of its changes per sample, relative to its own, times the sample rate.
     speed = [float(scales.change_width[i] / scales.answer_width[i]) * channels.rate_hz for i in measured]
     rate = float(np.mean(speed)) if speed else 0.1 * channels.rate_hz
     for tank in parts.tanks:
@@ -169,7 +169,7 @@ def lumped_parameters(parts: Parts, channels: TwinChannels, scales: TwinScales) 
             else Parameter(tank.name, "spilled_into", "1", 1.0, 0.7, 0.5),
             Parameter(tank.name, "outflow", "1/s", 1.0, rate, 1.0),
             Parameter(tank.name, "exponent", "1", 1.0, 0.5, 0.4),
-            # Nothing tells how high a tank is whose level is not measured: it counts in shares of its height.
+            # The height of a tank with an unmeasured level is unknown, so its level is a fraction of the height.
             Parameter(tank.name, "edge", "m", 1.0, 1.03 * full, 0.1)
             if tank.level
             else Parameter(tank.name, "start", "1", 1.0, 0.6, 0.3),

@@ -195,8 +195,8 @@ def simulate_measured(
 ) -> NDArray[np.float32]:
     """Simulate outputs ``(run, tick, output)``; a port reads the measurement, or the last output if it is NaN.
 
-    State is rounded at each tick, so that a run that goes on from a kept state is the same one. `answer` and `hidden`
-    are moved to the end of the run.
+    The state is rounded in each sample, so that a continued simulation gives identical bits. `answer` and `hidden` are
+    updated to the end of the run.
     """
     answers = np.empty(measured.shape, np.float32)
     work, read, after = np.zeros((5, len(wiring[2]))), np.zeros(answer.shape[1]), np.zeros(answer.shape[1])
