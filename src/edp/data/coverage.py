@@ -27,15 +27,15 @@ from edp.wording import typed
 
 Array = NDArray[np.float64]
 CELLS = 6
-"""Cells of each stroke in the occupancy."""
+"""Number of cells per stroke in the occupancy."""
 BINS = 24
-"""Bins of each side of a joint histogram."""
+"""Number of bins per axis of a joint histogram."""
 TAIL = 5e-4
 """Fraction of the samples at either end that a joint histogram omits."""
 QUANTILES = 32
-"""Bins of equal content for the mutual information."""
+"""Number of bins with equal content for the mutual information."""
 INFORMED = 200_000
-"""Samples for the mutual information, evenly spread."""
+"""Maximum number of samples for the mutual information, evenly spaced."""
 MEASURED, INTEGRATED = "strokes", "integrated velocity"
 
 
@@ -44,7 +44,7 @@ class Spectrum:
     """Inputs in the frequency domain; see `edp.data.spectrum`.
 
     Attributes:
-        names: commands; two one-sided ones as their difference.
+        names: names of the commands; two one-sided commands count as their difference.
         frequency_hz: shape ``(frequency,)``.
         density: power spectral density, shape ``(frequency, command)``.
         flat_to_hz: frequency up to which each spectrum stays within 10 dB of its maximum.
@@ -68,7 +68,7 @@ class Occupancy:
         source: ``strokes``, or ``integrated velocity`` where no stroke is measured.
         names: channels, an axis of `samples` each.
         span: lowest and highest value of each, m.
-        full_stroke: whether the span is the cylinder's; else it is what was seen.
+        full_stroke: whether the span is the cylinder's stroke; otherwise it is the recorded range.
         samples: count of samples, shape ``(CELLS,) * axes``.
     """
 
@@ -89,7 +89,7 @@ class JointHistogram:
     """Joint histogram of two signals in report units: `counts` has shape ``(x bin, y bin)``.
 
     Attributes:
-        filled: share of the bins with a sample.
+        filled: fraction of the bins with a sample.
         correlation: Pearson's, over all samples.
         information: mutual information in nat between quantile bins at the same instant, bias of chance removed.
     """
@@ -117,7 +117,7 @@ class Coverage:
         singular: smallest singular value of the input Hankel matrix by lags; inputs of deviation 1.
         constant: inputs that never change, left out of `singular`.
         absent: figures that could not be computed, each with the reason.
-        contradictions: strokes that are no integrals of their velocities, and what to do.
+        contradictions: strokes that are not integrals of their velocities, and the suggested action.
     """
 
     recordings: int
@@ -151,9 +151,9 @@ def cover(
 
     Args:
         recordings: recordings with one sample rate and equal channels.
-        inputs: channels that command, where neither name nor kind tells.
-        split: also say how far its tests lie from its training.
-        dead_band: share of the largest command that moves nothing.
+        inputs: command channels, required if neither name nor kind identifies them.
+        split: whether to also compute the distance between its test data and its training data.
+        dead_band: fraction of the largest command up to which an axis does not move.
 
     Raises:
         DataError: no recordings, mixed rates, an unknown input, or neither a command nor a velocity.
@@ -291,12 +291,12 @@ def _ends(occupancy: Occupancy) -> dict[str, tuple[float, float]]:
 
 def _integrate(recording: Recording, names: Sequence[str]) -> Array:
     way = np.cumsum(recording.select(names).astype(np.float64), axis=0) / recording.rate_hz
-    # An integral has no origin; its mean stands for mid stroke.
+    # An integral has no absolute position; its mean represents mid stroke.
     return np.asarray(way - way.mean(axis=0))
 
 
 def _cell(values: NDArray[Any], low: float, high: float, count: int) -> NDArray[np.intp]:
-    # A channel that stands still falls into the first cell instead of dividing by zero.
+    # A constant channel is in the first cell; this avoids a division by zero.
     share = (np.asarray(values, dtype=np.float64) - low) / max(high - low, 1e-12)
     return np.clip(np.floor(share * count), 0, count - 1).astype(np.intp)
 
@@ -364,7 +364,8 @@ def mutual_information(x: Array, y: Array, bins: int = QUANTILES) -> float:
 
     Less its expected value for independent ones.
 
-    A value held for long (a command in steady state) takes a bin of its own, however many samples it has.
+    A value that is constant for a long time (a command in steady state) has its own bin, independent of its number of
+    samples.
     """
 
     def ranked(values: Array) -> NDArray[np.intp]:

@@ -11,8 +11,8 @@ from edp.wording import typed
 OCCUPANCY = 0.9
 """Target for the fraction of visited stroke cells."""
 BEYOND = 0.1
-"""Maximum fraction of test samples farther from the training data than 95 % of the training data; 5 % if both are
-alike."""
+"""Maximum fraction of test samples farther from the training data than 95 % of the training samples. The fraction is 5
+% for equally distributed data."""
 
 
 @dataclass(frozen=True)

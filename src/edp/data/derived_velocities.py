@@ -1,4 +1,4 @@
-"""Velocities of logs that hold positions alone: the change of each position from tick to tick."""
+"""Velocities for logs with positions only: change of each position from sample to sample."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from edp.recording import Recording
 from edp.signals import Channel, Kind
 
 SUFFIX = "_velocity"
-"""Suffix for the name of a position to name its change per second."""
+"""Suffix added to the name of a position signal to name its rate of change."""
 RATE_OF = {integral: velocity for velocity, integral in INTEGRAL.items()}
-"""Kind of the change per second of a position, by its kind."""
+"""Kind of a rate of change, by the kind of the position signal."""
 
 
 def complete_velocities(
@@ -24,11 +24,11 @@ def complete_velocities(
 ) -> tuple[list[Recording], TwinChannelSettings]:
     """Add a velocity for each position without a recorded or named velocity, to recordings and settings.
 
-    Positions are the strokes that the settings name, else every position and angle that commands nothing. Recordings
-    with a velocity, and those without a position, come back as they are.
+    The positions are the strokes named in the settings, or all positions and angles that are not commands. Recordings
+    with a velocity or without a position are returned unchanged.
 
     Raises:
-        DataError: a recording has a channel of the name of such a velocity, or lacks a position.
+        DataError: a recording already has a channel with the name of a derived velocity, or lacks a position.
     """
     first = recordings[0]
     _ = roles_of(first, settings.commands)  # a command that is no channel is refused with the closest name

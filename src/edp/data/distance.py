@@ -14,11 +14,13 @@ from edp.recording import Recording
 
 Array = NDArray[np.float64]
 REFERENCES, QUERIES = 20_000, 4_000
-"""Samples searched in and searched for: distances shrink with the references, so both sides get equally many."""
+"""Maximum number of reference samples and of query samples. Distances decrease with the number of references, so both
+data sets use equally many."""
 MAX_STATES = 1 << 20
-"""Maximum number of states to draw from. Longer data are thinned evenly first."""
+"""Maximum number of states to select from. Longer data are thinned evenly first."""
 EARLIER_S = 0.2
-"""Commands are looked at now and this long ago: the delay of a hydraulic axis."""
+"""Age of the second command sample in a state, s, about the delay of a hydraulic axis. The first command sample is the
+current one."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,8 @@ class Distance:
         signals: number of signals in a state.
         test: median and 95 % quantile over test samples.
         train: reference distances from one half of the training segments to the other half, with equally many samples.
-        beyond: share of test samples farther away than 95 % of the training samples; 5 % where both are alike.
+        beyond: fraction of the test samples farther away than 95 % of the training samples; 5 % for equally distributed
+            data.
     """
 
     signals: int
@@ -53,7 +56,7 @@ def split_distance(recordings: Sequence[Recording], axes: Sequence[Axis], split:
     # Infinity takes a constant signal out of the distance.
     scale = np.where(deviation > 0, deviation, np.inf) * max(int(np.count_nonzero(deviation)), 1) ** 0.5
 
-    from scipy.spatial import cKDTree  # here: whatever looks at coverage would wait for it
+    from scipy.spatial import cKDTree  # import here: modules that use coverage would otherwise load it
 
     def nearest(references: Array, queries: Array) -> Array:
         tree = cKDTree((_evenly(references, size) - mean) / scale)
@@ -70,7 +73,7 @@ def _states(recordings: Sequence[Recording], axes: Sequence[Axis], stretches: Se
     every = -(-sum(stretch.stop - stretch.start for stretch in stretches) // MAX_STATES)
     for stretch in stretches:
         recording = recordings[stretch.recording]
-        # A stretch shorter than the delay keeps its last sample.
+        # A segment shorter than the delay keeps its last sample.
         back = min(round(EARLIER_S * recording.rate_hz), stretch.stop - stretch.start - 1)
         rows = slice(stretch.start + back, stretch.stop)
         commands = [axis.read_signed_command(recording) for axis in axes if axis.command]

@@ -13,17 +13,18 @@ from edp.errors import ConfigError, DataError
 
 
 class EpisodeSampler:
-    """Batches of episodes as a pure function of (seed, epoch). Each epoch has every machine once or nearly so.
+    """Batches of episodes as a pure function of (seed, epoch). Each epoch uses every machine about once.
 
-    A batch consists of ``machines`` groups of ``2 * shots`` segments of ``spec.length`` ticks, each from reset: the
-    first half of a group is the support that a network adapts on, the second half the query. No tick is in both.
+    A batch consists of ``machines`` groups of ``2 * shots`` segments of ``spec.length`` samples, each from reset. The
+    first half of a group is the support set, on which a network adapts; the second half is the query set. The halves
+    have no common samples.
 
     Args:
-        series: training segments that know their machine.
+        series: training segments with a machine name.
         horizons: look-ahead samples.
-        spec: length of a piece, lanes of a batch, burn-in.
-        shots: segments of support, and of query, of a machine.
-        seed: root of the random order.
+        spec: length of a segment, batch size and burn-in.
+        shots: number of support segments and of query segments per machine.
+        seed: random seed of the order.
 
     Raises:
         ConfigError: windows, a batch that is no multiple of ``2 * shots``, or segments no longer than the burn-in.
@@ -76,7 +77,7 @@ class EpisodeSampler:
         places = self.owned[machine]
         offsets = rng.integers(0, self.spec.length, len(places))  # cut elsewhere in each episode
         starts = self._starts(places, offsets)
-        if len(starts) < 2 * self.shots:  # this machine has no piece to spare
+        if len(starts) < 2 * self.shots:  # all segments of this machine are needed
             starts = self._starts(places, np.zeros_like(offsets))
         chosen = [starts[i] for i in rng.permutation(len(starts))[: 2 * self.shots]]
         length, burn_in = self.spec.length, self.spec.burn_in
@@ -91,10 +92,10 @@ class EpisodeSampler:
 
 
 def group_by_machine(series: Sequence[Series]) -> dict[str, list[int]]:
-    """Return the places of the series of each machine, machines in the order in which they come.
+    """Return the indices of the series of each machine, in the order of the machines' first occurrence.
 
     Raises:
-        DataError: a series that does not know its machine.
+        DataError: a series without a machine name.
     """
     owned: dict[str, list[int]] = {}
     for series_index, part in enumerate(series):

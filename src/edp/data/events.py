@@ -19,9 +19,9 @@ RECORDED = {
     "power limit": "Event_PowerLimit",
     "soil contact": "Event_SoilContact",
 }
-"""Events that only a simulation or a special logger knows, and their channels."""
+"""Events that only a simulation or a special logger records, and their channels."""
 CONTACT = 2e-3
-"""m from the end of a stroke that count as contact."""
+"""Distance from an end stop that counts as contact, m."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Activity:
     Attributes:
         reversals: changes of the sign of a command that left the dead band.
         crossings: times the command left its dead band, in either direction.
-        active: share of the time outside the dead band.
+        active: fraction of the time outside the dead band.
     """
 
     axis: str

@@ -12,10 +12,11 @@ from edp.data.folds import Folds
 from edp.data.lags import DoubleArray
 
 PENALTIES = tuple(10.0 ** (half / 2) for half in range(-14, 5))
-"""Penalties per row on columns of unit spread, half a decade apart: from almost none to strong."""
+"""Ridge penalties per row on columns with unit standard deviation, half a decade apart, from almost zero to strong."""
 
 MIN_GAIN = 1e-4
-"""A further set of columns or a weaker penalty must lower the squared error by this share; rounding does less."""
+"""Minimum relative reduction of the squared error that justifies additional columns or a weaker penalty. It is above
+rounding errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +46,7 @@ def fold_ridge(
     Args:
         table: ``(row, column)``, columns of about unit spread.
         targets: ``(row, output)``, or those of each fold, ``(fold, row, output)``.
-        folds: who is left out when.
+        folds: folds of the cross-validation.
         column_sets: sets of columns to choose from, the simplest first.
     """
     outputs, columns = targets.shape[-1], table.shape[1]
@@ -64,7 +65,7 @@ def fold_ridge(
             better = loss < best * (1.0 - MIN_GAIN)
             if better.any():
                 best[better] = loss[better]
-                # Columns of the set chosen before must not stay beside those of the new one.
+                # Columns of the previous set must not remain in the new set.
                 weights[:, :, better] = 0.0
                 own = np.stack([weight for weight, _ in solved])
                 weights[np.ix_(np.arange(folds.count), chosen, np.flatnonzero(better))] = own[:, :, better]
@@ -180,8 +181,8 @@ def _fold_moments(
 ) -> tuple[list[TableMoments], list[TableMoments]]:
     """Return the moments of the rows that each fold trains on, and of those that it leaves out.
 
-    Each row is multiplied out once for the fold that leaves it out, and once for each fold beside whose gap it lies:
-    what a fold trains on is the sum over the other folds without its gap.
+    The products of a row are computed once for the fold that leaves the row out, and once for each fold with the row in
+    its gap. The training moments of a fold are the sum over the other folds minus its gap.
     """
     outputs = targets.shape[-1]
     centre, level = table.mean(axis=0, dtype=np.float64), targets.mean(axis=-2).ravel()

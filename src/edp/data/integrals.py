@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from edp.wording import typed
 
 WINDOW_S = 1.0
-"""Over which changes are compared: lags of sensors and noise of velocities are small in it, drift as well."""
+"""Interval over which changes are compared, s. Sensor delays, velocity noise and drift are small over this interval."""
 MIN_TICKS = 5
 TOLD = 0.9
-"""Correlation from which the two say the same; below it noise, drift or another actuator may be the reason."""
+"""Minimum correlation between the integrated velocity and the stroke for a conclusion. A lower correlation can come
+from noise, drift or another actuator."""
 LOW, HIGH = 0.8, 1.25
-"""Accepted range of the ratio: wide enough for uncalibrated sensors, too narrow for any mistake of a unit."""
+"""Accepted range of the ratio. It allows for uncalibrated sensors and is too narrow for any wrong unit."""
 
 Rows = NDArray[np.floating]
 
@@ -44,7 +45,7 @@ def integral_fit(pairs: Sequence[tuple[Rows, Rows]], rate_hz: float) -> Integral
     """Compare a stroke with the integral of its velocity by the trapezoidal rule, over windows of `WINDOW_S`.
 
     Args:
-        pairs: velocity and stroke of each segment ``(tick,)``, in units that belong together.
+        pairs: velocity and stroke of each segment ``(tick,)``, in consistent units.
         rate_hz: sample rate.
     """
     ticks = max(MIN_TICKS, round(WINDOW_S * rate_hz))

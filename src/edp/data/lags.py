@@ -1,4 +1,4 @@
-"""Lag tasks: predictions at a tick from the rows of the last few ticks, and the sums that all such maps need."""
+"""Lag tasks: predictions from the last few samples, and the sums required to fit linear maps to them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class LagTask:
     """Predict each target at t + horizon from the inputs of the last `history` ticks, all in SI units.
 
     Attributes:
-        horizons: ticks ahead, each 0 or more; 0 estimates the target at the tick itself.
+        horizons: horizons in samples, each 0 or more; 0 estimates the target at the current sample.
         present: per target the input column with its present value, or None when no input measures it.
         history: samples up to and including the present one that a prediction may use.
 
@@ -78,7 +78,7 @@ def anchors(inputs: FloatArray, task: LagTask, means: DoubleArray) -> DoubleArra
 
     Args:
         inputs: ``(row, input)``.
-        task: says which column holds which target's present value.
+        task: task that defines the column with the present value of each target.
         means: training means ``(target,)``.
 
     Returns:

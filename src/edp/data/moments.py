@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 BLOCK_ROWS = 4_096
-"""Rows taken to double precision at a time: a megabyte of 30 columns, which stays in the processor's cache."""
+"""Number of rows converted to double precision at a time. One megabyte of 30 columns fits the processor's cache."""
 Vector = NDArray[np.float64]
 
 
@@ -31,7 +31,7 @@ class Moments:
 
     Attributes:
         count: rows.
-        low: smallest value of each column, ``(column,)``; `high` the largest, `mean` the mean.
+        low: smallest value of each column, ``(column,)``; `high` and `mean` are the largest value and the mean.
         squares: sum of squares about the mean.
     """
 
@@ -48,7 +48,7 @@ class Moments:
             self._merge(len(block), block.min(axis=0), block.max(axis=0), mean, np.square(block - mean).sum(axis=0))
 
     def merge(self, other: Moments) -> None:
-        """Take in what other rows gave."""
+        """Add the moments of other rows."""
         self.add(other.state())
 
     def state(self) -> MomentsState:

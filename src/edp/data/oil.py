@@ -9,7 +9,7 @@ from edp.recording import Recording
 from edp.signals import Kind
 
 OIL = "OilTemperature"
-"""Channel, of kind temperature."""
+"""Name of the oil temperature channel, of kind temperature."""
 FREEZING_K = 273.15
 
 

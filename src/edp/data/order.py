@@ -1,4 +1,4 @@
-"""Random orders of more things than a list of them would fit into memory."""
+"""Random order of more items than fit into memory as a list."""
 
 from __future__ import annotations
 
@@ -6,21 +6,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_LISTED = 1 << 24
-"""Things whose order is a list of 8 bytes each, 128 MB; 46 hours of windows at 100 Hz."""
+"""Maximum number of items whose random order is stored as a list (8 bytes each, 128 MB), or 46 hours of windows at 100
+Hz."""
 ROUNDS = 6
-"""Number of rounds of the network. Four make it indistinguishable from random for ideal functions (Luby and Rackoff,
-1988)."""
+"""Number of rounds of the Feistel network. Four rounds make the order indistinguishable from random for ideal functions
+(Luby and Rackoff, 1988)."""
 Numbers = NDArray[np.int64]
 
 
 class RandomOrder:
-    """A permutation of ``range(count)`` that is computed where it is read.
+    """Random permutation of ``range(count)``, computed on access.
 
-    Up to `MAX_LISTED` it is NumPy's. Beyond, a Feistel network with random keys permutes the next power of four, and
-    numbers outside of the range are permuted again until they fall into it (cycle walking, Black and Rogaway 2002).
+    Up to `MAX_LISTED` items, NumPy computes the permutation. For more items, a Feistel network with random keys
+    permutes the next power of four; numbers outside the range are permuted again until they are inside (cycle walking,
+    Black and Rogaway 2002).
 
     Args:
-        rng: the source of chance.
+        rng: random generator.
         count: length of the permutation.
     """
 

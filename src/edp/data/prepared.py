@@ -21,7 +21,7 @@ class Prepared:
 
     Attributes:
         task: channels to read and to predict.
-        train: training segments; `validation` and `test` likewise.
+        train: training segments.
         inputs: the logged input channels.
         feature_kinds: kind of each feature, in order.
         target_kinds: kind of each target.
@@ -51,7 +51,7 @@ def prepare(recordings: Sequence[Recording], task: Task, split: SplitSpec, windo
         recordings: the data set, all at the rate of the task.
         task: channels to read and to predict.
         split: division of the recordings.
-        window: W; the gap between neighbouring segments is ``W + k``.
+        window: window length W in samples; the gap between neighbouring segments is ``W + k``.
 
     Raises:
         DataError: a channel is missing, a value is not finite, rates differ, or a part would be empty.
@@ -61,7 +61,7 @@ def prepare(recordings: Sequence[Recording], task: Task, split: SplitSpec, windo
     state = hashlib.blake2b(digest_size=16)
     for recording in recordings:
         state.update(recording.digest.encode())
-    # The split is part of what went in: the same recordings divided otherwise are other data.
+    # The split is part of the inputs: the same recordings with another split are other data.
     state.update(repr(parts).encode())
 
     def series(stretches: Sequence[Stretch]) -> list[Series]:

@@ -20,13 +20,13 @@ PENALTIES = tuple(10.0**power for power in range(-6, 2))
 """Ridge penalties per training row on standardised features, from almost none to strong."""
 
 HISTORIES = (5, 20)
-"""Histories tried beside the task's own."""
+"""History lengths in samples that are tried in addition to the length in the task."""
 
 CROSSED_HISTORIES = (3, 5, 10, 20)
-"""Histories tried by cross-validation beside the task's own."""
+"""History lengths in samples that cross-validation tries in addition to the length in the task."""
 
 BLOCK_ROWS = 16_384
-"""Rows taken to double precision at a time, so that memory does not grow with the recording."""
+"""Number of rows converted to double precision at a time, so that memory does not grow with the recording."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,14 +70,14 @@ def ridge_solution(
 ) -> RidgeSolution:
     """Return the ridge-regularised least squares for every horizon and target, in physical units.
 
-    The map is fitted to the change from the present value where an input measures it, so a strong penalty leads back
-    to persistence. Memory is a few Gram matrices of ``(history * input)`` squared, whatever the length of the series.
+    If an input measures the target, the map predicts the change from the present value, so a strong penalty leads to
+    persistence. The memory is a few Gram matrices of ``(history * input)`` squared, independent of the series length.
 
     Args:
         train: training series; at least one has a full history and the longest horizon.
         task: channels to read and to predict.
-        validation: chooses penalty and history by squared error; when it has no usable tick, the smallest penalty and
-            longest history are taken.
+        validation: data on which the squared error selects penalty and history; without a usable sample, the smallest
+            penalty and the longest history are used.
         penalties: penalties per row on standardised features, each above 0.
         histories: histories to choose from, in samples; cut to the task's. By default 5, 20 and the task's.
 
@@ -91,7 +91,8 @@ def ridge_solution(
     best = np.full(outputs, np.inf)
     weights = np.zeros((task.history * inputs, outputs))
     penalty, history = np.zeros(outputs), np.zeros(outputs, dtype=np.int64)
-    # Longest history and smallest penalty first: these stay where validation cannot tell.
+    # Start with the longest history and the smallest penalty, which remain if validation cannot distinguish the
+    # candidates.
     for samples in reversed(tried):
         for relative in sorted(penalties):
             candidate = _solve(fitted, samples * inputs, relative)
@@ -112,12 +113,13 @@ def cross_validate_ridge(
 ) -> RidgeSolution:
     """Return the ridge regression on all of `parts`; penalty and history by cross-validation over contiguous folds.
 
-    For little data, where one held-out segment is too short to choose by and too dear to leave out of the fit.
+    Use this function for small data sets, where one held-out segment is too short for a selection and is needed for the
+    fit.
 
     Args:
-        parts: all segments that may be learned from.
+        parts: all segments for training.
         task: channels to read and to predict.
-        folds: segments of nearly equal duration; neighbouring ones share the history and future of their ticks.
+        folds: segments of nearly equal duration. Neighbouring segments share history and future samples.
         penalties: penalties to try, see `ridge_solution`.
         histories: histories to choose from, in samples; cut to the task's.
 
@@ -130,7 +132,7 @@ def cross_validate_ridge(
     weights = np.zeros((task.history * inputs, outputs))
     penalty, history = np.zeros(outputs), np.zeros(outputs, dtype=np.int64)
     for samples in sorted({min(entry, task.history) for entry in (*histories, task.history)}, reverse=True):
-        # Rows are counted anew for each history: a short one can use more of them.
+        # The number of rows depends on the history: a short history can use more rows.
         tried = replace(task, history=samples)
         folded = [moments_of(fold, tried, standard) for fold in _folds(parts, tried, folds)]
         whole = _sum(folded)
@@ -198,7 +200,7 @@ def _compute_squared_error(held_out: RidgeMoments, fitted: RidgeMoments, weights
     if held_out.rows == 0:
         return np.zeros(weights.shape[1])
     size, rows = len(weights), held_out.rows
-    # The intercept that the training rows had, not one fitted to what is held out.
+    # Use the intercept of the training rows, not an intercept fitted to the held-out rows.
     offset = (fitted.y - fitted.x[:size] @ weights) / fitted.rows
     x, y, xy = held_out.x[:size] / rows, held_out.y / rows, held_out.xy[:size] / rows
     quadratic = np.einsum("io,io->o", weights, (held_out.xx[:size, :size] / rows) @ weights)

@@ -14,7 +14,7 @@ from edp.signals import Channel, Kind
 
 Array = NDArray[np.float64]
 COMMANDS = (Kind.PILOT_PRESSURE, Kind.CURRENT, Kind.VOLTAGE, Kind.RATIO)
-"""Kinds that stand for a command, in the order in which they are looked for."""
+"""Kinds of channels that can be commands, in order of preference."""
 _TABLE_A1 = (
     ("boom", ("BmUp", "BmDwn"), ("BmUpConf", "BmDwnConf")),
     ("arm", ("AmIn", "AmOut"), ("AmInConf", "AmOutConf")),
@@ -28,11 +28,11 @@ class Axis:
 
     Attributes:
         name: name for reports.
-        command: channels that command it: extend and retract, one signed channel, or none.
-        velocity: its velocity, extension positive; where kinds tell none, another signal that answers.
+        command: command channels of the axis: extend and retract, one signed channel, or none.
+        velocity: velocity of the axis, extension positive; if unknown, another signal that responds to the command.
         pressures: head and rod pressure, or as many as there are.
-        stroke: its position.
-        conflux: channels that give it the second pump.
+        stroke: position of the axis.
+        conflux: channels that connect the second pump.
     """
 
     name: str
@@ -66,7 +66,7 @@ def roles_of(recording: Recording, inputs: Sequence[str] = ()) -> Roles:
 
     Args:
         recording: recording whose channels are searched.
-        inputs: names of the channels that command, where neither name nor kind tells.
+        inputs: names of the command channels, required if neither name nor kind identifies them.
 
     Raises:
         DataError: no such input channel.

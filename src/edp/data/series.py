@@ -12,13 +12,13 @@ class Series:
     """Inputs and targets of one contiguous segment, in SI units.
 
     Attributes:
-        name: the recording it comes from (with the row range when it is a part of one).
-        inputs: float32 ``(time, input)``; row t is what is known at tick t.
+        name: name of the recording, with the row range for a part of a recording.
+        inputs: inputs, float32 ``(time, input)``; row t contains the values available at sample t.
         targets: float32 ``(time, target)``; row t is the target channel *at* t (a horizon k asks for row t + k).
-        strategy_columns: float32 ``(time, column)``, what a training strategy reads of tick t beside the targets:
-            teacher predictions, the number of a domain or machine; None where it reads nothing more.
+        strategy_columns: additional columns for a training strategy, float32 ``(time, column)``: teacher predictions,
+            or the number of a domain or machine; None without additional columns.
         machine: machine of the recording; empty if unknown.
-        recording: the recording that it is cut from; empty where that is not known.
+        recording: name of the source recording; empty if unknown.
     """
 
     name: str

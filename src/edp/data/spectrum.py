@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 LAGS = 50
-"""Block rows of the Hankel matrix: the window of 50 samples that the thesis's networks read."""
+"""Number of block rows of the Hankel matrix: the window of 50 samples of the thesis's networks."""
 LAG_STEPS = (1, 2, 3, 5, 8, 12, 16, 20, 25, 30, 35, 40, 45, 50)
 FLAT_DB = 10.0
 """Maximum attenuation below the maximum of a spectrum that counts as flat."""
@@ -27,7 +27,7 @@ def hankel_gram(inputs: Sequence[Array], lags: int) -> tuple[Array, int]:
     products at one distance, so that each block follows from its neighbour by one product less and one more.
 
     Args:
-        inputs: segments, shape ``(time, input)``; those shorter than `lags` are left out.
+        inputs: segments, shape ``(time, input)``; segments shorter than `lags` are omitted.
         lags: block rows.
 
     Returns:
@@ -56,8 +56,8 @@ def hankel_gram(inputs: Sequence[Array], lags: int) -> tuple[Array, int]:
 def smallest_singular_values(inputs: Sequence[Array], lags: int = LAGS) -> dict[int, float]:
     """Return the smallest singular value of the input Hankel matrix over the root of its columns, by number of lags.
 
-    Inputs are brought to mean 0 and deviation 1, so that white noise has the value 1. Inputs are persistently exciting
-    of an order as long as the value is above zero; a small one says which models the data cannot tell apart.
+    Inputs are standardised, so white noise has the value 1. Inputs are persistently exciting of an order if its value
+    is above zero; a small value shows that the data cannot distinguish models of this order.
 
     Args:
         inputs: segments, shape ``(time, input)``; no column is constant.
@@ -89,7 +89,7 @@ def density(stretches: Sequence[Array], rate_hz: float) -> tuple[Array, Array]:
     # Imported at first use: scipy.signal imports scipy.stats, half a second of the start of every command.
     from scipy.signal import welch
 
-    # By stretch: a segment across two recordings would hold a jump that nobody commanded.
+    # Process each segment separately: a segment across two recordings would contain an artificial jump.
     parts = [welch(u, rate_hz, nperseg=size, axis=0) for u in fitting]
     power = np.average([p for _, p in parts], axis=0, weights=[len(u) for u in fitting])
     return np.asarray(parts[0][0][1:]), np.asarray(power[1:])

@@ -16,8 +16,8 @@ def spread_series(series: Sequence[Series], length: int, most: int, on_disk: boo
     Args:
         series: the series.
         length: length of a segment.
-        most: ticks in all.
-        on_disk: rows that are read from disk when they are asked for stay there, in place of coming into memory.
+        most: approximate total number of samples.
+        on_disk: whether rows on disk stay on disk until they are read, instead of being loaded into memory.
     """
     stretches = spread_stretches([part.samples for part in series], length, most)
     return [_cut(series[i], start, stop, on_disk) for i, start, stop in stretches]

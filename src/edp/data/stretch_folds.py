@@ -31,9 +31,9 @@ def stretch_folds(series: Sequence[Series], count: int, gap: int, shortest: int,
     Args:
         series: at least one segment. They are concatenated in random order, because files are often in the order of the
             driving tasks.
-        count: folds, at least 2.
-        gap: ticks beside a fold that it does not learn from.
-        shortest: ticks of a segment that says something; what is cut shorter is in neither part.
+        count: number of folds, at least 2.
+        gap: number of samples next to a fold that are omitted from training.
+        shortest: minimum length of a segment in samples; shorter segments are omitted.
         seed: random seed of the order.
 
     Raises:

@@ -71,14 +71,15 @@ class Task:
     Attributes:
         features: the feature set.
         targets: names of logged or derived channels.
-        horizons: look-ahead in samples, increasing; 0 means the present value from inputs alone (simulation).
+        horizons: prediction horizons in samples, increasing; 0 estimates the present value from the inputs alone
+            (simulation).
         mode: absolute or delta encoding.
         rate_hz: samples per second of every recording.
         derived_targets: derived channels that serve as targets only.
-        integrate: targets at horizon 0 whose running integral is evaluated too: a plant that integrates (a position
-            behind a velocity) is predicted through its rate and integrated outside.
-        physics: further logged channels that only a physics base reads: inputs, but neither features nor known to
-            baselines.
+        integrate: targets at horizon 0 whose running integral is also evaluated. For an integrating plant, the rate (a
+            velocity) is predicted and then integrated to a position.
+        physics: additional logged channels that only a physics base reads. They are not features, and baselines do not
+            read them.
 
     Raises:
         ConfigError: a horizon or combination that cannot hold.

@@ -1,7 +1,6 @@
 """Channels of a plant model for free-run simulation: commands, and the simulated velocities, strokes and pressures.
 
-Which channel is which comes from names and kinds (`edp.data.roles`), or from settings: three cylinders of an excavator
-and one actuator of a test rig are the same thing here.
+The roles of the channels come from names and kinds (`edp.data.roles`) or from settings, for any number of actuators.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from edp.settings.bounds import MAX_NAMES, check_count
 from edp.signals import Channel, Kind
 
 INTEGRAL = {Kind.VELOCITY: Kind.POSITION, Kind.ANGULAR_VELOCITY: Kind.ANGLE}
-"""Kind of what a velocity integrates to, by its kind."""
+"""Kind of the integral of a velocity, by the kind of the velocity."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +28,7 @@ class TwinChannelSettings:
     Attributes:
         commands: commands of operator or controller; by default pilot pressures, else currents, voltages, ratios.
         velocities: one for each actuator; by default every velocity.
-        strokes: the position of each of them, in the same order; by default where positions fit the velocities.
+        strokes: position of each of these axes, in the same order; by default the positions that match the velocities.
         pressures: pressures of chambers and pumps; by default every pressure that is not a command.
 
     Raises:
@@ -55,9 +54,9 @@ class TwinChannels:
     """Channels by role; outputs are ordered velocities, strokes, pressures.
 
     Attributes:
-        commands: read at each tick.
+        commands: command channels that are read in each sample.
         velocities: velocities of the actuators.
-        strokes: position of each, in the order of the velocities, or none at all.
+        strokes: positions of all actuators in the order of the velocities, or none.
         pressures: pressures of chambers and pumps.
         rate_hz: samples per second.
 
@@ -118,10 +117,10 @@ def twin_channels(recording: Recording, settings: TwinChannelSettings | None = N
 
     Args:
         recording: recording whose channel names and kinds are searched.
-        settings: names where these do not tell.
+        settings: channel names, required if the kinds do not identify the channels.
 
     Raises:
-        DataError: a channel that is named, but not recorded.
+        DataError: a named channel is not recorded.
         ConfigError: a part that nothing fills, or kinds that do not fit.
     """
     chosen = settings or TwinChannelSettings()
@@ -130,7 +129,7 @@ def twin_channels(recording: Recording, settings: TwinChannelSettings | None = N
         return tuple(recording.channels[recording.index(name)] for name in names)
 
     roles = roles_of(recording, chosen.commands)
-    # The second pump's pilot pressures are commands as well: which actuator gets its oil is for the lever to say.
+    # The second pump's pilot pressures are also commands, because the lever decides which actuator gets the oil.
     commands = chosen.commands or roles.inputs + tuple(name for axis in roles.axes for name in axis.conflux)
     axes = [axis for axis in roles.axes if axis.velocity]
     velocities = chosen.velocities or tuple(axis.velocity for axis in axes)

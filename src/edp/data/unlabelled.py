@@ -32,5 +32,5 @@ def unlabelled(task: Task, recording: Recording) -> Series:
             f"{int(bad[:, column].sum())} missing or infinite value(s), the first at row {row}; repair the log or ask "
             'for a repair (nan = "hold")'
         )
-    # Zeros stand for targets that nobody reads: a series has columns for all of them.
+    # Fill the targets with zeros, since a series needs columns for all targets.
     return Series(recording.name, inputs, np.zeros((len(inputs), len(task.targets)), dtype=np.float32))

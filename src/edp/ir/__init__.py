@@ -1,4 +1,4 @@
-"""A network as a plain list of streaming layers, each one tick at a time: what export targets and quantisation read."""
+"""Network as a plain list of streaming layers, computed sample by sample; input of export and quantisation."""
 
 from edp.ir.base import Array, Graph, Layer, Slot
 from edp.ir.builder import Builder

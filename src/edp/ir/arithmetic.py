@@ -85,7 +85,7 @@ EXACT = FloatArithmetic(
     },
     in_order=False,
 )
-"""NumPy's functions, in double precision or in single."""
+"""NumPy functions in double or single precision, used as the exact reference."""
 
 
 # ---- the C runtime's -------------------------------------------------------------------------------------------------
@@ -205,4 +205,4 @@ RUNTIME = FloatArithmetic(
     },
     in_order=True,
 )
-"""Single precision with the runtime's own functions and sums."""
+"""Arithmetic in single precision with the functions and summation order of the C runtime."""

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 Array = NDArray[np.float32]
 Indices = NDArray[np.uint16]
 Values = NDArray[Any]
-"""Values of a layer at several ticks of several streams, ``(time, stream, number)``."""
+"""Values of a layer for several samples and streams, ``(time, stream, number)``."""
 Memory = dict[str, Any]
-"""What a layer remembers, by slot: ``(stream, ...)``, rings ``(tick, stream, ...)``; an age is one for all streams."""
+"""Memory of a layer by slot: ``(stream, ...)``, ring buffers ``(tick, stream, ...)``. An age is one number for all
+streams."""
 
 INPUT = "input"
-"""The value that holds the inputs of the tick, SI units, in the order in which they are fed."""
+"""Name of the value that contains the inputs of the current sample, SI units, in input order."""
 
 
 class Number(StrEnum):
@@ -41,10 +42,10 @@ class Slot:
     """Numbers that a layer carries from tick to tick.
 
     Attributes:
-        name: within the layer.
+        name: name within the layer.
         shape: shape; a ring has samples first, the oldest one in row 0.
-        fill: every number's value after a reset, unless the graph says otherwise.
-        number: meaning of the numbers.
+        fill: value of every number after a reset, unless the graph has another value.
+        number: meaning of the values.
     """
 
     name: str
@@ -119,14 +120,14 @@ class Layer(ABC):
 
     Attributes:
         name: name of the layer and of its value; unique in its graph, lower case, parts joined by dots.
-        inputs: values that it reads.
-        matrices: constants that the C runtime multiplies with, which lie in panels there.
-        counted: whether its C state has a ring or a counter.
+        inputs: names of the values that the layer reads.
+        matrices: names of the weight matrices, which the C runtime stores in panels.
+        counted: whether its C state has a ring buffer or a counter.
         stays_float: whether it stays in single precision in an integer network: it has no weights, or a few gains.
-        bit_exact: whether its equations in the arithmetic of the C runtime give the bits of the C code.
-        tick_by_tick: whether its equations compute one tick at a time, since other layers wait for what they change.
-        without: forms that this kind of layer does not have (``integers``, ``tangent``, ``onnx``, ``matlab``), each
-            with what to do instead.
+        bit_exact: whether its equations in the arithmetic of the C runtime are bit-identical to the C code.
+        tick_by_tick: whether the equations compute one sample at a time, because other layers depend on their changes.
+        without: unsupported forms of this kind of layer (``integers``, ``tangent``, ``onnx``, ``matlab``), each with
+            the suggested alternative.
     """
 
     matrices: ClassVar[tuple[str, ...]] = ()
@@ -137,8 +138,8 @@ class Layer(ABC):
     without: ClassVar[Mapping[str, str]] = {}
 
     over_time: ClassVar[Callable[..., Any]] = _refuse_equations
-    """The equations: a method ``over_time(run, *inputs)`` from the values of the inputs, ``(time, stream, number)``, to
-    those of the layer; `run` is a `LayerRun`."""
+    """Method ``over_time(run, *inputs)`` that computes the layer's values from its inputs, both ``(time, stream,
+    number)``; `run` is a `LayerRun`."""
 
     name: str
     inputs: tuple[str, ...]
@@ -179,7 +180,7 @@ class Layer(ABC):
         return self.scratch
 
     def products(self, x: Values, y: Values) -> dict[str, Values]:
-        """Return what its 8-bit matrices are multiplied by, ``(time, row, terms)``, by matrix.
+        """Return the inputs of its 8-bit matrices, ``(time, row, terms)``, by matrix.
 
         Args:
             x: its first input since a reset, ``(time, number)``.
@@ -205,7 +206,7 @@ class Graph:
     Attributes:
         inputs: numbers fed at each tick.
         layers: every layer reads `INPUT` and layers before it.
-        results: values that are given back, by what they mean: ``prediction``, and ``lower`` and ``upper`` bounds.
+        results: values that the graph returns, by meaning: ``prediction``, and ``lower`` and ``upper`` bounds.
         initial: values of slots after a reset that are not all one number, by ``(layer, slot)``.
         window: ticks after a reset until predictions rest on a whole window.
     """

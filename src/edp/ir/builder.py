@@ -21,7 +21,7 @@ def constant(values: Any) -> Array:
         ExportError: one of them is not finite.
     """
     plain = values.detach().cpu().numpy() if hasattr(values, "detach") else values
-    # A copy in C order: a graph must not change when training goes on with the same tensors.
+    # Copy in C order, so that the graph does not change when training continues with the same tensors.
     array = np.array(plain, dtype=np.float32, order="C")
     # A weight that is not finite would make every prediction NaN on the controller, long after the export.
     if not np.isfinite(array).all():
@@ -30,7 +30,7 @@ def constant(values: Any) -> Array:
 
 
 MAX_INDEX = 2**16 - 1
-"""Largest index of a table: tables of 16 bits take half of the flash of tables of words."""
+"""Maximum index in a table. Tables of 16-bit indices need half the flash memory of 32-bit tables."""
 
 
 def indices(values: Any) -> Indices:
@@ -92,7 +92,7 @@ class Builder:
     def pick(self, name: str, x: str, columns: Sequence[int]) -> str:
         """Select elements of a value; the value itself is returned if all are selected in order."""
         chosen = tuple(columns)
-        # A gather that moves nothing would cost a copy a tick in the exported code.
+        # Omit a gather that changes nothing; it would cost a copy per sample in the exported code.
         if chosen == tuple(range(self.width(x))):
             return x
         return self.add(Gather, name, x, columns=chosen)
@@ -125,11 +125,11 @@ class Builder:
         used_layers: list[Layer] = []
         used_values = set(results.values())
         for layer in reversed(self.layers):
-            # Layers of width zero act on what others remember, so nobody reads their value and they must stay.
+            # Layers of width zero change the memory of others. Their value is not read, but they must stay.
             if layer.name in used_values or not layer.width:
                 used_layers.append(layer)
                 used_values |= set(layer.inputs)
-        # Copies of the layers: the builder may go on with its own.
+        # Copy the layers, because the builder may continue to change its own.
         return Graph(
             self.inputs, tuple(replace(layer) for layer in reversed(used_layers)), results, self._initial, window
         )

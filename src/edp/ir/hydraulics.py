@@ -11,7 +11,7 @@ import numpy as np
 from edp.ir.base import Array, Indices, Layer, LayerRun, Memory, Slot, Values
 
 NONE = 2**16 - 1
-"""Entry of a table of places: there is no such thing."""
+"""Entry for a missing element in a table of positions."""
 VALVE_STATES = 5
 
 
@@ -19,33 +19,33 @@ VALVE_STATES = 5
 class HydraulicTick(Layer):
     """Velocities and pressures after one sample, scaled like the outputs, from commands in SI units and port values.
 
-    The equations are those of `edp.networks.twin.grey`, in double precision; what is carried on is single precision.
-    Units within are m, s, MPa, MN and Gg. Places are those of numbers in `numbers`, `NONE` where there is none.
+    The equations are those of `edp.networks.twin.grey`, in double precision; the state is stored in single precision.
+    Internal units are m, s, MPa, MN and Gg. Positions are indices of `numbers`, `NONE` for a missing element.
 
     Attributes:
         numbers: parameters of the machine.
         full: the largest command of each valve.
         knots: knots of all opening curves.
         middle: centre of each stroke; `scale` maps a stroke to -1..1, 0 for a stroke that is not measured.
-        scale: see there.
+        scale: scale of each stroke, see `middle`.
         offset: offset of each output, in internal units; `answer_width` is its width.
-        answer_width: see there.
-        linkage: of three cylinders, as `edp.networks.twin.grey.parameter_index` orders it; one zero: the load is
-            polynomials.
+        answer_width: width of each output, in internal units.
+        linkage: linkage of three cylinders in the order of `edp.networks.twin.grey.parameter_index`; a single zero if
+            the load consists of polynomials.
         sides: commands that extend and retract ``(valve, 2)``.
-        valve_at: places of each valve's numbers ``(valve, 13)``.
+        valve_at: positions of each valve's parameters ``(valve, 13)``.
         valve_actuator: actuator of each valve.
         valve_pump: pump of each valve; `NONE` for a supply at constant pressure.
-        actuator_at: places of each actuator's numbers.
-        pump_at: places of each pump's; without any, one entry `NONE`.
-        ports: velocity 0, stroke 1 or pressure 2, and which ``(output, 2)``.
+        actuator_at: positions of each actuator's parameters.
+        pump_at: positions of each pump's parameters; a single `NONE` without pumps.
+        ports: kind of each port (velocity 0, stroke 1, pressure 2) and its index ``(output, 2)``.
         exponents: exponents of the load's monomials ``(term, actuator)``.
         load: places of the first coefficient of the inertia's root (of the first body of a linkage) and of the
             potential, and coefficients of each entry of the root between them.
-        circuit: place of the circuit's numbers.
-        remembered: ticks of demands.
-        steps: implicit steps in a tick.
-        tick_s: length of a tick.
+        circuit: position of the circuit's parameters.
+        remembered: number of stored demand samples.
+        steps: number of implicit steps per sample.
+        tick_s: sample time, s.
     """
 
     tick_by_tick = True
@@ -145,4 +145,5 @@ class HydraulicTick(Layer):
 
 
 SOLVERS: list[Callable[[HydraulicTick, Mapping[str, Values], Memory, Values, Values], Values]] = []
-"""The solver of one tick (layer, constants, memory, commands, ports), entered by the equations' own room."""
+"""Solvers of one time step by name, called with layer, constants, memory, commands and ports. The module of the
+equations registers its solver here."""

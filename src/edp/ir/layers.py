@@ -15,7 +15,7 @@ from edp.ir.base import Array, Indices, Layer, LayerRun, Values
 from edp.ir.descent import depth_of, find_leaves, summed
 
 LEAST = float(np.finfo(np.float32).tiny)
-"""The least normal number of single precision."""
+"""Smallest positive normal number of single precision."""
 
 
 def split(x: Values, rows: int) -> Values:
@@ -41,9 +41,9 @@ class Function(StrEnum):
     SINE = "sine"
     COSINE = "cosine"
     LOG = "log"
-    """Natural, of what is above 0; anything below the least normal number of single precision counts as that."""
+    """Natural logarithm. Arguments below the smallest normal number of single precision are replaced by this number."""
     POSITIVE = "positive"
-    """1 where a number is above 0, else 0."""
+    """Step function: 1 for positive numbers, else 0."""
 
 
 class BinaryOperation(StrEnum):
@@ -278,8 +278,8 @@ class TreeSums(Layer):
 
     Output o is the sum of ``leaf[o, t, i - (2^D - 1)]`` over its trees t, the first one first. Node i is reached from
     node 0 by D steps ``i = 2 i + 1 + (x[feature[o, t, i]] > threshold[o, t, i])``, compared in single precision. A node
-    that does not split has `NEVER` as its threshold. A tick takes ``outputs trees D`` comparisons whatever it reads,
-    and no multiplication.
+    that does not split has `NEVER` as its threshold. A sample takes ``outputs trees D`` comparisons for any input, and
+    no multiplication.
 
     Attributes:
         feature: numbers of the input, ``(output, tree, 2^D - 1)``, uint16.
@@ -307,7 +307,7 @@ class TreeSums(Layer):
 
 
 NEVER = float(np.finfo(np.float32).max)
-"""A threshold that no number of single precision exceeds, and that every target can write: it is no infinity."""
+"""Threshold that no number of single precision exceeds. It is finite, so that every target language can write it."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

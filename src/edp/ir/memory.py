@@ -1,6 +1,6 @@
 """Layers with state: differences, convolutions, recurrences, trailing windows.
 
-In the equations `before` is what the layer had at the tick before.
+In the equations `before` is the value of the layer at the previous sample.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from edp.ir.layers import Function, flat, split
 
 # Finite on purpose: minus infinity would give NaN where all scores of a row are hidden.
 UNSEEN = -1e30
-"""Score of a tick before the reset: no softmax notices it."""
+"""Attention score of a sample before the reset. The score is so low that the softmax ignores the sample."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -462,7 +462,7 @@ class Feedback(Layer):
 class Feed(Layer):
     """Feedback edge of a plant model: its input is the value of the layer `into`, a `Feedback`, at the next sample.
 
-    It gives no value and comes after all readers of that layer.
+    It has no value and comes after all readers of that layer.
     """
 
     stays_float = True
@@ -481,9 +481,9 @@ class Feed(Layer):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PrefixCorrection(Layer):
-    """Adds ``W_2 tanh(W_1 [mean ; x] + b_1) + b_2`` to what other layers remember, once, `ticks` ticks after a reset.
+    """Adds ``W_2 tanh(W_1 [mean ; x] + b_1) + b_2`` to the memory of other layers once, `ticks` samples after a reset.
 
-    The mean is over these ticks. It gives no value and comes after the layers that it corrects.
+    The mean is over these samples. The layer has no value and comes after the layers that it corrects.
 
     Attributes:
         corrects: layers and slots, in the order of the correction's numbers.

@@ -9,7 +9,7 @@ from edp.ir.arithmetic import EXACT
 from edp.ir.base import INPUT, Arithmetic, Graph, LayerRun, Memory, Number, Values
 
 RINGS = ("ring", "scores", "keys", "values")
-"""Slots whose first dimension is time."""
+"""Names of the memory slots whose first dimension is time."""
 
 
 class Interpreter:
@@ -65,14 +65,15 @@ class Interpreter:
 
 
 class Reference(Interpreter):
-    """A stream through a float graph, one tick at a time. Slow; used by tests and quantisation.
+    """Sample-by-sample simulation of a float graph. It is slow and used by tests and quantisation.
 
     Args:
         graph: the layers.
-        dtype: float64 shows what the graph means, float32 what single precision makes of it.
+        dtype: float64 for the exact result of the graph, float32 for its result in single precision.
     """
 
-    # Double precision by default: the reference judges single-precision forms, so its own rounding must not show.
+    # Double precision by default: single-precision forms are compared with the reference, so its rounding errors must
+    # be negligible.
     def __init__(self, graph: Graph, dtype: type[np.floating] = np.float64) -> None:
         super().__init__(graph, EXACT, dtype)
 

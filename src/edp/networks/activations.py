@@ -33,7 +33,8 @@ class ActivationSpec(Protocol):
 
 ACTIVATIONS: Registry[type] = Registry("activation")
 AMPLITUDE = above(0.0, 1000.0)
-"""Range in standard deviations of the target. Beyond a few tens tanh is linear over all values that occur."""
+"""Accepted range of learned amplitudes, in standard deviations of the target. With an amplitude above a few tens, tanh
+is linear over all values that occur."""
 
 
 @ACTIVATIONS.register("identity")

@@ -14,8 +14,8 @@ from edp.networks.stream import Inputs, Stream, StreamStatus, StreamTick
 class AdaptedStream(Stream):
     """Stream whose predictions are corrected online by recursive least squares; see `edp.ir.rls.RlsCorrector`.
 
-    Held and missed ticks teach nothing; their predictions are corrected all the same, as in the exported C. Bounds of
-    intervals move with the prediction.
+    The correction does not learn from held and missed samples, but their predictions are corrected, as in the exported
+    C code. Interval bounds are shifted with the prediction.
 
     Args:
         predictor: the network; it is put in evaluation mode.
@@ -24,7 +24,7 @@ class AdaptedStream(Stream):
 
     Attributes:
         adapter: learned correction; `adapter.learned` is saved across a restart, `adapter.restore` loads it.
-        learn: False freezes what was learned.
+        learn: whether the correction continues to learn; False keeps the learned correction constant.
         status: status of the adaptation in the last step.
         correction: added correction ``(horizon, target)``, SI units.
     """
@@ -36,7 +36,7 @@ class AdaptedStream(Stream):
     def reset(self) -> None:
         """Reset the state of the network; the learned correction remains. ``adapter.reset()`` resets the correction."""
         super().reset()
-        # The change across a reset is no motion of the machine; learning from it would spoil the correction.
+        # The change across a reset is not a motion of the machine, so the correction must not learn from it.
         self.adapter.interrupt()
         self.status = RlsStatus.NONE
         self.correction = np.zeros_like(self.adapter.adaptation.unit)
@@ -47,7 +47,7 @@ class AdaptedStream(Stream):
         return self._correct(super().step(inputs))
 
     def missed(self, ticks: int = 1) -> StreamTick:
-        """Tell that ticks went by without a step; the prediction is the corrected one."""
+        """Report missing samples without a step; the returned prediction is corrected."""
         result = super().missed(ticks)
         self.adapter.interrupt()
         return self._correct(result)

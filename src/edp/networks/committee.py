@@ -1,4 +1,4 @@
-"""A committee: several small networks, and regression trees, side by side on the same changes over time spans."""
+"""Ensemble of small networks and regression trees in parallel, on the same changes over several time spans."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NON_LINEAR: dict[str, tuple[Callable[[Tensor], Tensor], Operation, Function]] = 
     "tanh": (torch.tanh, Operation.TANH, Function.TANH),
     "relu": (torch.relu, Operation.RELU, Function.RELU),
 }
-"""Element-wise functions that members may have."""
+"""Element-wise activation functions of the hidden units, by name."""
 
 
 class Members(Streaming):
@@ -86,10 +86,10 @@ class Committee(Streaming):
     A linear head on it is a linear model plus a weighted mean of perceptrons, a kernel machine and sums of trees.
 
     Args:
-        bank: gives what the others read.
+        bank: lag bank that computes the inputs of all other parts.
         groups: groups of perceptrons.
-        radial: nearness to typical rows; None for none.
-        near: nearness in few columns, each one to typical rows.
+        radial: radial basis functions on all columns; None without them.
+        near: radial basis functions on few columns each.
         trees: number of trees for each prediction (horizon and target); None without trees.
     """
 

@@ -15,7 +15,8 @@ class Decomposition:
 
     Attributes:
         backbone: names of parameters by part of the backbone, from the input on; parts are the beginnings of names.
-        head: names of all others: gate, heads, output, activation, skip connection and what a physics base learns.
+        head: names of all other parameters: gate, heads, output, activation, skip connection and trained physics
+            parameters.
         last: parameters of `head` that belong to the last linear layer of the heads.
     """
 

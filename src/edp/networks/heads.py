@@ -96,11 +96,11 @@ class GluHead:
 class LinearHead:
     """``y_c = w_c h + b_c`` for each output c: no hidden layer.
 
-    A block that mixes the hidden features of outputs has nothing to mix, and is refused.
+    Blocks that mix hidden features are rejected, because this head has none.
 
     Attributes:
-        dead_band: small predictions become zero, of changes no change at all, within a width of each output that
-            training on folds chooses (`OutputBand`).
+        dead_band: whether small predictions are set to zero. Cross-validation selects the width per output
+            (`OutputBand`).
     """
 
     dead_band: bool = False

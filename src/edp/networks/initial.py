@@ -51,8 +51,8 @@ class ConstantState:
 class PrefixState:
     """A small network corrects the state once, from the first ticks after a reset.
 
-    It sees the mean of what the recurrent layers read over these ticks, and the last of them. Until then predictions
-    come from the plain state. It learns where a loss is taken soon after a reset: with a small ``burn_in``.
+    Its inputs are the mean and the last value of the recurrent layers' inputs over these samples. Until then
+    predictions use the uncorrected state. Its training requires a loss soon after a reset, that is a small ``burn_in``.
 
     Attributes:
         ticks: length of the prefix.

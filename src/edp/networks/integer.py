@@ -135,7 +135,8 @@ def _error_with(predictor: Predictor, series: Sequence[Series], frac: int) -> fl
     scale, unit = rounded.front.scale, 2.0**-frac
 
     def scaled(features: Tensor) -> Tensor:
-        # Rounding and clamping alone are applied: the judgement concerns the format of the inputs, not of the weights.
+        # Apply only rounding and clamping, because the comparison concerns the format of the inputs, not of the
+        # weights.
         return (scale(features) / unit).round().clamp(-LARGEST, LARGEST) * unit
 
     rounded.front.scale = scaled  # type: ignore[method-assign]

@@ -49,21 +49,21 @@ class LagBank(Streaming):
     ``(batch, time, width)`` to ``width (1 + lags + smoothed)`` columns; ``x_m`` is the mean of x over the last m ticks.
     The change of such means (the Haar wavelet) has one m-th of the variance that noise gives to the change itself.
 
-    The change over l ticks is l times the mean of the last l changes from tick to tick. In the first l ticks of a
-    stream it is l times the mean of those seen, the first of which is 0: the change that would be if the stream had
-    gone on like this before. The change of means over m is the mean of the last m changes over m. State: the input
-    before, whether there was one, and the changes that each mean needs.
+    The change over l ticks is l times the mean of the last l changes from tick to tick. In the first l samples of a
+    stream it is l times the mean of the available changes, the first of which is 0. This extrapolates the stream
+    backwards. The change of means over m is the mean of the last m changes over m. The state contains the previous
+    input, a flag for it, and the changes that each mean needs.
 
     Args:
-        width: inputs.
+        width: number of inputs.
         lags: spans in ticks, rising.
-        smoothed: spans among them that also give the change of a mean.
-        bounded: whether columns are held within `low` and `high`.
+        smoothed: those spans in `lags` for which the change of a mean is also computed.
+        bounded: whether columns are limited to `low` and `high`.
 
     Attributes:
         gain: factor of each change, ``(lag + smoothed, width)``; training sets it to the inverse standard deviation.
-        low: least value of each column, ``(columns,)``, of a bounded bank; until it is set it holds nothing back.
-        high: largest likewise.
+        low: smallest value of each column, ``(columns,)``, of a bounded bank; no limit until it is set.
+        high: largest value of each column, ``(columns,)``, of a bounded bank.
     """
 
     gain: Tensor
@@ -86,12 +86,12 @@ class LagBank(Streaming):
 
     @property
     def spans(self) -> tuple[int, ...]:
-        """Ticks of each change, in the order of the columns behind the present values."""
+        """Span of each change in samples, in the order of the columns after the present values."""
         return (*self.lags, *self.smoothed)
 
     @property
     def columns(self) -> int:
-        """Numbers that it gives at a tick."""
+        """Number of columns per sample."""
         return self.width * (1 + len(self.spans))
 
     @property
@@ -153,7 +153,7 @@ class LagBank(Streaming):
         spans = torch.tensor(self.spans, dtype=self.gain.dtype, device=self.gain.device)
         gain = torch.cat([one.to(self.gain), (spans[:, None] * self.gain).flatten()])
         columns = build.add(ScaleShift, "scaled_changes", joined, gain=gain, shift=torch.zeros_like(gain))
-        # Limits that nothing has set hold nothing back.
+        # Limits that are not set have no effect.
         if not self.bounded or bool((self.high == torch.finfo(torch.float32).max).all()):
             return columns
         return build.add(Clip, "within", columns, low=self.low, high=self.high)

@@ -43,8 +43,8 @@ def matrices_of(network: nn.Module, recurrent: bool = True) -> list[Matrix]:
     """Return the weights of the convolutions, recurrent layers, linear layers and heads of a network.
 
     Args:
-        network: its parts say which of their parameters they multiply with (`Streaming.matrices`).
-        recurrent: False leaves out those of recurrent layers.
+        network: network whose parts list the parameters of their multiplications (`Streaming.matrices`).
+        recurrent: whether to include the weights of recurrent layers.
     """
     stacks = [stack for stack in network.modules() if isinstance(stack, Stack)]
     recurring = {part for stack in stacks for layer in stack.layers for part in layer.modules()}

@@ -35,7 +35,7 @@ class OutputSpec(Protocol):
 
     @property
     def coverages(self) -> tuple[float, ...]:
-        """Shares of the targets that its intervals mean to hold, the widest first."""
+        """Intended fractions of the targets within the intervals, the widest interval first."""
         ...
 
     @property
@@ -50,7 +50,7 @@ class OutputSpec(Protocol):
 
 OUTPUTS: Registry[type] = Registry("output")
 MAX_PAIRS = 99
-"""Quantiles or intervals: all whole per cent."""
+"""Maximum number of quantiles or intervals: one per whole per cent."""
 
 
 class Output(nn.Module):
@@ -89,7 +89,7 @@ class Output(nn.Module):
         """Add lower and upper bounds, ``coverage * horizon * output`` standardised elements each; None for a point.
 
         Args:
-            build: takes the layers.
+            build: builder of the layer graph.
             center: the prediction, ``horizon * output``.
             y: output of the heads, ``horizon * value * output``.
         """
@@ -179,7 +179,8 @@ class Quantiles:
 
     Attributes:
         levels: increasing, between 0 and 1, symmetric about the median 0.5.
-        calibrated: segment the intervals after training so that they hold their share of the validation part.
+        calibrated: whether the intervals are scaled after training, so that they contain their fraction of the
+            validation data.
 
     Raises:
         ConfigError: levels that are not as said.
@@ -252,7 +253,8 @@ class _Law:
 
     Attributes:
         coverages: coverages of the calibrated and evaluated intervals, decreasing.
-        calibrated: segment the intervals after training so that they hold their share of the validation part.
+        calibrated: whether the intervals are scaled after training, so that they contain their fraction of the
+            validation data.
 
     Raises:
         ConfigError: coverages that are not decreasing between 1 and 0.

@@ -30,9 +30,9 @@ NETWORK_PARTS: Mapping[str, Registry[type]] = {
     "blocks": BLOCKS,
     "physics": PHYSICS,
 }
-"""Registries of the parts of a network, by the field of the specs that holds one."""
+"""Registries of the network parts, by the field of the specification that contains the part."""
 USUAL_KINDS = {"head": "mlp"}
-"""Heads of the usual kind need not say so."""
+"""Default kind of the heads. Files omit the kind of heads of this kind."""
 NETWORK = SettingsTree(NETWORK_PARTS, USUAL_KINDS)
 
 

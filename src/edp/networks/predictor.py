@@ -34,7 +34,7 @@ class ModelSpec:
         backbone: options of a registered backbone.
         head: options of registered per-output heads.
         activation: options of a registered output activation.
-        output: options of a registered output: what is said of each target in addition to a prediction.
+        output: options of a registered output: point, quantiles or an error distribution per target.
         blocks: options of registered blocks; absent means not built.
         window: W, samples of trailing context of pooling, and the length of the window regime.
         physics: options of a registered physics base; None for no base.
@@ -82,8 +82,8 @@ class Predictor(Streaming):
     """A look-ahead predictor (eq. 3.6) that reads and writes SI units.
 
     ``forward`` maps inputs ``(batch, time, input)`` to standardised predictions ``(batch, time, horizon, target)``;
-    ``predict`` gives them in SI units. Both obey the streaming contract. Where the output says more than a point,
-    ``intervals`` gives lower and upper bounds too.
+    ``predict`` gives them in SI units. Both obey the streaming contract. For outputs with an uncertainty, ``intervals``
+    returns lower and upper bounds.
 
     Attributes:
         number_format: number format of the computation; bundles contain float32 only.

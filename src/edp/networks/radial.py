@@ -34,7 +34,7 @@ def check_near(near: Sequence[int], lags: Sequence[int], centres: int) -> None:
 class RadialFeatures(Streaming):
     """``sigmoid(-|z - c|^2 / 2)`` for each centre c, ``(batch, time, width)`` to ``(batch, time, centres)``; no memory.
 
-    ``z`` is what it reads, times `gain`. The argument is a linear layer on ``[z ; -|z|^2 / 2]`` with the weights
+    ``z`` is the input times `gain`. The argument is a linear layer on ``[z ; -|z|^2 / 2]`` with the weights
     ``[c ; 1]`` and the bias ``-|c|^2 / 2``. Away from a centre the sigmoid falls like the Gaussian kernel
     ``exp(-|z - c|^2 / 2)``, and unlike it every target computes it in integers, too. Far from all centres a linear map
     of the features is its intercept alone.
@@ -101,7 +101,7 @@ class RadialFeatures(Streaming):
 
     def lower(self, build: Builder, x: str) -> str:
         x = build.pick("read", x, self.columns)
-        # Limits that nothing has set hold nothing back.
+        # Limits that are not set have no effect.
         if self.clipped and bool((self.high < torch.finfo(torch.float32).max).any()):
             x = build.add(Clip, "within", x, low=self.low, high=self.high)
         z = build.add(ScaleShift, "situation", x, gain=self.gain, shift=torch.zeros_like(self.gain))

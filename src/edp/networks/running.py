@@ -36,7 +36,7 @@ def stream_predictions(predictor: Predictor, series: Sequence[Series], batch: in
 def window_predictions(predictor: Predictor, series: Sequence[Series]) -> list[NDArray[np.float32]]:
     """Return predictions, each from a reset over the window that ends at its sample (thesis 3.1.4).
 
-    W times the work of a stream. The first ticks, which have no whole window, have what there is of it.
+    The cost is W times that of a stream. The first samples use the available part of their window.
     """
     return _windows(predictor, predictor.predict, series)
 
@@ -155,7 +155,7 @@ def stream_groups(series: Sequence[Series], batch: int = 16) -> list[list[int]]:
 @contextmanager
 def _evaluating(predictor: Predictor) -> Iterator[None]:
     was_training = predictor.training
-    # Dropout off: predictions must not depend on how often they are asked for.
+    # Switch dropout off, so that predictions do not depend on the number of calls.
     predictor.eval()
     try:
         yield
@@ -212,7 +212,7 @@ def _pieces(
     state = predictor.initial_state(len(group), like)
     for start in range(0, longest, PIECE):
         rows = np.arange(start, min(start + PIECE, longest))
-        # A shorter stream repeats its last tick; what is said of those ticks is for the caller to leave out.
+        # A shorter stream repeats its last sample; the caller omits the outputs of these samples.
         x = np.stack([part.inputs[np.minimum(rows, part.samples - 1)] for part in group])
         # Inside the loop: a mode that a generator enters would stay on between its values.
         with torch.inference_mode():
@@ -226,8 +226,8 @@ def answer_pieces(
     """Yield the network output of each series segment by segment, so that long outputs need not fit into memory.
 
     Returns:
-        number of the series, first tick of the piece, what is said of it and the features that it was said from
-        ``(1, tick, feature)``. Pieces of a series come in order, series of like length side by side.
+        index of the series, first sample of the segment, network output, and the features of the output ``(1, tick,
+        feature)``. Segments of a series are in order; series of similar length run in parallel.
     """
     order = sorted(range(len(series)), key=lambda i: series[i].samples)
 

@@ -27,13 +27,14 @@ class StreamStatus(IntEnum):
     """Result code of a stream step, with the values of `edp_status` in the exported C."""
 
     OK = 0
-    """A prediction from this tick's inputs."""
+    """Status of a prediction from the inputs of the current sample."""
     WARMING = 1
-    """Status after fewer samples than a whole window since the last reset: less accurate."""
+    """Status after a reset, before a whole window of samples was read. The predictions are less accurate."""
     HELD = 2
-    """Inputs were rejected or missed: a prediction from the last accepted ones."""
+    """Status of a prediction from the last accepted inputs, because the current inputs were rejected or missed."""
     RESTARTED = 3
-    """Nothing left to hold, or a result that is not finite: the memory was cleared, and there is no new prediction."""
+    """Status without a new prediction: the memory was cleared, because the last inputs are too old or a result was not
+    finite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +178,7 @@ class Stream:
         if ticks < 1:
             raise DataError(f"{ticks} missed ticks were reported; give at least 1")
         if ticks > HOLD_TICKS:
-            # More than can be held: what came before is given up at once.
+            # The gap exceeds the holding time, so the memory is cleared at once.
             self._holding = HOLD_TICKS
             self.ticks += ticks - 1
             return self._tick(self._hold())
@@ -238,7 +239,7 @@ class Stream:
 
     def _hold(self) -> StreamStatus:
         """Process a sample without new inputs."""
-        # A stream without a tick since its reset has nothing to hold.
+        # A stream without a sample since its reset has no inputs to hold.
         if self._age > 0 and self._holding < HOLD_TICKS:
             self._holding += 1
             self.held += 1
@@ -250,7 +251,7 @@ class Stream:
         return StreamStatus.RESTARTED
 
     def _tick(self, status: StreamStatus) -> StreamTick:
-        # A copy: the caller may keep results while the stream goes on.
+        # Return a copy, because the caller may keep results while the stream continues.
         count = len(self._coverages)
         center, lower, upper = np.split(self._numbers.copy(), [1, 1 + count])
         return StreamTick(center[0], lower, upper, self._coverages, status)

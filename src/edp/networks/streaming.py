@@ -15,7 +15,8 @@ from edp.errors import ExportError
 from edp.ir.builder import Builder
 
 State = Any
-"""A tree (tuple, dict) of tensors whose first dimension is the batch; ``()`` for a module without memory."""
+"""State of a module: tree (tuple, dict) of tensors whose first dimension is the batch; ``()`` for a module without
+memory."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ class Operation(StrEnum):
 
 
 class Streaming(nn.Module, ABC):
-    """A causal map from ticks to features with explicit state.
+    """Causal map from samples to features with explicit state.
 
     For any split of a sequence into chunks, running the chunks in order and handing the state on gives the same
     output as one call (chunk invariance); output t never depends on inputs after t (causality).
@@ -108,7 +109,7 @@ class Streaming(nn.Module, ABC):
         """Add the layers that compute this part tick by tick to a graph, as in evaluation.
 
         Args:
-            build: takes the layers.
+            build: builder of the layer graph.
             x: name of the value that the part reads.
 
         Returns:

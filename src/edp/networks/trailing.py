@@ -45,8 +45,8 @@ class StreamingTrailingMean(Streaming):
 def _sums(history: Tensor, window: int) -> Tensor:
     """Return the sums over every `window` neighbouring rows of ``(batch, time, width)``.
 
-    Sums of 1, 2, 4, ... rows are made by doubling, and those that `window` consists of are added up: every sum takes
-    the same additions wherever a stream is cut into chunks, and nothing is ever subtracted.
+    Sums of 1, 2, 4, ... rows are computed by doubling, and the sums that compose `window` are added. Every sum uses the
+    same additions for any division of a stream into chunks, without subtractions.
     """
     ticks = history.shape[1] - window + 1
     runs, size, start = history, 1, 0

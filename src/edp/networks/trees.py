@@ -14,23 +14,23 @@ from edp.ir.builder import indices
 from edp.networks.streaming import Cost, State, Streaming
 
 MAX_TREES = 2000
-"""Maximum number of trees per predicted value. Boosting at a rate of 0.05 ends far below."""
+"""Maximum number of trees per predicted value. Boosting with a learning rate of 0.05 stops far below this number."""
 MAX_DEPTH = 8
-"""256 leaves a tree: 768 numbers, 2.5 KB of flash."""
+"""Maximum depth of a tree. A tree of this depth has 256 leaves and 768 parameters, 2.5 KB of flash."""
 BLOCK = 2**20
-"""Nodes of all rows that are looked at together: 16 MB of single precision."""
+"""Maximum number of tree nodes evaluated at a time, over all rows: 16 MB in single precision."""
 
 
 class Trees(Streaming):
     """Sums of complete regression trees, ``(batch, time, width)`` to ``(batch, time, outputs)``; no memory.
 
-    What they compute is written at `edp.ir.layers.TreeSums`. Their tables are no parameters: no gradient reaches them,
-    and none passes through them, since a sum of trees is constant between thresholds. In double precision a number
-    next to a threshold may go to the other side than in single precision, which exported code computes in.
+    The equations are in `edp.ir.layers.TreeSums`. The tables are not trainable parameters, and no gradient passes
+    through them, since a sum of trees is constant between thresholds. Near a threshold, double precision can select
+    another branch than single precision, which exported code uses.
 
     Args:
-        width: columns that they read.
-        outputs: sums.
+        width: number of input columns.
+        outputs: number of sums.
         trees: number of trees per sum.
         depth: comparisons from the root to a leaf.
 
@@ -57,8 +57,9 @@ class Trees(Streaming):
         """Take over fitted tables; see `edp.training.tree_tables`.
 
         Args:
-            feature: integers from 0 to ``width - 1``, ``(output, tree, 2^depth - 1)``.
-            threshold: finite in single precision, likewise; `edp.ir.layers.NEVER` where a node does not split.
+            feature: column indices from 0 to ``width - 1``, ``(output, tree, 2^depth - 1)``.
+            threshold: finite thresholds in single precision, same shape; `edp.ir.layers.NEVER` if a node does not
+                split.
             leaf: finite in single precision, ``(output, tree, 2^depth)``.
 
         Raises:

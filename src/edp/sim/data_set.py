@@ -43,7 +43,7 @@ MANIFEST = "data_set.json"
 LOCK = ".lock"
 ONE_PER_CORE = Workers(count=0)
 BYTES_PER_VALUE = {".parquet": 3.0, ".csv": 10.0, ".mat": 3.0}
-"""Room a logged value takes, rounded up; measured on M22: 1.7, 8.0 and 2.1."""
+"""Upper estimate of the bytes per logged value, by format. Measured on M22: 1.7, 8.0 and 2.1 bytes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,8 +53,8 @@ class SimulationOrder(DataSetSpec):
     Attributes:
         suffix: ending of the logs, which settles their format.
         layout: layout of MAT files, a name in `edp.logs.LAYOUTS`; empty for the plain one.
-        truth: where the channels go that only a simulation knows, see `edp.logs.WriteOptions`; empty for ``apart``
-            in a layout that was asked for, else ``with`` the others.
+        truth: place of the channels that only a simulation provides, see `edp.logs.WriteOptions`. Empty means ``apart``
+            for a requested layout, else ``with``.
     """
 
     suffix: str = ".parquet"
@@ -68,12 +68,12 @@ class SimulationOrder(DataSetSpec):
         overrides: Sequence[str] = (),
         **changes: object,
     ) -> SimulationOrder:
-        """Create the order of a scenario file, or the default one; overrides and `changes` replace its values.
+        """Return the data set of a scenario file, or the default one, with overrides and `changes` applied.
 
-        Overrides are ``key.path=value`` in the keys of the file; `changes` that are not None go before them.
+        Overrides have the form ``key.path=value`` with keys of the file. `changes` that are not None take precedence.
 
-        What a change makes void in the file goes with it, and `note` is called with a sentence that says so: a layout
-        of MAT files once another format is asked for, a family once a machine is.
+        Settings of the file that a change makes invalid are removed, and `note` is called with a message: the layout of
+        MAT files if another format is requested, a family if a machine is requested.
 
         Raises:
             ConfigError: a key or value that cannot be; file, key, value and bound are named.
@@ -138,11 +138,11 @@ def simulate_data_set(
 ) -> list[Path]:
     """Simulate a data set into a folder, one log per recording. Existing logs of the same order are reused.
 
-    Logs do not depend on who writes them: each scenario carries its own seed.
+    Logs do not depend on the worker, because each scenario has its own seed.
 
     Args:
-        out: folder; it may hold nothing but an earlier part of the same data set.
-        order: what to simulate; an hour of machine M22 by default.
+        out: folder; it must be empty or contain an earlier part of the same data set.
+        order: data set to simulate; by default one hour of machine M22.
         workers: who simulates; nodes see the folder under the same path.
         on_done: called with the scenario of each log and whether the log was there already.
 
@@ -161,7 +161,7 @@ def simulate_data_set(
     with _alone(folder) as check:
         bound = _bound(folder, identity)
         missing = [scenario for scenario, path in zip(plan, paths, strict=True) if not is_there(path)]
-        # Before the manifest: a refused order leaves the folder unbound.
+        # Check before the manifest is written, so that a rejected data set does not bind the folder.
         check_room(folder, missing, suffix)
         if not bound:
             write_json(folder / MANIFEST, identity)
@@ -244,11 +244,11 @@ def find_data_set_limit(
 ) -> LimitFile:
     """Estimate the predictability limit of a simulated data set, and write it to ``limit.json`` next to its logs.
 
-    A limit that is there already from the same order and settings is kept.
+    An existing limit of the same data set and settings is reused.
 
     Args:
         folder: the folder of the data set.
-        order: what was simulated into it.
+        order: data set that was simulated.
         spec: moments, branches and horizons.
         workers: who simulates; recordings that are done are not done again after a stop.
         progress: receiver of the progress; its units are recordings.
@@ -277,7 +277,7 @@ def find_data_set_limit(
 def identity_of(plan: Sequence[Scenario], files: WriteOptions, suffix: str = ".parquet") -> dict[str, object]:
     """Return the identity of a simulated data set in JSON types."""
     identity: dict[str, object] = {"schema": 1, "edp": __version__, "plan": [scenario_to_dict(entry) for entry in plan]}
-    # Only what departs from the usual: folders without these options keep their identity.
+    # Include only values that differ from the defaults, so that existing folders keep their identity.
     if files != WriteOptions():
         identity["files"] = asdict(files)
     if suffix != ".parquet":

@@ -38,12 +38,12 @@ class LimitFile(ResultFile):
         horizons: horizons in samples.
         targets: names of the predicted channels.
         confidence: level of the intervals.
-        moments: number of moments of each recording.
-        branches: number of futures of each moment.
+        moments: number of branching times per recording.
+        branches: number of simulated futures per branching time.
         recordings: number of recordings.
         seed: root of the random futures.
-        commands_unknown: errors of a predictor that knows the state and not the commands to come.
-        commands_known: errors of a predictor that knows both.
+        commands_unknown: errors of a predictor that knows the state but not the future commands.
+        commands_known: errors of a predictor that knows the state and the future commands.
         persistence: errors of the present value as prediction.
         key: hash of the data set and of the settings; None without a data set on disk.
 

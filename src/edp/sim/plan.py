@@ -35,10 +35,11 @@ DEFAULT_MIX: Mapping[str, float] = {
     "end_stops": 0.09,
     "reversals": 0.06,
 }
-"""Share of the recordings by excitation."""
+"""Default fraction of the recordings per excitation."""
 
 MAX_RECORDINGS, MAX_MINUTES, MAX_MACHINES, MAX_SEED = 100_000, 1e6, 1000, 2**63
-"""Bounds of one data set; the plan of the most recordings takes some seconds."""
+"""Maximum number of recordings, minutes and machines, and maximum seed of a data set. A plan of this size takes some
+seconds."""
 BOUNDS = {
     "recordings": integer(1, MAX_RECORDINGS),
     "minutes": span(MIN_MINUTES, MAX_MINUTES),
@@ -49,7 +50,7 @@ BOUNDS = {
     "step_s": above(0.0, LARGEST_STEP_S),
 }
 AIR = "air"
-"""Free air in a mix of materials."""
+"""Name of free air in a mix of materials."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,17 +61,17 @@ class DataSetSpec:
         machine: name of a machine, or path of a machine file.
         minutes: length of all recordings together.
         recordings: number of recordings of equal length.
-        seed: root of every random choice.
-        family: number of random machines that replace `machine`; 0 for none.
+        seed: random seed.
+        family: number of random machines that replace `machine`; 0 uses `machine`.
         masses: lightest and heaviest machine of the family, t.
         scatter: scatter of the machines of the family about the laws of scaling: a factor, at most 2.5.
-        mix: share of the recordings by excitation.
-        materials: share of the recordings of families that work the ground (grading, dig) by soil; ``air`` is none.
-            The other families always move in free air.
+        mix: fraction of the recordings per excitation.
+        materials: fraction of the recordings per soil, for excitations that work the ground (grading, dig); ``air`` is
+            free air. All other excitations move in free air.
         rate_hz: samples per second.
-        step_s: integration step.
-        start_strokes: range of the strokes to start from, as shares of full.
-        sensor_noise: False logs the truth.
+        step_s: integration step, s.
+        start_strokes: range of the initial strokes, as fractions of the full stroke.
+        sensor_noise: whether logs have sensor errors; False logs the true values.
         sensors: values that replace those of the machine's ``[sensors]``.
         faults: faults of machine and sensors in every recording; see `edp.sim.faults`.
 
@@ -101,7 +102,7 @@ class DataSetSpec:
             raise ConfigError(f"masses = {list(self.masses)} are those of a family; say how many machines with family")
         if not self.family and self.scatter != 1.0:
             raise ConfigError(f"scatter = {self.scatter} is that of a family; say how many machines with family")
-        # A machine is found again by its name: a rounded one would be another machine.
+        # The name identifies the machine, so rounding the name would select another machine.
         if self.scatter != round(self.scatter, 3):
             raise ConfigError(f"scatter = {self.scatter} has more than three decimals; names of machines hold three")
         member_mass(self.seed, 0, *self.masses)
@@ -220,7 +221,7 @@ def _rename_recording(name: str, machine: str) -> str:
 def hand_out(shares: Mapping[str, float], count: int) -> list[str]:
     """Return `count` names in the given proportions, mixed so that any leading part has these proportions, too.
 
-    Each has its turn once, the largest share first, and then the one that is farthest behind, by Webster's method.
+    Each name occurs once, in descending proportion; then Webster's method selects the name with the largest deficit.
     """
     counts = {name: 0 for name, share in sorted(shares.items(), key=lambda entry: (-entry[1], entry[0])) if share > 0}
     names = []

@@ -1,11 +1,11 @@
-"""The limit of predictability: how far off any predictor must be, found by branching moments of recordings.
+"""Predictability limit: lowest possible prediction error, estimated by branching simulations.
 
-At a moment the whole simulation is kept. From there it runs on many times, each time with fresh randomness of the
-operator (what is done now goes on, how long it lasts and what follows is drawn again), of the soil still to be met and
-of the sensors. Knowing the true state at that moment, and all the laws, the best guess of a later measured velocity is
-its median over these futures, which has the least mean absolute error of all guesses; that error is the limit. With
-the commands of the future given, only soil and sensors differ between the branches: the limit of a predictor that is
-given the commands.
+At each branching time the simulation is stored. It then continues many times with new random values for the operator
+(the current action continues with a new duration and new following actions), for soil not yet reached and for the
+sensors. For a known state and known equations, the best prediction of a later measured velocity is its median over
+these futures, because the median has the lowest mean absolute error; this error is the limit. With known future
+commands only soil and sensors differ between the branches, which gives the limit of a predictor that knows the
+commands.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ from edp.storage.reading import Table
 Array = NDArray[np.float64]
 TARGETS = tuple(TABLE_A1)[:3]
 PAST = 40
-"""Samples of the past that sensors see before a branch: longer than any latency of the bus."""
+"""Number of samples before a branch that the sensors process. It exceeds every bus latency."""
 RESAMPLES = 2000
-"""Draws of the bootstrap of recordings."""
+"""Number of bootstrap samples of the recordings."""
 CONFIDENCE = 0.95
 MAX_BRANCHES, MAX_MOMENTS = 4096, 100_000
-"""Bounds; the usual 32 branches of 240 moments take minutes."""
+"""Maximum number of branches and of branching times. The usual 32 branches at 240 times take minutes."""
 MOST_AHEAD = 2000
-"""Samples, 20 s at 100 Hz."""
+"""Maximum horizon in samples, 20 s at 100 Hz."""
 KINDS = ("commands_unknown", "commands_known", "persistence")
 
 
@@ -148,7 +148,7 @@ def _futures(
     futures = np.empty((spec.branches, len(at_times), len(TARGETS)))
     for b, branch in enumerate(seed.spawn(spec.branches)):
         branch_seed, noise = branch.spawn(2)
-        # With commands known and no soil there is but one future; sensors alone differ.
+        # With known commands and without soil there is one future; only the sensors differ.
         if not commands_known or simulation.plant.ground is not None:
             simulation.restore(snapshot)
             if commands_known:

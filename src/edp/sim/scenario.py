@@ -17,9 +17,10 @@ from edp.sim.physics.motor_circuit import motors_of
 from edp.sim.physics.plant import steps_per_sample
 
 START_STROKES = (0.3, 0.7)
-"""Away from both ends, where the first move would meet a cushion."""
+"""Range of the initial strokes (fractions of the full stroke), away from both ends, where the first move would meet a
+cushion."""
 LARGEST_STEP_S = 2.5e-3
-"""From 2 to 1 ms the order is 1.8 in hard reversals already (docs, known gaps)."""
+"""Maximum integration step, s. At 1 to 2 ms the order of convergence is 1.8 in hard reversals (docs, known gaps)."""
 
 
 class SimulationError(EdpError):
@@ -33,12 +34,12 @@ class Scenario:
     Attributes:
         machine: name of a machine, or path of a machine file (`.toml`).
         excitation: name in `EXCITATIONS`.
-        duration_s: length of the recording.
+        duration_s: length of the recording, s.
         rate_hz: samples per second, also the rate of commands.
-        step_s: integration step; cut in four near the ends of the stroke.
-        sensor_noise: False logs the truth.
+        step_s: integration step, s; it is divided by four near the ends of the stroke.
+        sensor_noise: whether logs have sensor errors; False logs the true values.
         material: soil that the bucket works in, see `edp.sim.physics.material.material_names`; empty for free air.
-        start_strokes: range of the strokes to start from, as shares of full.
+        start_strokes: range of the initial strokes, as fractions of the full stroke.
         sensors: values that replace those of the machine's ``[sensors]``, by key: to switch faults on or off.
         seed: random seed. Equal seeds give equal bits on the same machine.
         faults: faults of machine and sensors, each as a text or as a table; see `edp.sim.faults`.
@@ -116,6 +117,6 @@ def scenario_to_dict(scenario: Scenario) -> dict[str, object]:
     """Convert a scenario to JSON types; `Scenario(**plain(s)) == s`."""
     values = {entry.name: getattr(scenario, entry.name) for entry in fields(scenario)}
     values |= {"start_strokes": list(scenario.start_strokes), "sensors": dict(scenario.sensors)}
-    # Only where there are some: data sets and recordings without faults stay what they were.
+    # Add faults only if there are any, so that data sets without faults keep their identity.
     del values["faults"]
     return values | ({"faults": [fault.to_dict() for fault in scenario.faults]} if scenario.faults else {})

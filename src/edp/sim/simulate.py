@@ -84,7 +84,7 @@ class Simulation:
         """
         rows = self._advance(targets)
         self.samples += len(rows)
-        # Asked once a block: what once is not finite stays so.
+        # Check once per block, because a non-finite state persists.
         if not self.plant.finite:
             scenario = self.scenario
             raise SimulationError(
@@ -117,7 +117,7 @@ class Simulation:
         return Snapshot(scenario_to_dict(self.scenario), self.samples, state, tuple(arrays), tuple(self._logs))
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Go to a moment of the same scenario, exactly: what follows gives the same bits as it gave then.
+        """Restore a snapshot of the same scenario; the following samples have identical bits.
 
         Raises:
             SimulationError: the snapshot belongs to another scenario.
@@ -167,7 +167,7 @@ def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None
 
     Args:
         scenario: scenario to simulate.
-        progress: called with the share done, 0 to 1, now and then.
+        progress: callback with the completed fraction, 0 to 1.
 
     Returns:
         The 24 channels of Table A.1 as sensors show them, then `EXTRA_CHANNELS` without noise; float32, SI units.

@@ -13,7 +13,8 @@ from edp.sim.scenario import Scenario
 
 Array = NDArray[np.float64]
 START_CLEARANCE_M, START_TRIES = 0.3, 100
-"""Least height of the tip above ground at the start, and how often strokes are drawn for it."""
+"""Minimum height of the tip above ground at the start (m), and maximum number of random strokes that are tried to reach
+it."""
 
 
 def seeds_of(scenario: Scenario) -> list[np.random.SeedSequence]:

@@ -23,7 +23,7 @@ GAINS = 6
 TIME, BEHIND, SUM, LEVER = 0, 1, 2, 5
 MEMORY = 8
 MAX_SUM = 0.1
-"""Most speed (m/s) that the integral may add: a blocked leg must not wind it up."""
+"""Maximum speed (m/s) from the integral part, which prevents wind-up while a leg is blocked."""
 
 
 @compiled
@@ -74,8 +74,8 @@ def control(
 ) -> None:
     """Write the levers of one control step to `targets`, shape (samples, 3), linearly from the last levers.
 
-    `queue` holds reference strokes (shares), the oldest belonging to now; `setup` is the curves of `inverse_lever`
-    for each axis, `axes`, `plant`, `pose.joint_limits` and scratch of `pose.REACHED_VALUES`.
+    `queue` contains reference strokes (fractions), the oldest for the current sample. `setup` contains the curves of
+    `inverse_lever` per axis, `axes`, `plant`, `pose.joint_limits` and a buffer of `pose.REACHED_VALUES`.
     """
     speeds, levers, axes, reached = setup[0], setup[1], setup[2], setup[5]
     # Full speed up to half of the error at which the reference stands still.

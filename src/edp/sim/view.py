@@ -18,7 +18,7 @@ class View(NamedTuple):
     """The plant at one instant; frame and attitude as in `edp.sim.physics.pose`.
 
     Attributes:
-        strokes: shares of each cylinder's stroke, shape (3,).
+        strokes: strokes as fractions of each cylinder's full stroke, shape (3,).
         angles: relative joint angles, rad, shape (3,).
         rates: their rates, rad/s, shape (3,).
         speeds: cylinder velocities, m/s, shape (3,).

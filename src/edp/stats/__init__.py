@@ -1,7 +1,7 @@
 """Statistics of model search as plain functions: tests of paired runs, power, races, screening designs.
 
 Scores are better when lower, differences are module minus baseline, tests are one-sided for a mean below zero.
-Nothing here trains, stores or draws without a seed.
+The functions do not train models or write files, and random values always come from a seed.
 """
 
 from edp.stats.clustered import MeanTest, clustered_t

@@ -71,10 +71,9 @@ def check_tested_cells(differences: ArrayLike, tested: ArrayLike | None) -> tupl
 def lower_p(mean: Array, error: Array, df: float) -> tuple[Array, Array]:
     """Return the statistic and one-sided p-value for a mean below zero.
 
-    Equal differences have no error and speak for themselves.
+    Equal differences have a standard error of zero.
 
-    Where the error is zero the p-value is 0 for a negative mean and 1 otherwise: a module that changes nothing,
-    to the last bit, is no improvement.
+    The p-value is then 0 for a negative mean and 1 otherwise, so a module without any effect is not an improvement.
     """
     mean, error = np.asarray(mean, dtype=np.float64), np.asarray(error, dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -45,9 +45,9 @@ class MeanTest:
 def clustered_t(differences: ArrayLike, tested: ArrayLike | None = None) -> MeanTest:
     """Return two-way clustered t-test over sessions and training runs.
 
-    Cells of one session share its difficulty for the module, cells of one run share its weights; a cell is in one
-    of each, so both variances add and what they count twice comes off. With e the differences less their mean, N
-    cells, R sessions and G runs::
+    Cells of one session share its difficulty, and cells of one run share its weights. Each cell belongs to one session
+    and one run, so the variances of both add, minus the part that is counted twice. With e the differences less their
+    mean, N cells, R sessions and G runs::
 
         V_S = R / (R - 1) * sum_r (sum_f e)^2 / N^2
         V_F = G / (G - 1) * sum_f (sum_r e)^2 / N^2
@@ -57,7 +57,7 @@ def clustered_t(differences: ArrayLike, tested: ArrayLike | None = None) -> Mean
 
     Args:
         differences: ``(..., run, session)``, module minus baseline; values outside `tested` are not read.
-        tested: ``(run, session)``, the cells that exist; None: all.
+        tested: mask of the existing cells ``(run, session)``; None uses all cells.
 
     Raises:
         DataError: fewer than two runs or sessions, or cells that are not finite.
@@ -74,10 +74,10 @@ def clustered_t(differences: ArrayLike, tested: ArrayLike | None = None) -> Mean
     by_cell = np.square(rest).sum(axis=(-2, -1)) / cells**2
     # With few clusters the sum less the cells can be below either part, or negative.
     variance = np.maximum(by_session + by_run - by_cell, np.maximum(by_session, by_run))
-    # Equal differences leave rounding in the sums; what is below it is no variance.
+    # Equal differences leave rounding errors in the sums, which do not count as variance.
     dust = (1e-14 * np.abs(array).max(axis=(-2, -1))) ** 2
     error = np.sqrt(np.where(variance > dust, variance, 0.0))
-    # The scarcer of both clusters limits what is known of the variance.
+    # The smaller number of clusters determines the degrees of freedom.
     df = float(min(runs, sessions) - 1)
     statistic, p = lower_p(mean, error, df)
     return MeanTest(np.asarray(mean), error, statistic, df, p)

@@ -26,7 +26,7 @@ class Rule:
 
     Attributes:
         alpha: level of the adjusted p-value.
-        least_gain: improvement of the mean score over the baseline's that is worth having, as a share.
+        least_gain: minimum improvement of the mean score over the baseline's that is relevant, as a fraction.
         interim_analyses: interim analyses of the race; empty to run every module to the end.
         level: confidence level of the intervals.
     """
@@ -50,10 +50,10 @@ class ModuleEvidence:
 
     Attributes:
         module: name.
-        confirmed: whether it passed all gates.
-        reason: why, or why not, as a sentence.
+        confirmed: whether the module passed all criteria.
+        reason: reason of the decision as a sentence.
         runs: number of runs of the module; 0 if the module did not reach the confirmation.
-        dropped_after: runs after which the race dropped it; 0 where it did not.
+        dropped_after: number of runs after which the race dropped the module; 0 if it was not dropped.
         change: mean difference over the baseline's mean score.
         low, high: interval of `change`.
         p, adjusted: p-value of the clustered test, plain and adjusted over all registered modules.
@@ -61,7 +61,7 @@ class ModuleEvidence:
         paired_p: p-value of the plain t-test on run means.
         mixed_p: p-value of the thesis's mixed model on run means.
         d_z: effect size of the run means; None with fewer than two runs.
-        stability: share of the runs in which the module won.
+        stability: fraction of the runs in which the module improved the score.
     """
 
     module: str
@@ -92,15 +92,14 @@ def confirm(
     """Decide on every registered module from scores on one primary metric.
 
     Args:
-        scores: ``(1 + module, run, session)``, the baseline first, lower is better. A planned cell that failed is
-            NaN or infinite and counts as the worst. Runs that a module did not make because the race had dropped
-            it may hold anything: they are not read.
+        scores: ``(1 + module, run, session)``, the baseline first, lower is better. A failed planned cell is NaN or
+            infinite and counts as the worst score. Runs after the race dropped a module are not read.
         modules: names of the arms after the baseline.
-        registered: every module of the study, in the order of the answer; those not in `modules` were dropped
-            before and enter the adjustment with p = 1.
-        tested: ``(run, session)``; None: every run is evaluated on every session.
+        registered: every module of the study, in the order of the results; modules not in `modules` were dropped
+            earlier and enter the adjustment with p = 1.
+        tested: mask of the evaluated cells ``(run, session)``; None means that every run is evaluated on every session.
         rule: acceptance criteria; None for the defaults.
-        worst: ``(session,)``, the least that a failed cell costs; see `fill_worst`.
+        worst: minimum loss of a failed cell ``(session,)``; see `fill_worst`.
 
     Raises:
         DataError: names and scores do not fit, a baseline score that is not above zero, or see `fill_worst`.
@@ -116,7 +115,7 @@ def confirm(
     filled = fill_worst(array, mask, worst)
     differences = filled[1:] - filled[0]
     raced = race(differences, mask, rule.interim_analyses)
-    # Over all registered modules: those dropped before were tried on the same sessions.
+    # Adjust over all registered modules, because modules dropped earlier were tried on the same sessions.
     adjusted = adjust_registered({name: float(p) for name, p in zip(modules, raced.p)}, registered)
     evidence = {}
     for index, name in enumerate(modules):
@@ -152,10 +151,10 @@ def _evidence(name: str, cells: _Cells, dropped: int, adjusted: float, rule: Rul
     means = run_means(difference, mask)
     runs = len(means)
     judged = mask.sum() / runs
-    # Sessions judged over sessions trained on; 0 where every session is judged, which leaves the plain t-test.
+    # Ratio of test sessions to training sessions; 0 if every session is tested, which gives the plain t-test.
     ratio = float(judged / (mask.shape[1] - judged)) if mask.shape[1] > judged else 0.0
     mixed = mixed_model(run_means(module, mask)[:, None], run_means(baseline, mask)[:, None])
-    # Significance and relevance are both asked for: many runs make any difference significant.
+    # Require both significance and relevance, because many runs make any difference significant.
     confirmed = not dropped and adjusted < rule.alpha and change <= -rule.least_gain
     resampled = float(resampled_t(means, ratio).p)
     reason = _reason((change, low, high), adjusted, dropped, float(test.p), rule)

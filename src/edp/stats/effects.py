@@ -39,7 +39,7 @@ def cohens_dz(differences: ArrayLike) -> Array:
         raise DataError("one split has no spread; d_z needs at least two")
     mean, spread = array.mean(axis=-1), array.std(axis=-1, ddof=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # Equal differences leave a spread of rounding, which would pass for a huge effect.
+        # Equal differences leave rounding errors as spread, which would look like a huge effect.
         ratio = np.where(mean == 0.0, 0.0, mean / np.where(spread > 1e-14 * np.abs(mean), spread, 0.0))
     return np.asarray(ratio)
 
@@ -55,7 +55,9 @@ def effect_size(differences: ArrayLike, level: float = 0.95) -> EffectSize:
 
 
 def effect_interval(d_z: float, splits: int, level: float = 0.95) -> EffectSize:
-    """Return interval of a d_z that was measured on `splits` splits: the noncentralities that would just yield its t.
+    """Return the confidence interval of a d_z from `splits` splits.
+
+    Its ends are the noncentrality parameters at which the observed t is just significant.
 
     Raises:
         DataError: fewer than two splits.
@@ -79,7 +81,7 @@ def _noncentrality(statistic: float, df: int, probability: float) -> float:
 def rank_stability(differences: ArrayLike) -> Array:
     """Return the fraction of paired observations in which the module is better, over the last axis; ties do not count.
 
-    The thesis's third gate asks for three quarters of the N = J S pairs of runs.
+    The thesis's third criterion requires three quarters of the N = J S pairs of runs.
 
     Raises:
         DataError: empty or values that are not finite.
@@ -101,7 +103,7 @@ class Concordance:
 
 
 def kendalls_w(scores: ArrayLike) -> Concordance:
-    """Test whether splits rank modules alike; equal scores have their mean rank.
+    """Test whether splits rank modules equally; equal scores have their mean rank.
 
     Args:
         scores: ``(split, module)``.

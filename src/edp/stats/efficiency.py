@@ -10,8 +10,8 @@ from itertools import pairwise
 from edp.errors import DataError
 
 GAIN_PER_DOUBLING = 0.04
-"""Relative gain that a doubling of the parameters must bring. The thesis turned down 13 % for 15 times the
-parameters (4.2.2), 3.3 % a doubling; this is the next rounder figure above it."""
+"""Minimum relative gain per doubling of the parameters. The thesis rejected a gain of 13 % for 15 times the parameters
+(4.2.2), which is 3.3 % per doubling; this value is the next round number above it."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class SizeScore:
         name: name for the report, such as ``128 units``.
         parameters: number of parameters, or another cost (multiply-accumulates per sample, bytes).
         score: lower is better, above zero.
-        error: standard error of the score; 0 where it is not known.
+        error: standard error of the score; 0 if unknown.
     """
 
     name: str
@@ -34,9 +34,9 @@ class SizeScore:
 def most_efficient(candidates: Sequence[SizeScore], gain: float = GAIN_PER_DOUBLING) -> SizeScore:
     """Return the smallest candidate for which no larger one is worth its size.
 
-    Candidate c' repays its size over c where ``(S(c) - S(c')) / S(c) > gain * log2(P(c') / P(c))`` and the difference
-    exceeds its standard error ``sqrt(e(c)^2 + e(c')^2)``. Candidates are tried in ascending order of size, against
-    all larger ones, so one that is poor by chance does not hide a better one behind it.
+    Candidate c' is worth its additional size over c if ``(S(c) - S(c')) / S(c) > gain * log2(P(c') / P(c))`` and the
+    difference exceeds its standard error ``sqrt(e(c)^2 + e(c')^2)``. Candidates are tried in ascending order of size,
+    against all larger ones, so a candidate that is poor by chance does not hide a larger, better one.
 
     Raises:
         DataError: no candidate, two of one size, or a size or score that is not finite and above zero.

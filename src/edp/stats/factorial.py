@@ -12,11 +12,12 @@ from edp.errors import ConfigError, closest
 from edp.stats.checks import Array, Mask
 
 MAX_RUNS = 256
-"""Trainings of one screening; the search for columns grows with the third power of the factors."""
+"""Maximum number of training runs of a screening. The search for columns grows with the third power of the number of
+factors."""
 INTERACTION = 0.03
 """Assumed fraction of a run's variance per interaction, to weigh errors against aliases."""
 PASSES = 12
-"""Rounds of exchanges; a design of 14 factors in 32 runs settles in fewer."""
+"""Maximum number of rounds of coordinate exchange. A design of 14 factors in 32 runs converges in fewer rounds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +28,8 @@ class Factorial:
         factors: names.
         levels: ``(run, factor)``, True where on.
         exclusive: groups of factors of which at most one is on.
-        alias: the largest share of a two-factor interaction that gets into a main effect; 0 in resolution IV.
-            Main effects are averages over the other factors at the rates with which the design has them on.
+        alias: largest fraction of a two-factor interaction that adds to a main effect; 0 in resolution IV. Main effects
+            are averages over the other factors at the rates of the design.
         error: the largest standard error of a main effect (on minus off) over the noise of one run.
     """
 
@@ -45,11 +46,12 @@ def two_level_design(
     """Return a design in which no main effect is aliased with a two-factor interaction.
 
     In N = 2^m runs the columns are products of an odd number of basic ones (the even ones left out, as in a
-    fold-over), so a product of two columns is never a third: resolution IV, for up to N / 2 factors. Among the
-    columns those are taken that give the fewest aliases between interactions.
+    fold-over), so a product of two columns is never a third: resolution IV, for up to N / 2 factors. The selected
+    columns have the fewest aliases between interactions.
 
-    Where factors exclude each other no such design exists. The clashes are then taken out and the levels exchanged
-    one at a time while that lowers the errors and aliases of the main effects; `alias` and `error` say what is left.
+    If factors exclude each other, such a design does not exist. Conflicting levels are then removed, and levels are
+    exchanged one at a time while this lowers the errors and aliases of the main effects; `alias` and `error` contain
+    the remaining ones.
 
     Args:
         factors: names, at least two.
@@ -141,7 +143,7 @@ def _exchange_levels(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
             trials = trials[(counts <= 1).all(axis=0)]
             costs = _quality(trials, groups)[0]
             cheapest = int(np.argmin(costs))
-            # A gain below rounding would let two equal designs take turns for ever.
+            # A gain below rounding would alternate between two equal designs for ever.
             if costs[cheapest] < cost - 1e-9:
                 best, cost = trials[cheapest], float(costs[cheapest])
         if cost == before:
@@ -166,7 +168,7 @@ def _quality(levels: Mask, groups: Sequence[tuple[int, ...]]) -> tuple[Array, Ar
     inverse = np.linalg.inv(moments + 1e-9 * np.eye(factors + 1))
     errors = 4.0 * np.diagonal(inverse, axis1=-2, axis2=-1)[..., 1:]
     alias = (inverse @ (design.swapaxes(-1, -2) @ (rest[..., first] * rest[..., second])))[..., 1:, :]
-    # What the small addition above leaves in designs without aliases.
+    # Remove the effect of the small addition above in designs without aliases.
     alias = np.where(np.abs(alias) < 1e-8, 0.0, alias)
     cost = errors.mean(axis=-1) + 4.0 * INTERACTION * np.square(alias).sum(axis=-1).mean(axis=-1)
     cost = np.where((errors > 0.0).all(axis=-1) & (errors < 1e6).all(axis=-1), cost, np.inf)

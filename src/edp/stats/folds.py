@@ -11,10 +11,10 @@ from edp.stats.checks import Mask
 def repeated_folds(sessions: int, folds: int = 5, repeats: int = 1, seed: int = 0) -> Mask:
     """Return repeated grouped k-fold assignments: each repeat distributes all sessions again, one run per fold.
 
-    The same seed and a larger number of repeats give the same first runs, so a study can go on where it stopped.
+    The same seed and a larger number of repeats give the same first runs, so a study can be continued.
 
     Returns:
-        ``(run, session)``: on which sessions each run is evaluated; it trains on the others.
+        ``(run, session)``: mask of the sessions on which each run is evaluated; it trains on the others.
 
     Raises:
         ConfigError: fewer sessions than folds, fewer than two folds, or no repeat.
@@ -47,7 +47,7 @@ def repeated_splits(sessions: int, test_sessions: int, splits: int, seed: int = 
         )
     tested = np.zeros((splits, sessions), dtype=bool)
     for split in range(splits):
-        # A stream for each split: more splits leave the first ones as they are.
+        # Each split has its own random stream, so that more splits do not change the first ones.
         rng = np.random.default_rng([seed, split])
         tested[split, rng.choice(sessions, test_sessions, replace=False)] = True
     return tested

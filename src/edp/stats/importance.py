@@ -12,8 +12,8 @@ from edp.errors import DataError
 from edp.stats.checks import finite, lower_p
 
 PASS_AT = 0.30
-"""Largest one-sided p-value with which a module passes the screening: it is to lose few true modules, not to
-confirm any."""
+"""Maximum one-sided p-value of a module that passes the screening. The screening should lose few effective modules; a
+later test confirms them."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class MainEffect:
         effect: mean score with the factor minus mean score without it, in the unit of the scores; negative is better.
         error: standard error.
         p: one-sided, small where on is better.
-        importance: the factor's share of the variance that all factors explain, 0 to 1.
+        importance: fraction of the explained variance that belongs to the factor, 0 to 1.
         passed: p is at most the screening's level.
     """
 
@@ -47,14 +47,14 @@ def main_effects(
     """Return the regress the scores on all factors at once, and on covariates such as randomised rates.
 
     Args:
-        levels: ``(run, factor)``, True where on; a repeated design is stacked.
+        levels: ``(run, factor)``, True if the factor is on; a repeated design is stacked.
         factors: names.
         scores: ``(run,)``; failed runs filled with the worst.
         covariates: ``(run, covariate)``; None: none.
         pass_at: one-sided p-value up to which a factor passes.
 
     Returns:
-        One for each factor, in their order.
+        One effect per factor, in the order of the factors.
 
     Raises:
         DataError: shapes that do not fit, values that are not finite, a factor that never changes or cannot be
@@ -85,7 +85,7 @@ def main_effects(
         )
     inverse = np.linalg.inv(design.T @ design)
     coefficients = inverse @ (design.T @ y)
-    # Scores that are all the same leave rounding in the coefficients and in the residuals.
+    # Equal scores leave rounding errors in the coefficients and residuals.
     dust = 1e-13 * float(np.abs(y).max())
     coefficients = np.where(np.abs(coefficients) > dust, coefficients, 0.0)
     noise = float(np.square(y - design @ coefficients).sum()) / free

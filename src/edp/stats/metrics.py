@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from edp.errors import DataError
 
 COMPOSITE_WEIGHTS = {"mae": 0.40, "rmse": 0.15, "p95": 0.25, "p99": 0.20}
-"""Weights of the composite score, thesis eq. 3.41; they sum to one, so its unit is that of the errors."""
+"""Weights of the composite score, thesis eq. 3.41. They sum to one, so the score has the unit of the errors."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Errors of one output over all scored ticks; every field but `r2` and `count` is in the caller's unit.
+    """Errors of one output over all evaluated samples; every field except `r2` and `count` has the caller's unit.
 
     Attributes:
         mae: mean absolute error.
@@ -26,7 +26,7 @@ class Scores:
         p99: 99th percentile of the absolute error.
         composite: weighted sum of MAE, RMSE, P95 and P99, thesis eq. 3.41.
         bias: mean of prediction minus truth.
-        count: scored samples.
+        count: number of evaluated samples.
     """
 
     mae: float
@@ -64,8 +64,8 @@ def composite(mae: float, rmse: float, p95: float, p99: float) -> float:
 def score(prediction: ArrayLike, truth: ArrayLike) -> Scores:
     """Return the scores of one output.
 
-    Sums and percentiles are exact and in double precision. Beside its arguments it holds two double-precision
-    arrays of their length (16 bytes per sample).
+    Sums and percentiles are exact and in double precision. In addition to its arguments, the function needs two
+    double-precision arrays of their length (16 bytes per sample).
 
     Args:
         prediction: ``(sample,)`` in the unit in which the scores are wanted.
@@ -91,7 +91,7 @@ def score(prediction: ArrayLike, truth: ArrayLike) -> Scores:
 
 
 def interval_scores(lower: ArrayLike, upper: ArrayLike, truth: ArrayLike) -> tuple[float, float]:
-    """Share of the true values that lie between two bounds, and the mean distance of the bounds.
+    """Return the fraction of the true values between two bounds, and the mean distance of the bounds.
 
     Args:
         lower: ``(sample,)`` in the unit of the width.
@@ -119,7 +119,7 @@ def interval_score(lower: ArrayLike, upper: ArrayLike, truth: ArrayLike, coverag
         lower: ``(sample,)`` in the unit of the score.
         upper: upper bounds, same shape.
         truth: true values, same shape.
-        coverage: share of the truth that the interval is meant to hold, between 0 and 1.
+        coverage: intended fraction of the truth within the interval, between 0 and 1.
 
     Raises:
         DataError: see `interval_scores`; also for a coverage outside 0 to 1.
@@ -137,7 +137,7 @@ def weighted_interval_score(mae: float, scores: Mapping[float, float]) -> float:
 
     ``(mae / 2 + sum over intervals of (1 - coverage) / 2 score) / (1/2 + their number)``: the pinball loss, mean over
     the levels of median and bounds, times two. It is the mean absolute error of a prediction without intervals, and
-    goes to the continuous ranked probability score (CRPS) with ever more intervals (Bracher et al. 2021).
+    converges to the continuous ranked probability score (CRPS) for many intervals (Bracher et al. 2021).
 
     Args:
         mae: mean absolute error of the medians.
@@ -150,7 +150,7 @@ def weighted_interval_score(mae: float, scores: Mapping[float, float]) -> float:
 def mean_scores(scores: Sequence[Scores]) -> Scores:
     """Return the mean over outputs (the thesis's mean over cylinders); `count` is the sum.
 
-    `r2` is None as soon as one output has none: a mean over the others would not compare with another run's.
+    `r2` is None if any output has none, because a mean over the others would not be comparable between runs.
 
     Raises:
         DataError: `scores` is empty.

@@ -34,11 +34,10 @@ def mixed_model(module: ArrayLike, baseline: ArrayLike) -> MixedModel:
 
     With J splits, S seeds and both arms in each cell the arms are orthogonal to the splits, so b1 is the difference
     of the means and its variance ``2 s_e^2 / (J S)``. The residual variance is the mean square within splits, or,
-    where the split variance would come out negative, the mean square of everything. No iteration, so nothing can
-    fail to converge.
+    if the split variance would be negative, the mean square of all deviations. The solution needs no iteration.
 
-    The model gives each split one intercept for both arms: what a split does to the difference itself is not in
-    it, and overlapping splits count as independent. Its p-values are too small; `clustered_t` is the default.
+    The model has one intercept per split for both arms. It ignores effects of a split on the difference, and treats
+    overlapping splits as independent. Its p-values are too small; `clustered_t` is the default.
 
     Args:
         module: ``(..., split, seed)``.

@@ -1,4 +1,4 @@
-"""Adjusting p-values for the number of modules that were registered, not for those that are left."""
+"""Adjustment of p-values for the number of registered modules, including modules dropped earlier."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from edp.stats.checks import Array, finite
 def benjamini_hochberg(p: ArrayLike) -> Array:
     """Return p-values adjusted after Benjamini and Hochberg (1995), over the last axis.
 
-    They control the false discovery rate: the expected share of wrong ones among the confirmed. That is the
-    probability of any wrong one only where all are null; `holm` bounds that probability always.
+    They control the false discovery rate: the expected fraction of false positives among the confirmed modules. This
+        equals the probability of any false positive only if no module has an effect; `holm` always bounds that
+        probability.
 
     Raises:
         DataError: empty, or values outside 0 to 1.
@@ -41,7 +42,7 @@ def holm(p: ArrayLike) -> Array:
 def adjust_registered(p: Mapping[str, float], registered: Iterable[str]) -> dict[str, float]:
     """Apply Benjamini-Hochberg to all registered modules; a module without a test has p = 1.
 
-    Adjusting only for the survivors of a screening would forget that the others were tried on the same sessions.
+    An adjustment only for the modules that passed a screening would ignore the other tests on the same sessions.
 
     Args:
         p: raw p-values of the modules that were tested.

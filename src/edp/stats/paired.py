@@ -12,14 +12,14 @@ from edp.stats.checks import Array, check_tested_mask
 def fill_worst(scores: ArrayLike, tested: ArrayLike | None = None, worst: ArrayLike | None = None) -> Array:
     """Return the scores of all arms with each planned cell that is missing or diverged set to the session's worst.
 
-    Leaving such a pair out would reward the arm that fails where it is hard. An infinite score would decide a
-    mean alone. So a failed cell gets the largest finite score that any arm had on that session, or `worst`, where
-    that is larger: the score of a useless predictor, such as persistence, says best what a failure costs.
+    Omitting such a pair would favour an arm that fails on difficult sessions, and an infinite score would dominate the
+    mean. A failed cell therefore gets the largest finite score of any arm on that session, or `worst` if it is larger.
+    A suitable `worst` is the score of a trivial predictor, such as persistence.
 
     Args:
         scores: ``(arm, run, session)``, lower is better; NaN or infinite where a run failed.
-        tested: ``(run, session)``, the planned cells; None: all.
-        worst: ``(session,)``, the least that a failure costs; None: what was seen.
+        tested: mask of the planned cells ``(run, session)``; None uses all cells.
+        worst: minimum loss of a failed run ``(session,)``; None uses the recorded losses.
 
     Returns:
         ``(arm, run, session)``, finite; zero outside the planned cells.

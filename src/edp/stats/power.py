@@ -21,11 +21,11 @@ class ConfirmationPlan:
     """Length of a confirmation that reaches the required power.
 
     Attributes:
-        runs: training runs of each arm, a whole number of repeats; None where no number suffices.
+        runs: training runs per arm, a whole number of repeats; None if no number suffices.
         power: power for this number of runs.
-        limit: power with endlessly many runs on these sessions.
-        sessions_needed: sessions with which `runs` of them would do; None where these suffice.
-        reason: the answer as a sentence.
+        limit: power for infinitely many runs on these sessions.
+        sessions_needed: number of sessions for which `runs` runs suffice; None if the present sessions suffice.
+        reason: result as a sentence.
     """
 
     runs: int | None
@@ -96,7 +96,7 @@ def plan_runs(
             f"module's effect differs between sessions (sd {figure(math.sqrt(variance.session), 3)}); {text}"
         )
         return ConfirmationPlan(None, limit, limit, needed, reason)
-    # Whole repeats only: a part of one would judge some sessions more often than others.
+    # Use whole repeats only, since a partial repeat would evaluate some sessions more often than others.
     for runs in range(folds, most + 1, folds):
         reached = power(delta, variance, sessions, runs, folds, alpha)
         if reached >= target:
@@ -110,7 +110,7 @@ def plan_runs(
 
 
 def _sessions_needed(delta: float, variance: PairedVariance, folds: int, alpha: float, target: float) -> int | None:
-    """Return the smallest number of sessions with which endlessly many runs reach the target; None above 10,000."""
+    """Return the smallest number of sessions at which infinitely many runs reach the target; None above 10,000."""
     # Bisection: the power rises with the sessions.
     low, high = folds, 10_000
     if power(delta, variance, high, math.inf, folds, alpha) < target:
@@ -145,7 +145,7 @@ def simulated_power(
     repetitions: int = 2000,
     seed: int = 0,
 ) -> float:
-    """Return the power of the clustered t-test by Monte Carlo on the very cells that a study would fill.
+    """Return the power of the clustered t-test by Monte Carlo on the cells of a planned study.
 
     Args:
         delta: improvement, in the unit of the scores.

@@ -20,7 +20,7 @@ class InterimAnalysis:
     """Interim analysis of the data until now.
 
     Attributes:
-        runs: after which it is taken.
+        runs: number of runs after which the analysis takes place.
         drop_above: a module with a larger one-sided p-value is dropped.
     """
 
@@ -37,9 +37,9 @@ class RaceResult:
     """Result of a race for each module; arrays over the leading axes of the differences.
 
     Attributes:
-        dropped_after: runs after which it was dropped; 0 where it went all the way.
+        dropped_after: number of runs after which the module was dropped; 0 if it completed all runs.
         runs: number of runs until the decision.
-        p: one-sided p-value over all runs; 1 where it was dropped.
+        p: one-sided p-value over all runs; 1 if the module was dropped.
     """
 
     dropped_after: NDArray[np.int64]
@@ -58,8 +58,8 @@ def race(
     so under the null the probability of confirming it can only fall: futility analyses spend no alpha.
 
     Args:
-        differences: ``(..., run, session)`` in the order of the runs; values after the analysis that drops a
-            module is not used.
+        differences: ``(..., run, session)`` in the order of the runs; values after the analysis that drops a module are
+            not used.
         tested: ``(run, session)``; None: all.
         interim_analyses: numbers of runs in ascending order; analyses at or beyond the total number of runs are
             omitted.
@@ -73,7 +73,7 @@ def race(
     mask = check_tested_mask(tested, array.shape)
     dropped = np.zeros(array.shape[:-2], dtype=np.int64)
     for analysis in interim_analyses:
-        # One at the last run would be the test itself.
+        # An analysis after the last run would be the final test itself.
         if analysis.runs < mask.shape[0]:
             hopeless = clustered_t(array[..., : analysis.runs, :], mask[: analysis.runs]).p > analysis.drop_above
             # The first analysis that drops a module decides; later runs of it do not exist in a study.
@@ -87,9 +87,9 @@ class RaceRates:
     """Operating characteristics of a race for a module of known effect, over simulated studies.
 
     Attributes:
-        confirmed: share with p below alpha at the end.
+        confirmed: fraction with p below alpha at the end.
         confirmed_without: fraction confirmed without interim analyses.
-        dropped: share dropped at each interim analysis, by its number of runs.
+        dropped: fraction dropped at each interim analysis, by number of runs.
         mean_runs: mean number of runs of the module.
     """
 

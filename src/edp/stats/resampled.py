@@ -14,7 +14,7 @@ from edp.stats.clustered import MeanTest
 
 
 def resampled_t(differences: ArrayLike, test_over_train: float) -> MeanTest:
-    """Return the nadeau and Bengio's corrected resampled t-test (2003), one-sided.
+    """Return Nadeau and Bengio's corrected resampled t-test (2003), one-sided.
 
     ``t = mean / (s_d sqrt(1 / J + n_test / n_train))`` with J - 1 degrees of freedom: splits that share training
     data are not independent, and 1 / J alone would let any difference become significant by more splits.
@@ -71,5 +71,5 @@ def printed_p(d_z: ArrayLike, splits: int) -> np.ndarray:
 def _deviation(array: np.ndarray) -> np.ndarray:
     """Return the standard deviation (n - 1) over the last axis; zero if the values are equal up to rounding."""
     spread = array.std(axis=-1, ddof=1)
-    # A spread of rounding is none: the differences are equal.
+    # A spread of the size of rounding errors means equal differences.
     return np.where(spread > 1e-14 * np.abs(array).max(axis=-1), spread, 0.0)

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 MAX_EXACT = 1 << 20
-"""Values that are kept as they are, 8 MB."""
+"""Maximum number of values that are stored exactly, 8 MB."""
 FINE = 10
-"""Bits of the mantissa that tell bins apart: 1,024 bins an octave, so that a quantile is wrong by 0.05 % at most."""
+"""Number of mantissa bits that select a bin: 1,024 bins per octave, so the relative error of a quantile is at most 0.05
+%."""
 _SHIFT = 23 - FINE
 _BINS = 1 << (31 - _SHIFT)
 
@@ -19,7 +20,7 @@ _BINS = 1 << (31 - _SHIFT)
 class QuantileSketch:
     """Quantile sketch of non-negative values: exact up to `MAX_EXACT` values, beyond that to 0.05 %.
 
-    Bins are those of single precision with a shortened mantissa: two megabytes, however many values come.
+    A bin is a single-precision number with a shortened mantissa. The memory is two megabytes for any number of values.
     """
 
     def __init__(self) -> None:
@@ -56,7 +57,7 @@ class QuantileSketch:
         return {"bins": filled, "counts": self._bins[filled]}
 
     def add(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Take in what another one held, by its `state`: as if its values had come here."""
+        """Add the content of another sketch, given its `state`."""
         if "values" in state:
             self.update(state["values"])
             return

@@ -16,9 +16,9 @@ from edp.stats.multiple import benjamini_hochberg
 from edp.stats.resampled import printed_p
 
 MIN_DZ = 0.5
-"""The thesis's gate of relevance (3.3.4): a medium effect in Cohen's words."""
+"""Minimum effect size in the thesis (3.3.4): a medium effect (Cohen's d)."""
 MIN_STABILITY = 0.75
-"""The thesis's third gate: three quarters of the pairs of runs won."""
+"""Minimum fraction of pairs of runs with an improvement, the third criterion of the thesis."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class ThesisEvidence:
         beta: fixed effect of the module, negative is better.
         p: one-sided z-test of the mixed model.
         adjusted: Benjamini-Hochberg over all modules and metrics at once ("globally", 3.3.4).
-        printed_p: Phi(d_z sqrt(J)), what Table 4.5 prints.
+        printed_p: p-value printed in Table 4.5, Phi(d_z sqrt(J)).
         d_z: effect size of the differences of split means.
-        stability: share of the J S pairs won.
+        stability: fraction of the J S pairs with an improvement.
         passed: all three gates on this metric.
         confirmed: the module passed on any metric.
     """

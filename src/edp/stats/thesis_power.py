@@ -11,7 +11,7 @@ from scipy.special import ndtr, ndtri
 from edp.errors import ConfigError
 
 MAX_SPLITS = 25
-"""Upper bound of eq. 3.42: the sessions in the thesis's development set."""
+"""Maximum number of splits in eq. 3.42: the number of sessions in the thesis's development set."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class ThesisPlan:
 
     Attributes:
         splits: J = min(max(n_mc, n_analytical), 25), rounded up.
-        simulated: n_mc; None where 25 splits do not reach the power.
+        simulated: n_mc; None if 25 splits do not reach the power.
         analytical: n of eq. 2.21, not rounded.
     """
 
@@ -68,7 +68,7 @@ def thesis_power(
     """
     if splits < 2 or min(delta, sigma_seed, seeds) <= 0.0:
         raise ConfigError("the thesis's power needs two splits at least, and delta, sigma_seed and seeds above zero")
-    # A stream for each number of splits: a power does not depend on which others were asked for.
+    # Each number of splits has its own random stream, so a power does not depend on the other requested numbers.
     rng = np.random.default_rng([seed, splits])
     drawn = rng.normal(-delta, sigma_seed / math.sqrt(seeds), (experiments, splits))
     z = drawn.mean(axis=1) / (drawn.std(axis=1, ddof=1) / math.sqrt(splits))

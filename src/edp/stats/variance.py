@@ -17,7 +17,7 @@ class SplitVariance:
     """Mean score and its standard deviations between splits and between seeds within a split.
 
     Attributes:
-        mean: over all runs.
+        mean: mean score over all runs.
         split: standard deviation between splits.
         seed: standard deviation between seeds; None with one seed.
         split_interval, seed_interval: 95 % intervals; None where they are not defined.
@@ -33,8 +33,8 @@ class SplitVariance:
 def thesis_variance(scores: ArrayLike) -> SplitVariance:
     """Return the variances of eq. 2.17 and 2.18 of the thesis.
 
-    The first holds a part of the seeds' variance too, and the second is a mean of standard deviations, biased low
-    by c4(S): 0.886 with three seeds. `split_variance` has neither fault.
+    The first also contains a part of the seed variance. The second is a mean of standard deviations and is biased low
+    by c4(S), 0.886 for three seeds. `split_variance` avoids both errors.
 
     Args:
         scores: ``(split, seed)``.
@@ -180,7 +180,7 @@ def paired_variance(differences: ArrayLike, tested: ArrayLike | None = None) -> 
             [cells - session_pairs, cells - run_pairs, cells - 1.0],
         ]
     )
-    # The three sums then say (nearly) the same, and the solution would be noise.
+    # The three sums are then nearly proportional, and the solution would be noise.
     if np.linalg.cond(expected) > 1e8:
         raise DataError(
             f"{runs} runs on {sessions} sessions with {cells} cells cannot tell sessions, runs and cells apart; "

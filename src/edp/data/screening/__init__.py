@@ -1,4 +1,4 @@
-"""Screening of channels: which to feed a model, with how much memory, and which to leave out and why."""
+"""Screening of channels: selection of model inputs and memory length, with reasons for every omitted channel."""
 
 from edp.data.screening.result import (
     ChannelVerdict,

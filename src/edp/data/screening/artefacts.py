@@ -13,17 +13,19 @@ from edp.data.screening.result import Array, Flag, FlagKind
 from edp.data.screening.table import CandidateTable, chunks
 
 CLOCK = 0.98
-"""Rank correlation with time, in every piece, from which a channel only tells the time."""
+"""Minimum rank correlation with time, in every segment, of a channel that only contains the time."""
 STRONG = 0.6
-"""Correlation that a relation must have in every piece before a change of its sign counts."""
+"""Minimum correlation, in every segment, of a relation whose change of sign is reported."""
 EXACT = 0.97
-"""The same before a change of its gain counts."""
+"""Minimum correlation, in every segment, of a relation whose change of gain is reported."""
 GAIN = 1.5
-"""Ratio of the largest to the smallest gain."""
+"""Minimum ratio of the largest to the smallest gain that is reported as a change."""
 STEADY, SAME = 1.25, 1.05
-"""Largest ratio of gains (90 % to 10 %) that count as one gain where a sign turns, and where a relation is absent."""
+"""Maximum ratio of gains (90 % to 10 % quantile) that counts as one gain, for the detection of a changed sign and of an
+absent relation."""
 VISIBLE, ABSENT = 0.8, 0.3
-"""Correlation that gain and noise let expect, and the one found, where a relation is absent."""
+"""Minimum correlation expected from gain and noise, and maximum correlation found, in a segment with an absent
+relation."""
 
 
 def dead_flags(table: CandidateTable) -> list[Flag]:
@@ -49,11 +51,11 @@ def clock_flags(table: CandidateTable, live: Sequence[int]) -> list[Flag]:
         flags = []
         for piece in table.pieces:
             values = max(piece.stretches, key=len)[:, i]
-            # 2,000 rows tell a clock, and ranking all rows would cost as much as the rank correlation itself.
+            # 2,000 rows identify a clock; ranking all rows would cost as much as the rank correlation itself.
             values = values[:: max(1, len(values) // 2_000)]
             if values.max() > values.min():
                 flags.append(abs(float(np.corrcoef(ranks_of(values), np.arange(len(values)))[0, 1])))
-        # The least of all pieces: a slow signal may rise throughout one of them.
+        # The minimum over all segments is used, because a slow signal may rise throughout one segment.
         return min(flags) if len(flags) > len(table.pieces) // 2 else 0.0
 
     values = spread(of_channel, live)
@@ -77,11 +79,11 @@ def changing_flags(
 
     Args:
         names: channels.
-        lagged: covariances of every piece.
-        judged: columns that may be flagged.
-        trusted: columns that a channel is held against.
-        support: largest correlation of each channel with a target over all segments, ``(channel,)``. Of two channels
-            that are both in question, the one that has less than half the other's is taken for the changing one.
+        lagged: lagged covariances of every segment.
+        judged: columns that can be flagged.
+        trusted: columns with which a channel is compared.
+        support: largest correlation of each channel with a target over all segments, ``(channel,)``. If two untrusted
+            channels disagree, the channel with less than half of the other's correlation is flagged.
     """
     squares = lagged.squares().astype(np.float64)
     usable = np.asarray((squares > 0).all(axis=0))
@@ -122,15 +124,16 @@ def flag_broken(
 ) -> list[Flag]:
     """Flag channels that follow another with one gain in some recordings, but with another sign or not in others.
 
-    Pieces may join recordings with different relations, so every segment is looked at for itself, at lag 0. Natural
-    relations change their gain where they change their sign or fade; a plug turned round or left out does not. A
-    segment counts where the source moves so much that the gain and noise of the other segments would show it.
+    A block may join recordings with different relations, so every segment is evaluated separately, at lag 0. Natural
+    relations change their gain together with their sign or strength; a reversed or disconnected plug does not. A
+    segment counts if the source moves enough for the gain and noise of the other segments to show the relation.
 
     Args:
         table: the data.
-        live: its columns that change.
-        judged: places in `live` of the channels that may be flagged.
-        trusted: places of those that they are held against: of two in question, which one is broken cannot be decided.
+        live: columns of the table that change.
+        judged: indices in `live` of the channels that can be flagged.
+        trusted: indices in `live` of the reference channels. Between two untrusted channels, the broken one cannot be
+            identified.
     """
     piece_moments = [_moments([stretch[:, live]]) for piece in table.pieces for stretch in piece.stretches]
     relations, slopes, squares = (np.array(values) for values in zip(*piece_moments, strict=True))
@@ -147,7 +150,7 @@ def flag_broken(
 
 
 def _find_break(relation: Array, slope: Array, squares: Array) -> tuple[float, str] | None:
-    """Return the mean correlation where there is one, and in words how it breaks; None where it does not.
+    """Return the mean correlation in segments with a relation, and a description of the break; None without a break.
 
     Args:
         relation: correlation of channel and source, ``(stretch,)``.
@@ -168,7 +171,7 @@ def _find_break(relation: Array, slope: Array, squares: Array) -> tuple[float, s
         )
     noise = float(np.median((squares[:, 0] * (1.0 - relation**2))[strong]))
     shown = float(np.median(slope[strong])) ** 2 * squares[:, 1]
-    # Correlation that this gain and noise would give where the source moves as it does in the stretch.
+    # Expected correlation for this gain and noise and the source's variance in the segment.
     looked = np.sqrt(shown / np.maximum(shown + noise, 1e-300)) >= VISIBLE
     absent = int((looked & (np.abs(relation) <= ABSENT)).sum())
     if high <= SAME * low and absent >= max(2, 0.2 * looked.sum()):
@@ -182,7 +185,7 @@ def _moments(stretches: Sequence[np.ndarray]) -> tuple[Array, Array, Array]:
     mean = sum(stretch.sum(axis=0, dtype=np.float64) for stretch in stretches) / count
     products = np.zeros((len(mean), len(mean)))
     for part in chunks(stretches):
-        # Centred before the products, which would cancel otherwise.
+        # Subtract the means before the products, which would otherwise lose digits.
         part -= mean
         products += part.T @ part
     square = np.diag(products)
@@ -200,5 +203,5 @@ def lonely(values: Array, chance: float) -> int | None:
     """
     order = np.argsort(-np.abs(values))
     first, second = float(abs(values[order[0]])), float(abs(values[order[1]]))
-    # Strong in itself, against the next piece, and against chance.
+    # The correlation must be strong absolutely, compared with the next segment, and compared with chance.
     return int(order[0]) if first > max(0.3, 4 * second, 3 * chance) else None

@@ -1,4 +1,4 @@
-"""Compiled loops that let other threads run, and the threads that call them."""
+"""Compiled loops that release the GIL, and the threads that call them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def spread(
 
     `on_share` receives the finished fraction.
 
-    The threads of the linear algebra library are held to one meanwhile: they would wait for each other.
+    The linear algebra library uses one thread during the call, because its threads would wait for each other.
     """
     todo = list(items)
     results: list[Result] = []

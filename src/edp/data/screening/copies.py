@@ -1,12 +1,12 @@
 """Channels that are copies of another channel, and channels that contain future values.
 
-A *copy* is a channel that equals another one, delayed, scaled and with noise of its own: what is left of it is related
-to nothing in a linear way, so that whoever has the past of the original gains nothing. A *leak of the future* is a
-channel that the presents and pasts of the trusted channels leave unexplained, but that the future of one of them
-explains: shifted, smoothed to both sides, differenced across the present. No sensor shows that.
+A *copy* is a channel that equals another channel with a delay, a scale and additional noise. Its residual has no linear
+relation to any channel, so the copy adds no information to the past of the original. A *leak of the future* is a
+channel that the present and past of the trusted channels do not explain, but that the future of one of them explains:
+shifted, smoothed to both sides, or differentiated across the present. A sensor cannot produce such a signal.
 
-A channel that *causes* a trusted one through dynamics that can be inverted without loss and without noise looks the
-same; who has one names it as trusted.
+A channel that *causes* a trusted channel through invertible, noise-free dynamics looks like a leak. Declare such a
+channel as trusted.
 """
 
 from __future__ import annotations
@@ -24,36 +24,42 @@ from edp.data.screening.result import Array, Flag, FlagKind
 from edp.wording import number, typed
 
 LEAKING, DETERMINED = 0.25, 0.5
-"""Of what pasts leave unexplained of a channel, the share that may remain once the future is known, for a leak; the
-second where hardly anything remains, as from the ends of segments."""
+"""Maximum fraction of the unexplained variance that may remain after adding the future, for a leak. The second value
+applies if hardly any variance remains, for example at the ends of segments."""
 HARDLY = 0.01
-"""Share of the variance that counts as hardly anything."""
+"""Fraction of the variance below which a remainder counts as hardly any variance."""
 DIFFERENCING = 2.5
-"""Sum of the absolute weights of the future, from which it is differences of the future that explain: so do leaks that
-are derivatives, but also causes, whose effect is turned back. Shifts and means have a sum of 2 or less."""
+"""Sum of the absolute weights of the future above which the future enters as differences. Leaks that are derivatives
+have such weights, but also causes whose effect is inverted. Shifts and means have a sum of 2 or less."""
 EXACT_SHARE = 0.95
-"""Share that differences must take away to count as a leak: noise of sensors keeps a cause from being found so well."""
+"""Minimum fraction of the remaining variance that differences must explain for a leak. Sensor noise keeps causes below
+this fraction."""
 TELLING = 1e-4
-"""Less left unexplained by pasts than this share of the variance: nothing to learn from the future."""
+"""Minimum fraction of the variance unexplained by the past. Below it, a test for the future is not possible."""
 MATERIAL = 0.15
-"""Correlation of the rest of a copy with anything, above which it is more than noise."""
+"""Correlation of a copy's residual with any channel above which the residual contains more than noise."""
 SEEN = 0.7
-"""Largest lag of a noisy copy, as a share of the largest one searched."""
+"""Maximum lag of a noisy copy, as a fraction of the largest searched lag."""
 RELATED = 0.7
-"""Least correlation of a noisy copy with its original."""
+"""Minimum correlation of a noisy copy with its original."""
 EXPLAINED = 0.01
-"""Share of a channel's variance left by the presents and pasts of others, below which it is made of them."""
+"""Maximum fraction of a channel's variance unexplained by other channels (present and past), for a channel that is
+composed of them."""
 SLACK = 1
-"""Samples by which an exact copy may be off and still count as simultaneous."""
+"""Lag in samples up to which an exact copy counts as simultaneous."""
 _FAR = 30
-"""Samples ahead that a leak is searched at; one that is farther ahead is looked at around its peak."""
+"""Number of future samples searched for a leak. For a leak farther in the future, the samples around the correlation
+peak are searched."""
 _NEAR_PAST = range(21)
-"""Delays of the channels in question: densely, since what their past explains must not pass for the future."""
+"""Delays in samples of the source channels. They are dense, because effects of the past must not count as effects of
+the future."""
 _LONG_PAST = range(61)
 _SPARSE_PAST = (0, 1, 2, 4, 7, 12, 20)
-"""Delays of all others: the model has dozens of channels, and its solution grows with the third power of the taps."""
+"""Delays in samples of all other channels. They are sparse, because the model has dozens of channels and its cost grows
+with the third power of their number."""
 _MAX_TRUSTED = 40
-"""Strongest trusted channels in a model, for the same reason."""
+"""Maximum number of trusted channels in a model, which limits its cost. The channels with the strongest correlation are
+used."""
 _PARTNERS = 2
 
 
@@ -89,7 +95,7 @@ def find_leaks(
     def judge(channel: int) -> Flag | None:
         base = sorted((k for k in trusted if k != channel), key=lambda k: -strength[channel, k])[:_MAX_TRUSTED]
         sources = list(dict.fromkeys([*base[:_PARTNERS], *(k for k in targets if k != channel)]))
-        # a channel far ahead of its source is looked at as if it came at a moderate distance
+        # a channel far ahead of its source is treated as if its lead were moderate
         ahead = {k: max(far, min(reach - max(near), -int(lead[channel, k]) + 2)) for k in sources}
         past = [(k, a) for k in base for a in (near if k in sources else sparse)]
         future = [(k, -a) for k in sources for a in range(max(1, ahead[k] - far + 1), ahead[k] + 1)]
@@ -111,7 +117,7 @@ def _leak(
     future: list[Tap],
     left: tuple[float, float],
 ) -> Flag | None:
-    """Name the channel whose future explains most on its own, and how far ahead; None where it may be a cause."""
+    """Return the flag with the channel whose future explains most, and its lead; None if the channel may be a cause."""
     gains = {}
     for source in dict.fromkeys(k for k, _ in future):
         alone = unexplained(correlations, channel, past, [tap for tap in future if tap[0] == source])
@@ -157,9 +163,9 @@ def find_copies(correlations: Array, least: float) -> list[CopiedChannel]:
         # The peak may lie beyond the search.
         if abs(lag) >= reach:
             return None
-        # What leads may be a reference that a controlled machine follows closely: there the rest always counts.
+        # A leading channel may be the reference of a controlled machine, so its residual is always tested.
         exact = abs(value) >= least and lag >= -SLACK
-        # the rest can only be judged where enough lags lie on either side
+        # the residual can only be tested with enough lags on both sides
         if not exact and (abs(lag) > SEEN * reach or rest_related(correlations, i, j, lag, value) > MATERIAL):
             return None
         return CopiedChannel(i, j, lag, value)
@@ -170,8 +176,8 @@ def find_copies(correlations: Array, least: float) -> list[CopiedChannel]:
 def rest_related(correlations: Array, i: int, j: int, lag: int, value: float) -> float:
     """Return the largest correlation of ``x_i[t] - value x_j[t - lag]`` with any channel but i, at any lag.
 
-    Where i leads, also with the steps of the channels from sample to sample: what a reference tells of a machine that
-    follows it shows there, however slow both are.
+    If i leads, the changes of the channels from sample to sample are included. They show the relation between a
+    reference and a machine that follows it, even if both are slow.
     """
     reach = len(correlations) // 2
     shown = np.arange(max(-reach, lag - reach), min(reach, lag + reach) + 1) + reach
@@ -197,8 +203,8 @@ def copy_flags(
         names: channels.
         pairs: pairs of equal channels, usually in both directions.
         trusted: columns of the channels known to be measured; never flagged.
-        innovation: share of each channel's variance that its own past does not explain, ``(channel,)``.
-        settled: columns that are flagged already, of no use as originals.
+        innovation: fraction of each channel's variance that its own past does not explain, ``(channel,)``.
+        settled: columns that are already flagged and cannot be originals.
     """
     flags: dict[int, Flag] = {}
     # Closest pairs first: of a chain of copies each is named after its nearest original.
@@ -244,8 +250,8 @@ def flag_explained(names: Sequence[str], correlations: Array, judged: Sequence[i
     Args:
         names: channels.
         correlations: ``[reach + lag, i, j]``, over all segments.
-        judged: columns in the order in which they may go.
-        base: columns that explain; those of `judged` are among them until they go.
+        judged: columns that can be removed, in this order.
+        base: explaining columns; they include the columns of `judged` that are not yet removed.
     """
     reach = len(correlations) // 2
     strength = np.abs(correlations).max(axis=0)

@@ -20,7 +20,7 @@ from edp.data.screening.table import CandidateTable, Piece
 from edp.recording import FloatArray
 
 _SEGMENTS = 128
-"""Blocks whose spectra are held at once."""
+"""Number of blocks whose spectra are in memory at the same time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +30,8 @@ class Lagged:
     Attributes:
         live: columns of the table that the channels here are, ``(channel,)``.
         reach: largest lag.
-        sums: ``[p, reach + lag, i, j]`` sums ``x_i[t + lag] x_j[t]`` over piece p, float32.
-        samples: rows of each piece, ``(segment,)``.
+        sums: sums of ``x_i[t + lag] x_j[t]`` over segment p, as ``[p, reach + lag, i, j]``, float32.
+        samples: number of rows of each segment, ``(segment,)``.
         chance: correlations of channels with targets of other segments, ``(segment, shift, lag, channel, target)``.
     """
 
@@ -83,7 +83,7 @@ class _Spectra:
         mean = self.table.sums[0][piece_index, self.live]
         deviation = self.table.within[self.live]
         for stretch in self.table.pieces[piece_index].stretches:
-            # Single precision halves the memory of all pairs; `linear.RIDGE` allows for what it leaves uncertain.
+            # Single precision halves the memory of all pairs; `linear.RIDGE` covers its rounding errors.
             yield ((stretch[:, self.live] - mean) / deviation).astype(np.float32)
 
     def blocks(self, piece_index: int, columns: NDArray[np.int64] | None, around: bool) -> NDArray[np.complex64]:
@@ -121,7 +121,7 @@ def compute_lagged_covariances(
         table: the data.
         reach: largest lag, samples.
         shifts: number of other segments with which each segment is paired to estimate the level of chance.
-        on_share: hears the share that is done.
+        on_share: callback with the completed fraction.
     """
     live = np.flatnonzero(table.live)
     spectra = _Spectra(table, reach, live)
@@ -136,7 +136,7 @@ def compute_lagged_covariances(
         sums = spectra.back(_product(around, spectra.blocks(p, None, around=False)))
         pairs = []
         for shift in range(1, shifts + 1):
-            # Channels of this piece with targets of another one, where nothing can relate: chance.
+            # Channels of this segment with targets of another segment are unrelated and give the chance level.
             other = (p + shift) % count
             shared = min(around.shape[1], answers[other].shape[1])
             products = spectra.back(_product(around[:, :shared], answers[other][:, :shared]))

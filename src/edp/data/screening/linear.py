@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from edp.data.screening.result import Array
 
 RIDGE = 3e-6
-"""Added to the variance 1 of each regressor: about what single precision leaves uncertain."""
+"""Ridge term added to the unit variance of each regressor: about the rounding error of single precision."""
 Tap = tuple[int, int]
-"""Channel, and by how many samples it is delayed; a negative delay is its future."""
+"""Channel index and delay in samples. A negative delay is the channel's future."""
 
 
 def gram(correlations: Array, left: Sequence[Tap], right: Sequence[Tap]) -> Array:

@@ -25,13 +25,14 @@ from edp.data.screening.stability import ABOVE_CHANCE, MIN_INFORMATION, Relation
 from edp.data.screening.table import CandidateTable
 
 NEGLIGIBLE = 0.002
-"""Share of the remaining error that a channel must take away, held out, to be kept for that alone."""
+"""Minimum fraction of the held-out error that a channel must remove to be kept."""
 LARGE = 0.01
-"""The same, from which a channel that relates is not redundant even where the held-out segments do not agree."""
+"""Fraction of the held-out error from which a related channel is not redundant, even if the held-out segments disagree.
+"""
 CLEAR = 0.2
-"""Correlation from which a lag counts for the window."""
+"""Minimum correlation at which a lag counts for the window length."""
 STEP = 5
-"""Windows are rounded up to so many samples."""
+"""Multiple to which window lengths are rounded up, in samples."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +44,12 @@ class ScreeningEvidence:
         live: columns of the table that change.
         correlations: correlations of live channels over all segments, ``[reach + lag, i, j]``.
         relations: tests of live channels against targets.
-        pieces: correlation of each piece at the best lag with the best target, ``(segment, live channel)``.
+        pieces: correlation at the best lag with the best target in each segment, ``(segment, live channel)``.
         curves: lag curves.
         importance: permutation importance in the forest, all entries.
         values: Granger gains in linear models.
         clusters: collinear channels.
-        history: held-out error by window, and the shortest that suffices.
+        history: held-out error by window length, and the shortest sufficient window.
     """
 
     table: CandidateTable
@@ -80,7 +81,7 @@ class ScreeningEvidence:
 
 
 def noise_flags(evidence: ScreeningEvidence, judged: Sequence[str]) -> list[Flag]:
-    """Return the channels that neither relate to a target nor help a forest or a linear model, held out."""
+    """Return the channels that neither relate to a target nor improve a forest or a linear model on held-out data."""
     flags = []
     for live_index, column in enumerate(evidence.live):
         name = evidence.table.names[column]
@@ -129,8 +130,8 @@ def redundant_flags(evidence: ScreeningEvidence, judged: Sequence[str], free: Se
     """Flag redundant channels: members of a cluster, and channels predicted by the pasts of other channels.
 
     Args:
-        evidence: figures.
-        judged: channels that may go.
+        evidence: results of the screening.
+        judged: channels that can be removed.
         free: all channels without a flag, `judged` among them.
     """
     # Only channels without a value of their own may go; a related one is kept even where its importance is nil.
@@ -174,10 +175,10 @@ def propose(
 
     Args:
         evidence: figures.
-        names: candidates, those with missing values too.
-        targets: names; inputs as well unless the horizon is 0.
+        names: names of all candidates, including channels with missing values.
+        targets: names of the targets, which are also inputs unless the horizon is 0.
         horizon: samples ahead.
-        flags: whoever has one is dropped.
+        flags: defects; a channel with a flag is removed.
     """
     by_channel: dict[str, list[Flag]] = {}
     for flag in flags:
@@ -210,7 +211,7 @@ def _scores(evidence: ScreeningEvidence) -> dict[str, float]:
     information = (np.nan_to_num(relations.information) * steady).max(axis=1)
     names = [evidence.table.names[column] for column in evidence.live]
     entries = [evidence.importance_of(name) for name in names]
-    # A group shares its importance: collinear channels take each other's place in a forest.
+    # All members of a group have its importance, because collinear channels replace each other in a forest.
     weight = np.array([max(e.increase, 0.0) / len(e.members) if e is not None else 0.0 for e in entries])
     parts = [
         share * np.maximum(values, 0.0) / max(float(values.max()), 1e-30)
@@ -286,7 +287,7 @@ def _window(evidence: ScreeningEvidence, proposed: set[str], targets: Sequence[s
 def _notes(evidence: ScreeningEvidence, flags: Sequence[Flag], horizon: int) -> tuple[str, ...]:
     notes = []
     table = evidence.table
-    # Below eight pieces a standard error has hardly any degree of freedom.
+    # With fewer than eight segments a standard error has too few degrees of freedom.
     if len(table.pieces) < 8:
         notes.append(
             f"only {len(table.pieces)} pieces were compared: figures of stability are rough; give more recordings"

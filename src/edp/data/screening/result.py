@@ -18,7 +18,7 @@ from edp.settings.results import json_value
 
 Array = NDArray[np.float64]
 OnProgress = Callable[[str, float], None]
-"""Called with the stage that begins or goes on, and the share of the whole screening that is done, 0 to 1."""
+"""Callback with the current stage and the completed fraction of the whole screening, 0 to 1."""
 
 
 class FlagKind(StrEnum):
@@ -37,16 +37,16 @@ class FlagKind(StrEnum):
 
 @dataclass(frozen=True)
 class Flag:
-    """Something wrong with a channel, and by which figures it shows.
+    """Defect of a channel, with the evidence for it.
 
     Attributes:
         channel: the channel.
         kind: type of the defect.
-        source: the channel of which it is a copy or whose future it knows; empty where there is none.
+        source: original of a copy, or channel whose future it contains; empty for other defects.
         lag: delay of the channel relative to `source` in samples: -12 means that it has the value of the source 12
             samples later.
-        value: the figure that decided (a correlation, a share), 0 to 1.
-        evidence: a sentence with the figures.
+        value: value that decided about the flag (a correlation or a fraction), 0 to 1.
+        evidence: sentence with the numerical evidence.
     """
 
     channel: str
@@ -88,9 +88,9 @@ class LagCurve:
         best: lag of the largest absolute correlation.
         value: correlation there, with its sign.
         low, high: 95 % interval of the best lag over the segments.
-        agreement: share of the segments whose correlation at `best` has this sign.
+        agreement: fraction of the segments whose correlation at `best` has this sign.
         certain: the correlation at `best` differs from chance over the segments.
-        at_edge: the best lag is the end of the search, so that the true one may lie beyond.
+        at_edge: whether the best lag is at the end of the search range, so that the true lag may be outside.
     """
 
     channel: str
@@ -132,10 +132,10 @@ class Stability:
     Attributes:
         metric: ``pearson``, ``spearman``, ``kendall``, ``information`` or ``lag``.
         channel, target: names.
-        values: shape ``(segment,)``; NaN where the channel is constant in a piece.
+        values: value in each segment, shape ``(segment,)``; NaN if the channel is constant in a segment.
         mean, deviation: over the segments.
-        agreement: share of the segments with the sign of the mean (1 for information).
-        chance: mean absolute value between a piece's channel and another piece's target, where nothing can relate.
+        agreement: fraction of the segments with the sign of the mean (1 for information).
+        chance: mean absolute value between the channel and the target of different segments, which are unrelated.
     """
 
     metric: str
@@ -155,10 +155,10 @@ class GroupImportance:
     Attributes:
         members: channels permuted together.
         target: name, or ``all`` for the mean of the targets.
-        increase: mean increase of the mean squared error of the target's change up to the horizon, as a share of
-            that change's variance.
+        increase: mean increase of the mean squared error of the target's change up to the horizon, as a fraction of the
+            variance of this change.
         low, high: 95 % interval over the held-out segments.
-        share: the group's part of all positive increases.
+        share: fraction of all positive increases that belongs to the group.
     """
 
     members: tuple[str, ...]
@@ -177,7 +177,8 @@ class Value:
 
     Attributes:
         channel, target: names.
-        gain: share of the remaining squared error at the horizon that the channel takes away; negative: it harms.
+        gain: fraction of the remaining squared error at the horizon that the channel removes; negative if the channel
+            increases the error.
         low, high: 95 % interval over the held-out segments.
     """
 
@@ -211,7 +212,7 @@ class ChannelVerdict:
         channel: name.
         keep: whether it is proposed.
         rank: 1 is the most useful; kept channels come first.
-        score: 0 to 1, what the rank goes by.
+        score: score that determines the rank, 0 to 1.
         reason: one or two sentences with the figures.
         flags: defects of the channel.
     """
@@ -257,7 +258,7 @@ class ScreeningResult:
 
     Attributes:
         recordings: names of the recordings.
-        pieces: names of the segments that were compared with each other.
+        pieces: names of the compared segments.
         samples: rows of all recordings.
         rate_hz: samples per second.
         channels: candidates, targets among them, in the order of the recordings.
@@ -266,11 +267,11 @@ class ScreeningResult:
         horizon: samples ahead.
         matrices: dependencies at one instant.
         lags: a curve for each candidate and target.
-        stability: metrics by piece.
+        stability: metrics per segment.
         importance: importance of groups, for each target and for all.
         values: linear value of each channel with its past.
-        clusters: collinear channels, those of one member left out.
-        flags: all of them.
+        clusters: groups of at least two collinear channels.
+        flags: all flags.
         proposal: proposed feature set and memory.
         options: the options of the screening.
         seconds: time of each stage.

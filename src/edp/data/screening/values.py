@@ -22,14 +22,14 @@ from edp.data.screening.result import Array, Value
 HISTORY = (0, 1, 2, 4, 8, 16, 32)
 """Delays of each channel, samples."""
 WINDOWS = (5, 10, 15, 20, 25, 30, 40, 50, 60, 80, 100, 150, 200, 300, 400, 500)
-"""Histories tried, samples."""
+"""History lengths that are tried, in samples."""
 ENOUGH = 0.02
-"""A window is long enough when the held-out error is within this share of the best."""
+"""Maximum relative difference between the held-out error of a sufficient window and the best held-out error."""
 
 
 def choose_held_out(count: int, share: float, seed: int) -> NDArray[np.int64]:
     """Choose the left-out segments: at least two, at most all but two."""
-    # Two on either side at least, or there is no spread to judge by.
+    # At least two on either side are needed to estimate the spread.
     piece_count = min(max(2, round(count * share)), count - 2)
     return np.sort(np.random.default_rng(seed).permutation(count)[:piece_count])
 
@@ -92,12 +92,12 @@ def linear_values(
 
     Args:
         names: names of the channels of `lagged`.
-        lagged: covariances of every piece.
+        lagged: lagged covariances of every segment.
         used: columns that a model may read; targets too, unless the horizon is 0.
         targets: columns of the targets.
         horizon: samples ahead.
         held_out: segments that evaluate; the others train.
-        on_share: hears the share that is done.
+        on_share: callback with the completed fraction.
     """
     train = _correlations(lagged, np.setdiff1d(np.arange(len(lagged.samples)), held_out))
     read = [k for k in used if horizon > 0 or k not in targets]
@@ -142,14 +142,14 @@ def window_needed(
     """Return the shortest history for which a linear prediction is about as good as for the longest history evaluated.
 
     Args:
-        lagged: covariances of every piece.
+        lagged: lagged covariances of every segment.
         used: columns that a model may read.
         targets: columns of the targets.
         horizon: samples ahead.
-        held_out: segments that evaluate.
+        held_out: segments for evaluation.
 
     Returns:
-        The window in samples, and for each window tried the held-out error as a share of the change's variance.
+        The window in samples, and the held-out error of each tried window as a fraction of the change's variance.
     """
     train = _correlations(lagged, np.setdiff1d(np.arange(len(lagged.samples)), held_out))
     judge = _correlations(lagged, held_out)

@@ -16,13 +16,13 @@ class RlsStatus(IntEnum):
     """Result code of an adaptation step."""
 
     NONE = 0
-    """Nothing: there is no prediction to correct."""
+    """No prediction is available for correction."""
     HOLDING = 1
-    """The prediction is corrected; nothing was learned: in steady state, frozen, or too few ticks in a row."""
+    """The prediction is corrected without learning: in steady state, frozen, or after too few consecutive samples."""
     LEARNING = 2
-    """The prediction is corrected, and the error of an earlier one has taught."""
+    """The prediction is corrected, and the error of an earlier prediction has updated the correction."""
     FALLBACK = 3
-    """At least one of the numbers goes out as it was, because its corrections were worse than none."""
+    """At least one output is passed uncorrected, because its correction increased the error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ def total(products: Array) -> Array:
 
 
 class RlsCorrector:
-    """An adaptation at work.
+    """Online correction of predictions by recursive least squares.
 
     With the error ``e = (v(t) - y(t - k)) / unit`` of the prediction that has just come due, P for ``P = P(t - 1)``
     and ``phi = phi(t - k)``, a tick in motion does (a Kalman filter on coefficients that fade with time)::
@@ -63,8 +63,8 @@ class RlsCorrector:
     Attributes:
         theta: coefficients ``(H, J, n)``.
         covariance: P of each horizon ``(H, n, n)``.
-        fallback: numbers whose correction is taken back ``(H, J)``.
-        repairs: times that coefficients or a covariance were found damaged and started again; 0 in health.
+        fallback: mask of the outputs without correction ``(H, J)``.
+        repairs: number of restarts because coefficients or a covariance were invalid; 0 in normal operation.
     """
 
     def __init__(self, adaptation: Adaptation) -> None:
@@ -114,13 +114,13 @@ class RlsCorrector:
 
         Args:
             inputs: inputs of this sample ``(I,)``, SI units.
-            prediction: the network's from them ``(H, J)``, SI units.
-            fresh: whether they are this tick's own, and the prediction rests on a whole window.
-            learn: False freezes what was learned; it is evaluated all the same.
+            prediction: prediction of the network from these inputs ``(H, J)``, SI units.
+            fresh: whether the inputs belong to the current sample and the prediction uses a whole window.
+            learn: whether the correction learns; False keeps it constant, and it is still evaluated.
 
         Returns:
-            The corrected prediction ``(H, J)`` in SI units, and what was done. Numbers that are not finite are given
-            back as they came.
+            The corrected prediction ``(H, J)`` in SI units, and the status. Values that are not finite are returned
+            unchanged.
         """
         x, y = np.asarray(inputs, dtype=np.float32), np.asarray(prediction, dtype=np.float32)
         if not (np.isfinite(x).all() and np.isfinite(y).all()):
@@ -135,7 +135,7 @@ class RlsCorrector:
         measured, directed = x[self._columns], self._project_inputs(x)
         for h, k in enumerate(constants.horizons):
             error = np.zeros(len(measured), dtype=np.float32)
-            # The prediction of k ticks ago is judged only if all ticks since then came without a gap.
+            # The prediction made k samples ago is evaluated only if no sample is missing since then.
             if fresh and self._streak >= k:
                 error = self._error(h, measured)
                 taught = self._due(h, error, learn) or taught
@@ -198,16 +198,16 @@ class RlsCorrector:
         return learn and self._learn(h, row[:n], error)
 
     def _judge(self, h: int, error: Array, correction: Array, learn: bool) -> None:
-        """Compare the running errors without and with the correction; take it back, or let it out again."""
+        """Compare the running errors without and with the correction; disable or enable the correction."""
         constants, most = self._numbers, np.float32(MOST_ERROR)
         for running, of in ((self._plain[h], error), (self._corrected[h], error - correction)):
-            # A cap on single errors: one spike must not decide between correction and none.
+            # Limit single errors, so that one spike does not decide about the correction.
             running += constants["rate"] * (np.minimum(np.abs(of), most) - running)
         worse = ~self.fallback[h] & (self._corrected[h] > constants["worse"] * self._plain[h])
         better = self.fallback[h] & (self._corrected[h] < constants["better"] * self._plain[h])
         self.fallback[h] = (self.fallback[h] | worse) & ~better
         if learn and worse.any():
-            # A correction that did worse starts again from nothing, beside the error it is compared with.
+            # A correction that increased the error is reset to zero, together with the error for the comparison.
             self.theta[h][worse] = 0.0
             self._corrected[h][worse] = self._plain[h][worse]
             self.covariance[h] = self._start()
@@ -221,7 +221,8 @@ class RlsCorrector:
             self._repair(h)
             return False
         inverse = np.float32(1.0) / d
-        # The innovation is clipped, not the error: outliers may judge, but not teach.
+        # Clip the innovation and not the error: outliers count in the comparison but do not change the coefficients
+        # much.
         innovation = _clip(error - total(self.theta[h] * phi), CLIP)
         step = (innovation * inverse)[:, None]
         self.theta[h] = _clip(constants["keep"] * (self.theta[h] + g * step), constants["bound"])

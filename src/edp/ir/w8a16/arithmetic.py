@@ -1,7 +1,7 @@
 """Integer arithmetic of W8A16 networks, the same bits in NumPy and in C.
 
 A value is ``q 2^-frac`` with q a 16-bit number in [-32767, 32767]; `frac` may be negative or beyond 15. Accumulators
-are 32-bit, what they are multiplied by afterwards gives 64 bits. Every rounding is half up, every overflow saturates.
+have 32 bits; their product with a scale has 64 bits. Every rounding is half up, every overflow saturates.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from edp.errors import ExportError
 from edp.wording import typed
 
 Fixed = NDArray[np.int64]
-"""Integers of any width; NumPy computes with 64 bits, and `saturated` keeps them in theirs."""
+"""Integer array of any width. NumPy computes with 64 bits, and `saturated` limits values to their width."""
 
 LARGEST = 32767
-"""Of an activation."""
+"""Largest magnitude of an activation."""
 WEIGHT = 127
 """Largest magnitude of a weight."""
 ACCUMULATOR = 2**31 - 1
 GATE_FRAC = 16
-"""Fractional bits of what gates and scores are computed in, 32-bit."""
+"""Number of fractional bits of gates and attention scores, 32-bit."""
 CELL_FRAC = 20
-"""Fractional bits of the cell of an LSTM, 32-bit."""
+"""Number of fractional bits of an LSTM cell state, 32-bit."""
 UNIT_FRAC = 15
-"""Fractional bits of what lies between -1 and 1."""
+"""Number of fractional bits of values between -1 and 1."""
 GATE_LIMIT = 2**28
 CELL_LIMIT = 2**30
 TABLE = 513
-"""Entries of a table; between them it is interpolated."""
+"""Number of entries of a function table. Values between entries are interpolated."""
 
 
 def frac_for(largest: float, bits: int = 15) -> int:
@@ -102,13 +102,13 @@ def _table(function: Any, last: float) -> NDArray[np.uint16]:
 
 # Beyond 8, tanh is 1 to within 2^-16; one table serves tanh and sigmoid.
 TANH = _table(math.tanh, 8.0)
-"""tanh on [0, 8], in 2^-16."""
+"""Table of tanh on [0, 8], in 2^-16."""
 EXP = _table(lambda x: math.exp(-x), 16.0)
-"""exp(-x) on [0, 16], in 2^-16."""
+"""Table of exp(-x) on [0, 16], in 2^-16."""
 LOG1P_EXP = _table(lambda x: math.log1p(math.exp(-x)), 16.0)
-"""log(1 + exp(-x)) on [0, 16], in 2^-16."""
+"""Table of log(1 + exp(-x)) on [0, 16], in 2^-16."""
 NORMAL = _table(lambda x: 0.5 * (1.0 + math.erf(x / math.sqrt(2.0))), 8.0)
-"""Cumulated normal distribution on [0, 8], in 2^-16."""
+"""Table of the cumulative normal distribution on [0, 8], in 2^-16."""
 
 
 def look_up(table: NDArray[np.uint16], x: Fixed, step: int) -> Fixed:

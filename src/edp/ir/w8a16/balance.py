@@ -15,9 +15,9 @@ from edp.ir.layers import Dense, Gather, TreeSums
 def balanced(graph: Graph) -> Graph:
     """Return an equivalent network with larger leaves if trees have larger weights than other inputs of a layer.
 
-    The 8-bit weights of an output share one scale: beside a weight of 1 for the trees those of a linear model, a few
-    hundredths, would keep two or three bits. Leaves are multiplied by a power of two and the weights divided by it,
-    which no number of single precision notices. A second call changes nothing.
+    The 8-bit weights of an output have a common scale. With a weight of 1 for the trees, the weights of a linear model
+    (a few hundredths) would keep only two or three bits. Leaves are multiplied by a power of two and the weights
+    divided by it, which is exact in single precision. A second call changes nothing.
     """
     changed = {layer.name: layer for layer in graph.layers}
     for layer in graph.layers:

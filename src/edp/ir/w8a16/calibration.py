@@ -21,7 +21,7 @@ from edp.ir.w8a16.quantise import Formats, formats, quantise, weights_of
 
 # 500 ticks are 5 s at 100 Hz: longer than the networks remember, so that a piece shows steady values.
 PIECE = 500
-"""Ticks of a piece, from reset."""
+"""Length of a calibration segment in samples; each segment starts from reset."""
 # Errors of neighbouring formats are noisy; one finer format without gain is no sign of the end.
 PATIENCE = 2
 
@@ -34,17 +34,17 @@ def calibrate(
 ) -> Formats:
     """Choose formats of all values and 8-bit weights from recordings.
 
-    What is computed before the first weights is seen at every tick, since clipped inputs cost most; the rest on
-    segments of `PIECE` ticks spread evenly over all recordings. All inputs share one format: where a few of them are
-    very large at rare moments (derivatives), a finer one that clips these may cost less than a coarse one costs the
-    others.
+    Values before the first weights are calibrated on all samples, since clipped inputs cause the largest errors; all
+    other values are calibrated on segments of `PIECE` samples spread evenly over all recordings. All inputs have one
+    format. If a few inputs (derivatives) are very large at rare times, a finer format that clips them may cause smaller
+    errors than a coarse format.
 
     Args:
         graph: the float network.
         recordings: inputs ``(time, input)`` in SI units, of the training part.
-        ticks: about how many of them run through the whole network.
-        error_of: the network's error when its standardised inputs have so many fractional bits and the others are as
-            they were; None keeps the format in which nothing is clipped.
+        ticks: approximate number of samples that run through the whole network.
+        error_of: function that returns the network's error for a number of fractional bits of the standardised inputs;
+            None selects the format without clipping.
 
     Raises:
         ExportError: a part of the network has no integer form.
@@ -109,7 +109,7 @@ def _follow(graph: Graph, rows: NDArray[np.floating], ranges: dict[str, float]) 
         _raise(ranges, name, value)
     for layer in graph.layers:
         if isinstance(layer, Rotation):
-            # Its value is its state, which has a format of its own.
+            # The value of the layer is its state, which has a separate format.
             _raise(ranges, f"{layer.name}/h", values[layer.name])
     return values
 

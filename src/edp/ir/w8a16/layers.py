@@ -237,8 +237,8 @@ class QGroupedDense(_Weighted):
 class QTreeSums(FixedLayer):
     """Sums of trees: `feature` and `threshold` ``(output, tree, node)``, `leaf` ``(output, tree, leaf)``.
 
-    Thresholds have the format of the input, rounded down: ``q > threshold`` is what ``q 2^-frac`` says of the real one.
-    The sum of the leaves is shifted right by `right`.
+    Thresholds have the format of the input, rounded down, so ``q > threshold`` equals the comparison of ``q 2^-frac``
+    with the real threshold. The sum of the leaves is shifted right by `right`.
     """
 
     feature: Indices

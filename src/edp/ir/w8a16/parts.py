@@ -17,7 +17,7 @@ def integer_part(graph: Graph) -> set[str]:
     for layer in graph.layers:
         if isinstance(layer, layers.Standardise) or scaled & set(layer.inputs):
             scaled.add(layer.name)
-    # Backwards: what no weights read any more is cheap and stays in single precision.
+    # Go backwards: layers whose values are not read by weights are cheap and stay in single precision.
     for layer in reversed(graph.layers):
         if layer.macs or layer.name in before:
             before |= set(layer.inputs) | {layer.name}

@@ -25,9 +25,9 @@ from edp.ir.w8a16.rounding import WeightRounding
 from edp.ir.w8a16.rows import halves, rows, to_gates
 
 Ranges = Mapping[str, float]
-"""Largest magnitude of each value, and of each slot as ``layer/slot``."""
+"""Largest magnitude of each value, and of each memory slot as ``layer/slot``."""
 ADVICE = "export in float32"
-"""For a layer without an integer form that gives no advice of its own."""
+"""Advice in the error message for a layer without an integer form and without its own advice."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Formats:
 
     Attributes:
         fracs: fractional bits by value of the float graph; slots with their own format are named ``layer/slot``.
-        weights: 8-bit weights by matrix; those that are left out are rounded to the nearest.
+        weights: 8-bit weights by matrix; missing matrices are rounded to the nearest.
     """
 
     fracs: Mapping[str, int]
@@ -60,10 +60,10 @@ class _Work:
     fracs: Mapping[str, int]
     rounding: WeightRounding
     integer_fracs: dict[str, int]
-    """Fractional bits of values that are integers by now."""
+    """Number of fractional bits of each value that is already an integer."""
     out: list[Layer]
     slots: dict[tuple[str, str], int]
-    """Fractional bits of slots."""
+    """Number of fractional bits of each memory slot."""
 
     def rows(self, layer: Any, input_frac: int) -> dict[str, Any]:
         """Return the integer weights and biases of a layer."""
@@ -153,7 +153,7 @@ def quantise(graph: Graph, chosen: Formats, moments: Mapping[str, NDArray[np.flo
 def outline(graph: Graph) -> Graph:
     """Return the structure of the W8A16 network: every constant has its shape and type, filled with zeros.
 
-    What a network takes of a controller depends on no number, so neither training nor recordings are needed.
+    The resources on a controller do not depend on the weights, so neither training nor recordings are needed.
 
     Raises:
         ExportError: a kind of layer that has no integer form.
@@ -371,4 +371,4 @@ LOWER: dict[type[Layer], Lower] = {
     memory.TrailingMean: _mean,
     memory.AttentionPool: _pool,
 }
-"""By kind of layer that has an integer form."""
+"""Functions that convert a layer to integer arithmetic, by kind of layer."""

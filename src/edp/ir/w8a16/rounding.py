@@ -17,7 +17,7 @@ from edp.ir.w8a16 import arithmetic as fixed
 
 Array = NDArray[np.floating]
 DAMPING = 0.01
-"""Share of the mean diagonal that is added to ``H``: inputs that hardly move must not be given large weights."""
+"""Fraction of the mean diagonal that is added to ``H``. It prevents large weights for inputs that hardly change."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class WeightRounding:
 
     Attributes:
         weights: integers found before, by matrix.
-        moments: mean ``x x'`` of what a matrix is multiplied by, ``(terms, terms)``, or ``(row, terms, terms)`` where
-            each row has its own input.
+        moments: mean ``x x'`` of a matrix's inputs x, ``(terms, terms)``, or ``(row, terms, terms)`` if each row has
+            its own input.
     """
 
     weights: Mapping[str, NDArray[np.int8]] = field(default_factory=dict)

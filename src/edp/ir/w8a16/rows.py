@@ -14,9 +14,11 @@ from edp.wording import typed
 
 Array = NDArray[np.floating]
 COARSER = 1.02
-"""More than a sum needs to fit: weights of least error are a little larger in sum than the nearest ones."""
+"""Safety factor of the scale at which a row's sum fits the accumulator. Weights of least error have a slightly larger
+sum than rounded weights."""
 MAX_COARSE = 4.0
-"""Times its own scale that a row may take, two bits of its weights; beyond, the network is refused."""
+"""Maximum factor by which the scale of a row may grow, a loss of two bits of its weights. A network that needs more is
+rejected."""
 
 
 def rows(
@@ -25,7 +27,7 @@ def rows(
     """Return the weights ``(..., out, terms ...)``, biases ``(..., out)``, and the way from accumulators to `frac`.
 
     Args:
-        matrix: its name.
+        matrix: name of the matrix.
         weight: first dimensions as `bias`, the others are summed over.
         bias: one for each output.
         formats: fractional bits of the input and of the output.
@@ -75,7 +77,7 @@ def halves(gain: Array, most: int = 30) -> tuple[NDArray[np.int16], int]:
 
 def _check(name: str, weight: NDArray[np.int8], bias: Array) -> None:
     terms = tuple(range(bias.ndim, weight.ndim))
-    # The worst case over all inputs, since a sum that wraps around would be silent on the controller.
+    # Use the worst case over all inputs, since an overflow of the sum is not detected on the controller.
     sums = np.abs(weight.astype(np.int64)).sum(axis=terms) * fixed.LARGEST + np.abs(bias)
     worst = float(sums.max())
     if worst > fixed.ACCUMULATOR:

@@ -33,12 +33,12 @@ class BlockSlot(StrEnum):
 
 
 OUTPUT_SLOTS = (BlockSlot.GATE, BlockSlot.MIX, BlockSlot.BYPASS)
-"""Slots behind the backbone: every network has them."""
+"""Block positions after the backbone, which exist in every network."""
 SHARED_SLOTS = (BlockSlot.CHANNELS, BlockSlot.FEATURES)
-"""Slots that take several blocks, in the order given; the others take one."""
+"""Block positions that accept several blocks, applied in the listed order. All other positions accept one block."""
 
 BranchMaker = Callable[[int], Streaming]
-"""Builds one convolution stack whose first dilation is the argument."""
+"""Function that builds one convolution stack from its first dilation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class OutputSpace:
         features: scaled features.
         horizons: look-ahead times.
         outputs: targets.
-        present: for each target, the feature with its present value; None if it is not measured.
+        present: index of the feature with the present value of each target; None if the target is not measured.
         gain: ``(horizon, output)``; a present value in the standardised space of its target is its scaled feature
             times `gain` plus `shift`.
         shift: ``(horizon, output)``.

@@ -18,10 +18,11 @@ from torch.autograd.function import once_differentiable
 EPSILON = 1e-5  # in the variance of layer norm
 
 Shares = tuple[Tensor, Tensor] | float
-"""Fraction of the new h and c: draws of 0 and 1, ``(time, batch, units)`` each, or one number."""
+"""Fractions of the new h and c that an LSTM with zoneout takes: arrays of 0 and 1, each ``(time, batch, units)``, or
+one number."""
 
 Norm = tuple[Tensor, Tensor, Tensor]
-"""Gain of the normalised ``U h``, gain and shift of the normalised c."""
+"""Layer normalisation of an LSTM: gain of the normalised ``U h``, gain and shift of the normalised c."""
 
 
 def output_first(weight: Tensor) -> Tensor:
@@ -39,12 +40,13 @@ def lstm_steps(
     """Run ``c~ = f c + i g``, ``h~ = o tanh(c~)`` over time, gates in the order o, i, f, g.
 
     Args:
-        projected: ``(time, batch, 4 units)``, the input's part of the pre-activations, with all that is added.
+        projected: input part of the pre-activations, including all biases, ``(time, batch, 4 units)``.
         recurrent: ``(4 units, units)``.
         norm: layer normalisation, optional: ``U h`` is normalised and multiplied by ``(4 units,)``; ``tanh`` acts on c
             after normalisation, multiplication and addition of ``(units,)`` each.
         state: h and c, each ``(batch, units)``.
-        share: ``h = h_before + share (h~ - h_before)``, and likewise c; 1 without zoneout.
+        share: fraction of the new state, ``h = h_before + share (h~ - h_before)``, and equally for c; 1 without
+            zoneout.
 
     Returns:
         h at every tick, ``(time, batch, units)``, and (h, c) after the last.

@@ -51,7 +51,7 @@ class _Scan(torch.autograd.Function):
 
 
 def _run(a: Tensor, b: Tensor, start: Tensor, backwards: bool = False) -> Tensor:
-    """Return about ``2 sqrt(time)`` operations instead of one a tick.
+    """Compute the recurrence with about ``2 sqrt(time)`` operations instead of one per sample.
 
     Blocks of ``sqrt(time)`` ticks run side by side from zero, with the product of the factors kept; then the end of
     each block enters the next. Products only shrink where ``|a| < 1``, so nothing overflows.

@@ -19,9 +19,8 @@ class Prediction:
 
     Attributes:
         center: ``(batch, time, horizon, output)``: the prediction itself, a median or a mean.
-        spread: ``(batch, time, horizon, number, output)``: what it says about its own error. Nothing for a point
-            (no numbers); for quantiles the signed distance of each other level from the median; for a law the
-            logarithm of the variance.
+        spread: predicted uncertainty, ``(batch, time, horizon, number, output)``: empty for a point prediction; signed
+            distances of the other levels from the median for quantiles; logarithm of the variance for a distribution.
         levels: levels of the quantiles in `spread`, in order.
         law: distribution of the error, ``normal`` or ``laplace``, if `spread` is a variance.
     """
@@ -36,7 +35,7 @@ class LossSpec(Protocol):
     """Options of a main loss."""
 
     outputs: ClassVar[tuple[str, ...]]
-    """Kinds of output that it trains, names of `edp.networks.outputs.OUTPUTS`."""
+    """Names of the output kinds in `edp.networks.outputs.OUTPUTS` that this loss can train."""
 
     def evaluate(self, answer: Prediction, target: Tensor) -> Tensor:
         """Return the loss of each prediction, ``(batch, time, horizon, output)``.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from edp.networks.losses.terms import TERMS, Course, check_weight
 
-FLOOR = 1e-8  # of a variance, in squared standard deviations: what does not move has no correlation
+FLOOR = 1e-8  # minimum variance, in squared standard deviations: a constant signal has no correlation
 
 
 @TERMS.register("correlation")

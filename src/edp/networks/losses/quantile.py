@@ -16,7 +16,7 @@ from edp.networks.losses.base import LOSSES, QUANTILES, Prediction
 class Quantile:
     """Pinball loss, mean over the levels of the model's output: ``2 max(p u, (p - 1) u)``, u = target - quantile.
 
-    Twice the pinball loss, so that the median's share is the absolute error.
+    The factor 2 makes the contribution of the median equal to the absolute error.
     """
 
     outputs: ClassVar[tuple[str, ...]] = (QUANTILES,)

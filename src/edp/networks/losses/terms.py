@@ -19,8 +19,8 @@ class Course:
     Attributes:
         predicted: ``(stream, time, horizon, output)``, as the network's standardised output.
         target: targets, same shape and unit.
-        level: ``(stream, time, 1 or horizon, output)``: what both are counted from, the present value in delta mode;
-            zero in absolute mode. ``predicted + level`` is the prediction of the value itself.
+        level: reference value of predictions and targets, ``(stream, time, 1 or horizon, output)``: the present value
+            in delta mode, zero in absolute mode. ``predicted + level`` is the predicted value itself.
         valid: ``(stream, time)``; ticks that count.
     """
 
@@ -43,7 +43,7 @@ class TermSpec(Protocol):
 
     weight: float
     span: ClassVar[int]
-    """Consecutive predictions that it compares."""
+    """Number of consecutive predictions that the term compares."""
 
     def evaluate(self, course: Course) -> Tensor:
         """Return the unweighted term, a mean over the compared elements; zero without compared elements."""

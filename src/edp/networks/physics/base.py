@@ -23,19 +23,20 @@ from edp.registry import Registry
 
 PHYSICS: Registry[type] = Registry("physics base")
 SPEEDS = tuple(f"CylVels_{i + 1}" for i in range(AXES))
-"""Targets that a physics base predicts."""
+"""Names of the targets that a physics base predicts: the cylinder velocities."""
 HEADS = tuple(f"CylPressures_{i + 1}" for i in range(AXES))
 RODS = tuple(f"CylPressures_{i + 5}" for i in range(AXES))
 ANGLE, RATE, SPEED = 0.5, 0.5, 0.2
-"""Usual widths of joint angles in rad, joint rates in rad/s and cylinder velocities in m/s."""
+"""Half-widths of the usual ranges of joint angles (rad), joint rates (rad/s) and cylinder velocities (m/s)."""
 PRESSURE = (1e7, 5e6)
-"""Usual middle and width of a pressure, Pa."""
+"""Middle and half-width of the usual pressure range, Pa."""
 POSES = {
     # own.
     "angles": (*(f"JointAngle_{i + 1}" for i in range(AXES)), *(f"JointVel_{i + 1}" for i in range(AXES))),
     "strokes": tuple(f"CylStroke_{i + 1}" for i in range(AXES)),
 }
-"""Channels that tell the pose and its rate: relative joint angles and rates, or cylinder strokes from closed."""
+"""Channels that contain the pose and its rate: relative joint angles and rates, or cylinder strokes from the closed
+end."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +106,8 @@ class PhysicsBase(Streaming):
     """Inputs ``(batch, time, input)`` in SI units to velocities ``(batch, time, horizon, target)`` in m/s.
 
     `is_velocity` is 1 for the targets that are cylinder velocities and 0 for others, which the base does not predict.
-    State: the strokes of the tick before and whether there was one, where strokes tell the pose; else none.
+    The state contains the previous strokes and a flag for them if the pose comes from strokes; otherwise there is no
+    state.
     """
 
     is_velocity: Tensor
@@ -212,7 +214,7 @@ class PhysicsBase(Streaming):
             return build.join("ahead", velocities.value)  # type: ignore[attr-defined]
 
     def costs(self) -> list[Cost]:
-        # Arithmetic of the pose itself, held to a trace of what runs by `edp.evaluation.mac_check`.
+        # Number of operations for the pose, verified against a trace by `edp.evaluation.mac_check`.
         count = (52 if self.spec.pose == "angles" else 101) + AXES + self.arithmetic()
         width = len(self.task.horizons) * len(self.task.targets)
         return [

@@ -14,7 +14,7 @@ from edp.networks.physics.dynamic import Dynamic, DynamicSpec
 from edp.networks.physics.geometry import AXES, Pose, inverse
 
 BLOCK = 65_536
-"""Ticks taken at a time when averaging."""
+"""Number of samples per block when averages are computed."""
 
 
 @PHYSICS.register("force")

@@ -18,21 +18,21 @@ AXIS_NUMBERS = (
     "LENGTH", "MASS", "COM_X", "COM_Y", "INERTIA", "HEAD_AREA", "ROD_AREA", "CLOSED", "STROKE",
     "COULOMB", "STATIC", "STRIBECK", "VISCOUS",
 )  # fmt: skip
-"""Per cylinder, SI units, by their names in `edp.sim.machine.layout`."""
+"""Names of the parameters per cylinder, as in `edp.sim.machine.layout`, SI units."""
 PLANT_NUMBERS = (
     "GRAVITY", "BOOM_BASE", "BOOM_ROD", "BOOM_COS", "BOOM_SIN", "ARM_BASE", "ARM_ROD", "ARM_COS", "ARM_SIN",
     "PIVOT_X", "PIVOT_Y", "PIN_X", "ROCKER", "LINK", "LUG_X", "LUG_Y", "CYLINDER_X", "CYLINDER_Y",
 )  # fmt: skip
 SIDES = ("ROCKER_SIDE", "LINK_SIDE")
-"""Side of the line between the centres on which two circles intersect, +1 or -1, if strokes define the bucket's
-pose."""
+"""Names of two parameters with the values +1 or -1. Each selects one of the two intersections of circles that give the
+bucket's pose from a stroke."""
 SMALL = 1e-12
 LEAST = 1e-6
 """Minimum squared lever arm in a denominator, m^2/rad^2. No cylinder works at a millimetre per radian."""
 TURN = 1e-2
-"""Half of the angle in rad over which the change of a lever arm is taken; its error is some 1e-4 of the change."""
+"""Half of the angle step for the numerical derivative of a lever arm, rad. The relative error is about 1e-4."""
 GRID = 9
-"""Strokes per cylinder, end to end, over which quantities are averaged before there are data."""
+"""Number of strokes per cylinder, from end to end, for averages before data are available."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from edp.networks.physics.dynamic import Dynamic, DynamicSpec
 from edp.networks.physics.geometry import AXES, Pose
 
 HELD = 1e3
-"""Factor of its own inertia that holds an axis at standstill."""
+"""Factor by which the inertia of an axis is increased while dry friction holds the axis at standstill."""
 
 
 @PHYSICS.register("hybrid")
@@ -24,8 +24,8 @@ class HybridPhysicsSpec(DynamicSpec):
     """`z = J(q) q' + F k dt / M(q)` with the mass of the present pose (eq. 3.9).
 
     Attributes:
-        coupled: solve the whole equation of motion, in which axes push each other, instead of dividing each force by
-            its own M_ii / J_i^2 (the thesis); needs ``load = "all"``.
+        coupled: whether to solve the complete coupled equation of motion instead of dividing each force by its own M_ii
+            / J_i^2 (the thesis); requires ``load = "all"``.
 
     Raises:
         ConfigError: coupled without the whole load.

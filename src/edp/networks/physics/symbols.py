@@ -21,7 +21,7 @@ class Symbol:
     It stands where equations expect a tensor ``(batch, time, ...)``, without batch and time. Comparisons give 1 or 0.
 
     Args:
-        build: takes the layers.
+        build: builder of the layer graph.
         value: name of the value in the graph.
         shape: shape of the values; the last dimension is contiguous.
     """
@@ -258,4 +258,4 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "zeros_like": lambda a: torch.zeros(a.shape),
     "stack": stack,
 }
-"""Torch's functions by name."""
+"""PyTorch functions by name, for recording equations as layers."""

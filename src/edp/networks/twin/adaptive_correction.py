@@ -14,30 +14,30 @@ from edp.networks.twin.adaptive_twin import REST, AdaptiveTwin
 Array = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 JUDGED_S = 10.0
-"""Seconds of motion over which errors of both are averaged, and before which nothing is moved."""
+"""Time of motion over which the errors with and without correction are averaged, s. The correction is zero before."""
 
 
 class TunedCorrection:
     """Moves predictions towards the forecasts of a grey box that follows the machine.
 
-    With y what the network predicted, f what the grey box forecast, and e their errors, known when a prediction comes
-    due and averaged over the last `JUDGED_S` of motion, the prediction becomes ``y + w (f - y)`` with the weight of the
-    least squared error of such a mixture::
+    Let y be the network's prediction, f the grey box's forecast, and e their errors, which are known when a prediction
+    comes due and are averaged over the last `JUDGED_S` of motion. The corrected prediction is ``y + w (f - y)`` with
+    the weight that minimises the squared error::
 
         w = (mean e_y^2 - mean e_y e_f) / (mean e_y^2 + mean e_f^2 - 2 mean e_y e_f), within 0 and 1
 
-    for each horizon and target; by at most `limit`. A grey box that is worse, and whose errors say nothing of the
-    network's, has the weight 0: then predictions go out as they came.
+    for each horizon and target. The correction is at most `limit`. A grey box with larger, uncorrelated errors has the
+    weight 0, so predictions are unchanged.
 
     Args:
-        tuned: the grey box; the correction feeds it.
+        tuned: grey box that is updated by the correction.
         targets: names of the predicted channels, velocities of the twin.
-        horizons: ticks ahead.
+        horizons: horizons in samples.
         limit: largest correction ``(horizon, target)``, SI units.
 
     Attributes:
         weight: w ``(horizon, target)``.
-        columns: velocity of the twin that each target is.
+        columns: index of the twin's velocity for each target.
         limit: largest correction ``(horizon, target)``, SI units.
 
     Raises:
@@ -81,7 +81,8 @@ class TunedCorrection:
         Args:
             command: commands of the twin ``(command,)``; a missing value stops the correction.
             measured: measured outputs of the twin ``(output,)``, NaN for a missing sensor.
-            prediction: the network's ``(horizon, target)``, SI units; as it is where it is not finite.
+            prediction: prediction of the network ``(horizon, target)``, SI units; values that are not finite are
+                returned unchanged.
             oil_c: temperature of the oil (degC); NaN: not measured.
         """
         if not np.isfinite(command).all():

@@ -9,9 +9,9 @@ covariance::
     P = (P^-1 + S' S / n)^-1,  x = x + P S' clip(e) / n,   n ticks of the segment, whose errors count as one tick's
     x = a x,  P = a^2 P + (1 - a^2) prior,                 a = exp(-learn_ticks / forgetting)
 
-which is a Kalman filter on numbers that fade to what they were. Forces that no number stands for, as those of soil, are
-estimated tick by tick (`DisturbanceObserver`). A forecast runs from the observer's state with the numbers and forces of
-now.
+which is a Kalman filter on parameters that decay to their initial values. Forces without a parameter, such as soil
+forces, are estimated in each sample (`DisturbanceObserver`). A forecast runs from the observer's state with the current
+parameters and forces.
 """
 
 from __future__ import annotations
@@ -36,29 +36,29 @@ Doubles = NDArray[np.float64]
 STEP = 0.02
 """Relative step of a group to determine its effect: large compared with rounding, small compared with curvature."""
 CLIP = 3.0
-"""Units beyond which an error teaches no more."""
+"""Error in scaled units at which errors are clipped, so that outliers do not change the parameters more."""
 BOUND = 3.0
-"""Groups are held within so many prior deviations."""
+"""Maximum change of a parameter group, in prior standard deviations."""
 LEAST = 1e-3
-"""Minimum error, as a fraction of the velocity spread, below which nothing is adapted."""
+"""Minimum error for adaptation, as a fraction of the velocity's standard deviation."""
 LATELY = 30
-"""Stretches over which errors are averaged."""
+"""Number of recent segments over which errors are averaged."""
 HOTTEST_C = 150.0
-"""Maximum oil temperature, degC. A thermometer that reads more is broken."""
+"""Maximum plausible oil temperature, degC. A higher reading counts as a sensor fault."""
 WARMER = 0.02
-"""Change of a logarithm by temperature from which numbers are made again: about a kelvin."""
+"""Change of a parameter's logarithm with temperature at which the parameters are computed again: about one kelvin."""
 REST = 1e-3
-"""Speed (m/s or rad/s) below which a segment tells nothing of valves and friction."""
+"""Minimum speed (m/s or rad/s) of a segment that identifies valves and friction."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class NumberGroup:
-    """Numbers of a grey box that grow and shrink together.
+    """Parameters of a grey box that are scaled by a common factor.
 
     Attributes:
-        powers: for each prefix of parameter names, the power of the group's factor that multiplies these parameters.
-        deviation: prior deviation of the logarithm of the factor.
-        shared: one group for the machine; else one for each actuator, its valves included.
+        powers: power of the group's factor that multiplies the parameters of a name prefix, by prefix.
+        deviation: prior standard deviation of the logarithm of the factor.
+        shared: whether all actuators share one group; otherwise each actuator has a group that includes its valves.
         per_kelvin: change of the logarithm per kelvin of oil temperature, if that is measured.
     """
 
@@ -85,11 +85,11 @@ class TunedSpec:
     Attributes:
         groups: names in `NUMBER_GROUPS` of the groups to adapt.
         learn_ticks: length of a segment that is run again.
-        forgetting_s: seconds of motion after which what was learned has 1/e of its weight.
+        forgetting_s: time constant of forgetting, in seconds of motion.
         gain: gain of the observer, as a fraction of the innovation.
         load_share: fraction of a new force that the estimate adopts per sample; 0 to estimate no forces.
-        oil_c: temperature of the oil (degC) in the logs to which the twin was fitted, for ticks that tell theirs; NaN:
-            not known.
+        oil_c: oil temperature (degC) in the recordings of the twin's fit, for samples with a measured oil temperature;
+            NaN if unknown.
 
     Raises:
         ConfigError: a value out of range or a group that does not exist.
@@ -151,13 +151,13 @@ class AdaptiveTwin:
 
     Attributes:
         labels: labels of the groups.
-        moves: powers by which each number grows with each group's factor ``(number, group)``.
-        deviation: prior, of the logarithms of the factors ``(group,)``.
-        warmth: their change by a kelvin ``(group,)``.
-        logs: logarithms of the groups' factors, less `by_oil` ``(group,)``; 0 where nothing has changed.
+        moves: power of each group's factor in each parameter ``(number, group)``.
+        deviation: prior standard deviation of the factors' logarithms ``(group,)``.
+        warmth: change of the factors' logarithms per kelvin of oil temperature ``(group,)``.
+        logs: logarithms of the groups' factors without the part `by_oil` ``(group,)``; 0 for unchanged parameters.
         by_oil: factor of the oil temperature for each group ``(group,)``.
-        learn: False freezes them.
-        learned: segments that have taught.
+        learn: whether the factors are adapted; False keeps them constant.
+        learned: number of segments used for adaptation.
 
     Raises:
         ConfigError: a twin that is no grey box, or a group that it has no number of.
@@ -211,9 +211,10 @@ class AdaptiveTwin:
         """Process one sample.
 
         Args:
-            command: ``(command,)``; one that is missing interrupts, since nothing is known of what moves then.
+            command: commands, shape ``(command,)``. A missing command interrupts the segment, because the motion is
+                then unknown.
             measured: ``(output,)``, NaN where a sensor is missing: that port runs free.
-            oil_c: temperature of the oil (degC); NaN, or beyond what oil can have: not measured.
+            oil_c: oil temperature (degC); NaN or an implausible value counts as not measured.
         """
         self._warm(oil_c)
         if not np.isfinite(command).all():
@@ -261,7 +262,7 @@ class AdaptiveTwin:
 
     def _port(self, state: TwinState, measured: Array) -> Array:
         own = np.asarray(state["answer"][0], np.float32)
-        # Without a measurement the difference is NaN, which is what leaves a port free.
+        # Without a measurement the difference is NaN, which marks a free port.
         return np.asarray(own + np.float32(self.spec.gain) * (measured - own), dtype=np.float32)
 
     def _take(self, measured: Array) -> None:

@@ -21,17 +21,19 @@ from edp.settings.bounds import MOST_TICKS, integer
 from edp.wording import typed
 
 TwinState = dict[str, Array]
-"""All that a twin remembers, by name; the first dimension is the batch. ``answer`` is what its free ports read next."""
+"""State of a twin by name; the first dimension is the batch. ``answer`` contains the values that free ports read next.
+"""
 PREFIX = integer(1, MOST_TICKS)
 BEYOND = 0.05
-"""Fraction of a stroke by which a measured start may lie beyond an end stop, for noise and play."""
+"""Fraction of the stroke by which a measured start may exceed an end stop, to allow for noise and play."""
 
 
 class Twin(ABC):
-    """A causal map from commands and feedback to the state of the machine one tick later.
+    """Causal map from commands and feedback to the state of the machine one sample later.
 
-    Every output is a *feedback port*: at each tick it reads what was measured, or where nothing was measured (NaN)
-    its own last output. Measured mode (a filter), free mode (a plant model) and any mixture are the same numbers::
+    Every output is a *feedback port*. In each sample it reads the measured value, or its own last output if the
+    measurement is missing (NaN). The same weights act as a filter (all measured), a plant model (none measured) or a
+    mixture::
 
         state = twin.reset(commands[:, :50], measured[:, :50])
         outputs, state = twin.rollout(commands[:, 50:], state)  # outputs[:, t] is the machine after commands[:, 50 + t]
@@ -42,7 +44,7 @@ class Twin(ABC):
     Attributes:
         channels: commands and outputs.
         scales: scales of the network, and bounds of the outputs.
-        prefix_ticks: least number of measured ticks before a free run.
+        prefix_ticks: minimum number of measured samples before a free-run simulation.
     """
 
     def __init__(self, channels: TwinChannels, scales: TwinScales, prefix_ticks: int) -> None:
@@ -64,7 +66,7 @@ class Twin(ABC):
         """Add the twin's own layers: scaled velocities and pressures before bounds.
 
         Args:
-            build: the layers in the making.
+            build: builder of the layer graph.
             commands: scaled ``(command,)``.
             fed: scaled feedback inputs ``(output,)``.
 
@@ -95,11 +97,11 @@ class Twin(ABC):
         """Return the state after a measured segment.
 
         Args:
-            commands: ``(batch, tick, command)``, at least `prefix_ticks` of them.
+            commands: commands of the prefix, ``(batch, tick, command)``, at least `prefix_ticks` samples.
             measured: ``(batch, tick, output)``; NaN where a sensor is missing, but not at the first tick.
 
         Raises:
-            DataError: too few ticks, a port about which nothing is known, or a start beyond an end stop.
+            DataError: too few samples, a port without any measurement, or a start beyond an end stop.
         """
         commands, measured = np.asarray(commands, np.float32), np.asarray(measured, np.float32)
         ticks = commands.shape[1] if commands.ndim == 3 else 0
@@ -117,7 +119,7 @@ class Twin(ABC):
 
         Args:
             command: ``(batch, command)``.
-            state: before it.
+            state: state of the twin before the command.
             measured: ``(batch, output)``, NaN where a port is free; None frees all.
 
         Returns:
@@ -132,7 +134,7 @@ class Twin(ABC):
 
         Args:
             commands: ``(batch, tick, command)``.
-            state: before the first tick.
+            state: state of the twin before the first sample.
             measured: ``(batch, tick, output)``, NaN where a port is free; None frees all.
 
         Returns:
@@ -163,10 +165,10 @@ class Twin(ABC):
         """Simulate variants of one run that equal the first run up to a given sample each, for a search over commands.
 
         Args:
-            commands: ``(run, tick, command)``, those of a run the first one's before it branches off.
+            commands: commands ``(run, tick, command)``; before a run branches off, they equal those of the first run.
             state: state of one machine, a batch of one.
             measured: feedback inputs at the first sample ``(output,)``, NaN for outputs that run free.
-            first: tick at which each run branches off the first one ``(run,)``, ascending, its own zero.
+            first: sample at which each run branches off the first run ``(run,)``, ascending; 0 for the first run.
 
         Returns:
             Outputs ``(run, tick, output)``.
@@ -199,7 +201,7 @@ class Twin(ABC):
 
         Args:
             feedback: feedback inputs ``(batch, output)``.
-            velocity: proposed velocities ``(batch, velocity)``; `pressure` likewise.
+            velocity: proposed velocities ``(batch, velocity)``.
             pressure: proposed pressures.
         """
         count, strokes = len(self.channels.velocities), len(self.channels.strokes)
@@ -252,13 +254,13 @@ class Twin(ABC):
 class TwinRunner:
     """Twin with fixed parameters for one machine sample by sample; constant data are prepared once.
 
-    Values are those of the twin's own methods but for rounding. A controller asks so a hundred times a second.
+    Results equal those of the twin's methods up to rounding. It is fast enough for a controller at 100 Hz.
 
     Args:
         twin: twin to run. Later changes of its parameters may or may not take effect.
 
     Attributes:
-        resistance: forces against each velocity (N, or N m) that the load does not know of; None where the twin's
+        resistance: additional force against each velocity (N, or N m) that is not part of the load; None if the twin's
             equations have no load.
     """
 
@@ -273,8 +275,8 @@ class TwinRunner:
     def neighbours(self, commands: Array, state: TwinState, measured: Array, first: NDArray[np.int64]) -> Array:
         """Return `branches` for commands near the commands of the first run, for the derivatives of a plan.
 
-        Where it is far cheaper, the load of the machine follows them to first order: the first run is exact, and what
-        the others differ from it by is small against what they move.
+        If this is much cheaper, the other runs are linearised: the first run is exact, and the others differ little
+            from it.
         """
         return self.branches(commands, state, measured, first)
 
@@ -283,7 +285,7 @@ class TwinRunner:
 
         Args:
             command: ``(command,)``, finite.
-            state: before it, a batch of one; it stays as it is.
+            state: state before the command, a batch of one; it is not changed.
             measured: ``(output,)``, NaN where a port is free.
         """
         return self.twin.step(command[None], state, measured[None])[1]
@@ -344,7 +346,7 @@ def starts_within(
     Raises:
         DataError: all of them lie beyond.
     """
-    # Starts within one stretch that would be the same tick are one run.
+    # Starts at the same sample of a segment count as one run.
     runs = [
         WindowStart(part, int(at))
         for part in series

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 Doubles = NDArray[np.float64]
 NOT_FINITE = 1e12
-"""Loss that stands for one that is not finite: greater than any that a fit can have."""
+"""Loss returned instead of a loss that is not finite. It is larger than any loss of a fit."""
 MIN_DAMPING, MAX_DAMPING = 1e-9, 1e9
-"""Bounds of the damping, which keep the linear system regular to rounding."""
+"""Bounds of the damping factor. They keep the linear system well-conditioned."""
 MIN_CURVATURE = 1e-12
-"""Curvature that damping is scaled by where neither data nor prior have any."""
+"""Minimum curvature that scales the damping, for coordinates without information from data or prior."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,8 @@ class NormalEquations:
 
 
 Problem = Callable[[Doubles, bool], NormalEquations]
-"""Normal equations of the data at coordinates ``(coordinate,)``; the losses alone if the flag is False."""
+"""Function that returns the normal equations of the data at coordinates ``(coordinate,)``, or only the losses if the
+flag is False."""
 
 
 @dataclass(frozen=True)

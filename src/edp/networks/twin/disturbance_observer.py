@@ -9,13 +9,15 @@ from edp.networks.twin.base import TwinRunner, TwinState
 
 Array = NDArray[np.float64]
 PROBE_N = 1e4
-"""Force step to determine the effect of a force on the velocities one sample later, N."""
+"""Force step for the numerical derivative of the next velocities by a force, N."""
 RENEWED_TICKS = 10
-"""Interval of renewing this effect, in samples. It depends on the pose and on the valve openings."""
+"""Interval at which the effect of a force on the velocities is computed again, in samples. The effect depends on the
+pose and on the valve openings."""
 LOG_SHARE = 0.3
-"""Fraction of a new error for forces along a log, which may be noisier than in a loop."""
+"""Fraction of a new error used for the force estimates along a recording, which may be noisier than in real-time
+operation."""
 MOST_N = 5e5
-"""Maximum estimate, N: about the holding force of a cylinder of a 22 t excavator."""
+"""Maximum magnitude of an estimated force, N: about the holding force of a cylinder of a 22 t excavator."""
 
 
 def force_slopes(
@@ -45,14 +47,14 @@ def force_slopes(
 
 
 class DisturbanceObserver:
-    """Resistance against each cylinder, from velocities one tick ahead.
+    """External force against each cylinder, estimated from one-step-ahead velocity errors.
 
-    In a tick chambers hardly give way, so that what a velocity differs by from what the model expects is a force on
-    what it moves. What the model knows wrongly of friction or gravity counts as one, too.
+    Within one sample the chambers are nearly incompressible, so a velocity error of the model is attributed to an
+    external force. Errors of the modelled friction or gravity are also attributed to this force.
 
     Args:
         runner: runner of a model with a load; the observer writes its `resistance`.
-        velocities: columns of its outputs, which begin with all velocities.
+        velocities: column indices of the velocities among the outputs; velocities are the first outputs.
         share: fraction of a new error that the estimate adopts per sample; 0 to switch the observer off.
     """
 

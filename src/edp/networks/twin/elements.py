@@ -28,7 +28,7 @@ from edp.networks.twin.scales import Array, TwinScales
 from edp.settings.bounds import MAX_UPDATES, check_bounds, check_count, integer, span
 
 PRIOR = 0.2
-"""Plausible deviation of a level that is not measured, as a share of the tank's height."""
+"""Prior standard deviation of an unmeasured tank level, as a fraction of the tank height."""
 
 
 @TWINS.register("elements")

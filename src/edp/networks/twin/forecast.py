@@ -4,9 +4,9 @@ The observer is Luenberger's with one gain. Before tick t every port reads
 
     z[t] = a[t] + g (m[t] - a[t])
 
-a the twin's own output for tick t, m what was measured; a missing measurement leaves the port free. From the state
-that this gives, the commands of tick t are held and the twin runs free: ``f[t, k]`` is its output for tick t + k. It
-reads nothing after tick t.
+with the twin's own output a for sample t and the measurement m; a missing measurement leaves the port free. From the
+resulting state, the twin runs free with the constant commands of sample t: ``f[t, k]`` is its output for sample t + k.
+It does not read any data after sample t.
 """
 
 from __future__ import annotations
@@ -26,11 +26,14 @@ GAINS = (1.0, 0.3, 0.1)
 simulated M22 predicts ten samples ahead with 0.78, 0.72 and 0.71 mm/s. ARX needs 1, since it reads its own past outputs
 as measurements."""
 CHOICE_LOGS, CHOICE_TICKS = 3, 1500
-"""Stretches and ticks of each on which a gain is chosen: thousands of moments settle errors to a few per cent."""
+"""Number of segments, and number of samples of each segment, on which an observer gain is selected. A few thousand
+samples determine the errors to a few per cent."""
 BLOCK, BLOCK_NUMBERS = 4096, 4_000_000
-"""Moments that look ahead at a time, and numbers of their runs: states of a few MB, runs of some tens of MB."""
+"""Maximum number of predictions computed at a time, and maximum number of values in these simulations. The states need
+a few MB, the simulations some tens of MB."""
 MOST_AHEAD = 1000
-"""Ticks: with the commands held nothing of a machine can be foretold for as long; each tick of a log runs so far."""
+"""Maximum prediction horizon in samples. Predictions assume constant commands, which is not useful over longer times.
+"""
 
 
 def check_horizons(horizons: Sequence[int]) -> None:
@@ -62,7 +65,7 @@ def choose_gain(twin: Twin, series: Sequence[Series], horizons: Sequence[int]) -
 
     Args:
         twin: any formulation.
-        series: inputs are commands, targets are what the twin outputs; the first ones are used.
+        series: segments with commands as inputs and twin outputs as targets; only the first segments are used.
         horizons: horizons in samples.
     """
     ends, parts = sorted({min(horizons), max(horizons)}), list(series)[:CHOICE_LOGS]
@@ -80,7 +83,7 @@ def choose_gain(twin: Twin, series: Sequence[Series], horizons: Sequence[int]) -
                 errors[row, at] += np.nansum(np.abs(apart))
     if not errors.any():
         return GAINS[0]
-    # Errors of near and far horizons differ by a factor: each is taken in shares of the best.
+    # Errors of short and long horizons differ by a factor, so each is divided by its best value.
     return GAINS[int(np.argmin((errors / errors.min(axis=0)).sum(axis=1)))]
 
 
@@ -117,7 +120,7 @@ def forecast(twin: Twin, commands: Array, measured: Array, horizons: Sequence[in
         states, ports = [], np.empty((block.stop - first, measured.shape[1]), np.float32)
         for row, t in enumerate(range(first, block.stop)):
             own = state["answer"][0]
-            # Without a measurement the difference is NaN, and so is the port, which is what leaves it free.
+            # Without a measurement the difference and the port are NaN, which marks a free port.
             ports[row] = own + np.float32(gain) * (measured[t] - own) if gain > 0.0 else np.nan
             states.append(state)
             state = runner.step(commands[t], state, ports[row])
@@ -132,7 +135,7 @@ def _begin(twin: Twin, measured: Array) -> int:
     """
     there = np.asarray(np.isfinite(measured).all(axis=1))
     possible = np.flatnonzero(there & twin.is_within_stops(np.where(there[:, None], measured, np.float32(0.0))))
-    # Where there is none, the reset at the first tick says what is wrong there.
+    # If there is none, the reset at the first sample raises the error.
     return int(possible[0]) if len(possible) and len(measured) - possible[0] >= twin.prefix_ticks else 0
 
 

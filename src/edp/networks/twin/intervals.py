@@ -15,7 +15,8 @@ from edp.storage.reading import Table
 
 Array = NDArray[np.float32]
 KNOTS_A_DECADE = 12
-"""Horizons of a decade at which widths are calibrated: neighbouring ticks of a run are nearly one tick."""
+"""Number of horizons per decade at which interval widths are calibrated. Errors at neighbouring samples are nearly
+equal."""
 TICKS = integer(1, MAX_ROWS)
 
 
@@ -27,7 +28,7 @@ class FreeRunIntervals:
     promise: it is kept up to the last knot only.
 
     Attributes:
-        coverage: share of runs that an interval is meant to hold at any horizon.
+        coverage: intended fraction of the runs within the interval, equal for all horizons.
         ticks: horizons of the knots, growing.
         half_width: ``(knot, output)``, SI units, never shrinking with the horizon.
         runs: free runs that calibrated them.
@@ -88,9 +89,9 @@ def calibrate(errors: Array, coverage: float) -> FreeRunIntervals:
     that is above 1. Widths are then made to grow with the horizon by isotonic regression.
 
     Args:
-        errors: of free runs ``(run, tick, output)``, SI units, tick 1 first; NaN behind the end of a run. At least one
-            run goes to the last tick.
-        coverage: share of runs that an interval is meant to hold.
+        errors: errors of free-run simulations ``(run, tick, output)``, SI units, tick 1 first; NaN after the end of a
+            run. At least one run reaches the last tick.
+        coverage: intended fraction of the runs within the interval.
     """
     # Here, since every command with a network imports this module, and scipy.optimize takes a second.
     from scipy.optimize import isotonic_regression

@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 
 ADD, MULTIPLY = BinaryOperation.ADD, BinaryOperation.MULTIPLY
 MEASURED = 0.5
-"""A flag above it means that a port reads what was measured."""
+"""Threshold of a port flag. A port reads the measured value if its flag is above the threshold."""
 
 
 def plant_graph(twin: Twin) -> Graph:
     """Return one sample of a twin as a graph, from SI inputs to SI outputs.
 
     Inputs are the commands, a measured value for each output, and a flag for each: 1 where the port reads what was
-    measured, 0 where it reads the last output. A measured value must be finite even where nobody reads it. After a
-    reset the plant rests at the means of its training data.
+    measured, 0 where it reads the last output. A measured value must be finite even if its port is free. After a reset
+    the plant starts in steady state at the means of its training data.
 
     Raises:
         ExportError: the formulation has no form as layers.
@@ -39,7 +39,7 @@ def plant_graph(twin: Twin) -> Graph:
         fed, last = _ports(build, twin, commands)
     answer = twin.lower_answers(build, command, fed)
     with build.inside("answers"):
-        # A map of the commands alone reads no port; an edge that leads nowhere would be memory for nothing.
+        # A map of the commands alone reads no port, so it needs no feedback edge.
         if any(fed in layer.inputs for layer in build.layers):
             build.add(Feed, "feed", answer, into=last)
         result = build.add(ScaleShift, "decoded", answer, gain=scales.answer_width, shift=scales.answer_offset)

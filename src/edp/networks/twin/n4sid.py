@@ -2,9 +2,10 @@
 
     x(t+1) = A x(t) + B [u(t); 1] + K e(t),   y(t) = C x(t) + e(t)
 
-The column space of the observability matrix is that of future outputs, freed from future commands, as far as the past
-tells them: PO-MOESP, with past commands and outputs as instruments (Verhaegen 1994; Van Overschee and De Moor 1996,
-ch. 2 to 4). The output to the command of tick t is the machine at t + 1, so nothing feeds through.
+The column space of the observability matrix is estimated from future outputs without the effect of future commands,
+    projected on the past: PO-MOESP, with past commands and outputs as instruments (Verhaegen 1994; Van Overschee and De
+    Moor 1996, ch. 2 to 4). The output for the command of sample t is the machine at t + 1, so there is no direct
+    feedthrough.
 """
 
 from __future__ import annotations
@@ -33,24 +34,26 @@ MAX_WINDOWS = 40_000
 """Maximum number of windows, evenly selected from long logs. Their factorisation takes seconds, and neighbouring
 windows are nearly equal."""
 CHUNK = 4096
-"""Windows that are factorised at once: bounds the memory."""
+"""Number of windows factorised at a time, which bounds the memory."""
 SLOWEST = 0.999
-"""Largest modulus of a pole: 10 s at 100 Hz. Slower ones are drifts that the strokes, which are integrals, have."""
+"""Maximum modulus of a pole, a time constant of 10 s at 100 Hz. Slower poles describe drift, which the integrated
+strokes already contain."""
 FARTHEST = 1e4
-"""Bound of a state, which is of the size of 1: whatever is commanded, outputs stay finite numbers."""
+"""Bound of a model state. States have a magnitude of about 1, and the bound keeps outputs finite for all commands."""
 STRETCHES, STRETCH_TICKS = 128, 150
-"""Stretches from which B is solved, each with an own start, and their length."""
+"""Number of segments from which B is computed, each with its own initial state, and their length in samples."""
 JUDGED_S, JUDGED_EACH = 10.0, 4
-"""Length of the free runs that choose the order, and how many there are in a recording."""
+"""Length (s) of the free-run simulations that select the order, and number of simulations per recording."""
 KEPT_BACK = 5
-"""Every fifth recording is kept back from the models whose orders compete."""
+"""Interval of the recordings that are held out to select the order: every fifth recording."""
 SMALL = 1e-9
-"""Fraction of the largest direction below which a direction counts as rounding."""
+"""Minimum singular value of a direction, as a fraction of the largest one. Smaller ones are rounding errors."""
 MIN_SHARE = 1e-4
-"""Fraction of the largest singular value below which a state counts as noise. Filters of such states amplify
-rounding."""
+"""Minimum singular value of a state, as a fraction of the largest one. Smaller ones are noise, which filters would
+amplify."""
 MIN_NOISE = 1e-2
-"""Minimum sensor noise, in standard deviations. On exact data a filter would trust one sample more than the model."""
+"""Minimum sensor noise, in standard deviations. On exact data a filter would follow each sample instead of the model.
+"""
 
 
 @TWINS.register("n4sid")
@@ -58,13 +61,13 @@ MIN_NOISE = 1e-2
 class N4sid:
     """Subspace identification of velocities and pressures with integrated strokes: a baseline of every twin.
 
-    The order is the one whose free runs on a fifth of the training recordings, kept back meanwhile, have the least
-    error; a single order is taken as it is. Poles outside the unit circle are reflected into it, and those slower than
-    a modulus of 0.999 are shrunk to it, so the model is stable. B is solved for by least squares on simulated
-    segments, K from the covariance of what is left by a Riccati equation.
+    The selected order has the smallest free-run error on a held-out fifth of the training recordings; a single order
+    needs no selection. Poles outside the unit circle are reflected into it, and those slower than a modulus of 0.999
+    are shrunk to it, so the model is stable. B is solved for by least squares on simulated segments, K from the
+    residual covariance by a Riccati equation.
 
     Attributes:
-        orders: numbers of states to choose from; those beyond what the rows of outputs can tell are cut to that.
+        orders: candidate numbers of states. Orders above the rank of the output rows are reduced to this rank.
         horizon: rows of past and of future, in ticks.
         prefix_ticks: measured ticks before a free run.
 
@@ -125,8 +128,8 @@ class N4sid:
 class N4sidTwin(Twin):
     """State: ``answer`` (outputs) in SI units, and ``states`` of the model ``(batch, order)``.
 
-    What a port reads corrects the states by the Kalman gain; a free port reads its own last output, which lies where
-    the model put it but for its bounds, and then corrects nothing.
+    A measured port corrects the states by the Kalman gain. A free port reads its own last output, which equals the
+    model's output except for bounds, so it does not correct the states.
     """
 
     def __init__(
@@ -181,7 +184,8 @@ class N4sidTwin(Twin):
 
 
 Pair = tuple[Doubles, Doubles]
-"""Commands, behind them a one, and solved outputs of a segment, scaled ``(tick, command + 1)``, ``(tick, output)``."""
+"""Commands followed by a one, and computed outputs of a segment, both scaled: ``(tick, command + 1)``, ``(tick,
+output)``."""
 
 
 def _append_ones(commands: Array) -> Doubles:
@@ -198,7 +202,8 @@ class _Projections:
     Attributes:
         horizon: rows of past and of future.
         pairs: the segments.
-        left: left singular vectors of what the past tells of the freed future ``(horizon * output, rank)``.
+        left: left singular vectors of the future outputs' projection on the past, without the effect of future
+            commands, ``(horizon * output, rank)``.
         sizes: their singular values.
         by_past: future outputs by past commands and outputs ``(horizon * output, horizon * (command + output))``.
     """
@@ -315,7 +320,7 @@ def _inputs_of(pairs: Sequence[Pair], a: Doubles, c: Doubles) -> Doubles:
         for t in range(length):
             rows[t] = c @ driven
             driven = a @ driven
-            # Plus the Kronecker product of a unit matrix and the command: state by state its own copy of it.
+            # Add the Kronecker product of a unit matrix and the command, one copy of the command per state.
             driven.reshape(order, order, commands)[own_state, own_state] += u[first + t]
         flat, goal = rows.reshape(length * answers, -1), y[first : first + length].reshape(-1)
         flat = flat - own @ (own.T @ flat)
@@ -333,7 +338,7 @@ def _gain(a: Doubles, c: Doubles, process: Doubles, output: Doubles) -> Doubles:
 
     rows = len(process)
     q, r, s = process.T @ process / rows, output.T @ output / rows, process.T @ output / rows
-    # Never singular: exact data leave no noise, and a filter of none is not defined.
+    # Add a minimum noise, because a Kalman filter without noise is undefined for exact data.
     q += SMALL * np.eye(len(q))
     r += MIN_NOISE**2 * np.eye(len(r))
     p = solve_discrete_are(a.T, c.T, q, r, s=s)

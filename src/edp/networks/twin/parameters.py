@@ -19,9 +19,9 @@ Doubles = NDArray[np.float64]
 NORMAL = 1.96
 """Half-width of a 95 % confidence interval of a normal distribution in standard deviations."""
 UNEXCITED = 0.7
-"""Fraction of the prior standard deviation. If the data leave more of it, they say little about a parameter."""
+"""Posterior standard deviation, as a fraction of the prior's, above which the data do not identify a parameter."""
 FARTHEST = 12.0
-"""Largest change of a positive parameter in prior standard deviations of its logarithm."""
+"""Maximum change of a positive parameter, in prior standard deviations of its logarithm."""
 TEXT_NAME = "datasheet.txt"
 
 
@@ -31,7 +31,7 @@ class Parameter:
 
     Attributes:
         element: element of the model that the parameter belongs to.
-        name: what the parameter is.
+        name: name of the parameter within its element.
         unit: SI unit of the value times `factor`.
         factor: SI value of one unit of the model.
         nominal: mean of the prior, from which a fit starts, in units of the model.
@@ -62,7 +62,7 @@ class Parameter:
         Args:
             value: fitted value in units of the model.
             deviation: posterior standard deviation as a fraction of the prior's.
-            excited: whether the data say anything about the parameter.
+            excited: whether the data identify the parameter.
         """
         low, high = (float(end * self.factor) for end in interval(value, deviation * self.width, self.positive))
         return DatasheetRow(self.element, self.name, self.unit, float(value * self.factor), low, high, bool(excited))
@@ -163,12 +163,12 @@ class DatasheetRow:
 
     Attributes:
         element: element of the model.
-        name: what the parameter is.
+        name: name of the parameter within its element.
         unit: SI unit of the value.
         value: fitted value.
         low: lower end of an approximate 95 % interval.
         high: upper end.
-        excited: whether the data say anything about it; else the value is that of the prior.
+        excited: whether the data identify the parameter; otherwise the value is the prior mean.
     """
 
     element: str
@@ -197,7 +197,7 @@ class Datasheet(ResultFile):
     """Content of ``datasheet.json``: fitted parameters of a machine.
 
     Attributes:
-        basis: where the intervals come from.
+        basis: source of the intervals.
         numbers: rows in the order of the parameters.
     """
 

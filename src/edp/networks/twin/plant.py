@@ -33,12 +33,12 @@ FLAG = "_measured"
 class TwinPlant(Predictor):
     """Machine one sample later from commands, measured values and flags, in SI units; it cannot be trained.
 
-    In single precision it is the twin; in double precision its layers, which shows what they mean. After a reset it
-    rests at the means of the training data, so that a stream that was never measured starts somewhere.
+    In single precision it runs the twin itself, in double precision the twin's layer graph. After a reset it starts in
+    steady state at the means of the training data, so that a stream without measurements has an initial state.
 
     Args:
         twin: the plant model.
-        title: a line about it.
+        title: one-line description.
     """
 
     def __init__(self, twin: Twin, title: str) -> None:

@@ -24,12 +24,12 @@ from edp.networks.twin.steps import BranchResults, run_branches, run_forward
 from edp.settings.bounds import MAX_UNITS, check_bounds, integer
 
 PIECE = 256
-"""Ticks that a run without gradients keeps at once: the loop writes what only a backward run would read."""
+"""Number of samples per block of a simulation without gradients. Intermediate results are kept for one block only."""
 MAP = "map_"
-"""Prefix of the names of a static map's parameters within the twin."""
+"""Prefix for the names of the static map's parameters within the twin."""
 MAX_MEMBERS = 32
 MEMBER_SEED = 1000
-"""Seed increment between members, so that few runs share a seed."""
+"""Seed increment between members, chosen so that seeds of different runs rarely coincide."""
 
 
 @TWINS.register("recurrent")
@@ -37,14 +37,14 @@ MEMBER_SEED = 1000
 class Recurrent:
     """GRU with feedback ports, trained with the free-run error (`edp.training.free_run`).
 
-    Several members are networks that are trained apart; the twin outputs with the mean of their changes. As they read
-    the same ports, they are one network, whose weights between members are zero.
+    Several members are trained separately, and the twin outputs the mean of their changes. Since they read the same
+    ports, they form one network with zero weights between members.
 
     Attributes:
-        units: width of its memory, that of all members together.
+        units: total number of hidden units of all members.
         members: networks whose changes are averaged.
-        valve_map: whether velocities and pressures are also pulled to what a static map (`StaticMap`) says of the
-            commands; how strongly is learned. A twin that has learned nothing else is that map.
+        valve_map: whether velocities and pressures are also pulled to the outputs of a static map (`StaticMap`) of the
+            commands. The strength of the pull is trained. Without training, the twin equals the static map.
         prefix_ticks: measured ticks before a free run, in which its memory forms.
 
     Raises:
@@ -81,7 +81,7 @@ class Recurrent:
     def member(self, channels: TwinChannels, scales: TwinScales, static: StaticTwin | None, seed: int) -> RecurrentTwin:
         """Return one of its members, untrained, on a fitted map."""
         network = self.alone()._network(channels)
-        # Answers that start at no change at all make the first free runs stand still.
+        # Outputs that start at zero change would make the first free runs stand still.
         network.draw(seed, 0.1)
         return RecurrentTwin(channels, scales, self.prefix_ticks, network, static)
 
@@ -122,8 +122,8 @@ class RecurrentTwin(Twin):
     State: ``answer`` scaled, ``h`` ``(batch, units)``, and with a static map the ``commands`` of its delay.
 
     Args:
-        channels: what commands it and what it outputs.
-        scales: of its numbers, and the bounds of its outputs.
+        channels: commands and outputs of the twin.
+        scales: scales of commands and outputs, and bounds of the outputs.
         prefix_ticks: least number of measured ticks before a free run.
         network: the cell.
         static: the map to which its outputs are pulled; None where the network has no pull.
@@ -159,9 +159,9 @@ class RecurrentTwin(Twin):
         """Simulate scaled outputs ``(time, batch, output)`` from measured starts, with gradients by the weights.
 
         Args:
-            commands: what `drive` made of them ``(time, batch, number)``.
+            commands: result of `drive` ``(time, batch, number)``.
             measured: scaled ``(time, batch, output)``, any finite number where `port` is 0.
-            port: 1 where a port reads what was measured; all of the first tick.
+            port: 1 if a port reads the measured value, which is required in the first sample; else 0.
         """
         count = len(self.channels.commands)
         mapped = None if self.static is None else commands[..., count:]
@@ -204,7 +204,7 @@ class RecurrentTwin(Twin):
 
         Args:
             commands: SI units.
-            state: of one machine, that of all batch.
+            state: state of one machine, used for all runs.
         """
         if self.static is None:
             return np.zeros((0, 0, 0), np.float32), np.zeros((0, 0, 0), np.float32)
@@ -330,11 +330,11 @@ def member_seed(seed: int, which: int) -> int:
 def averaged(twins: Sequence[RecurrentTwin]) -> RecurrentTwin:
     """Return a twin whose state change is the mean of the state changes of equally wide twins.
 
-    All of them read the same ports, and what an output adds up from h is linear: so their mean is one network, whose
-    gates are theirs side by side and whose outputs have their weights over the number of twins.
+    All twins read the same ports, and the outputs are linear in h. The mean is therefore one network that contains the
+    gates of all twins in parallel; its output weights are those of the twins divided by their number.
 
     Args:
-        twins: at least one; none with a static map, or all, with the same corners and delay.
+        twins: at least one twin; all or none with a static map, and the maps with equal corners and delay.
     """
     first, count = twins[0], len(twins)
     if count == 1:
@@ -369,6 +369,6 @@ def _mean_map(twins: Sequence[RecurrentTwin]) -> StaticTwin | None:
     pulls = [np.zeros(0) if twin.network.pull is None else twin.network.pull.detach().numpy() for twin in twins]
     shares = np.clip(np.stack(pulls), 0.0, 1.0).astype(np.float64)
     total = shares.sum(axis=0)
-    # Where nobody is pulled the map is not heard, but its numbers must be some.
+    # Without any pull the map has no effect, but its parameters must be defined.
     weights = np.where(total > 0.0, shares / np.where(total > 0.0, total, 1.0), 1.0 / len(maps))
     return StaticTwin.mean(maps, weights.astype(np.float32))

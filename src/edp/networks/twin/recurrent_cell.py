@@ -52,15 +52,15 @@ class TwinNetwork(CellWeights):
     """Cell over scaled values, time first.
 
     Args:
-        commands: number of them.
-        answers: number of them.
+        commands: number of commands.
+        answers: number of outputs.
         units: width of the memory.
         pulled: outputs that a static map pulls, all but the strokes; 0 without a map.
     """
 
     def __init__(self, commands: int, answers: int, units: int, pulled: int = 0) -> None:
         super().__init__(commands, answers, answers, units)
-        # All the way in each tick: an untrained network leaves the map as it is.
+        # Start with full pull, so that an untrained network reproduces the static map.
         self.pull = nn.Parameter(torch.ones(pulled)) if pulled else None
 
     def forward(
@@ -77,10 +77,10 @@ class TwinNetwork(CellWeights):
         Args:
             commands: ``(time, batch, command)``.
             measured: ``(time, batch, output)``, any finite number where `port` is 0.
-            port: 1 where a port reads what was measured, 0 where it reads the last output.
+            port: 1 if a port reads the measured value, 0 if it reads the last output.
             start: last output ``(batch, output)`` and h ``(batch, units)``.
-            bounds: of the outputs.
-            mapped: what a static map says ``(time, batch, output)``, strokes zero; None without one.
+            bounds: bounds of the outputs.
+            mapped: outputs of the static map ``(time, batch, output)``, zero for strokes; None without a map.
         """
         projected = nn.functional.linear(commands, self.command_weight, self.bias)
         mapped = torch.zeros(0, 0, 0) if mapped is None else mapped

@@ -17,15 +17,18 @@ from edp.networks.twin.scales import TwinScales
 from edp.networks.twin.static_map import StaticTwin
 
 AT_STOP = 0.002
-"""Fraction of a stroke within which two visits to a stroke end count as the same position: a few millimetres."""
+"""Fraction of a stroke within which two outermost positions count as equal: a few millimetres."""
 APART_S = 1.0
-"""Time away from an end after which the next visit is another one."""
+"""Minimum time away from an outermost position before a further visit counts as a new visit, s."""
 VISITS = 2
-"""Visits to the same outermost place that make it an end stop: turns on the way hardly come to the same place."""
+"""Minimum number of visits to the same outermost position that identify an end stop. Reversals within the stroke rarely
+occur at equal positions."""
 PUSHED_S = 1.0
-"""Time at an outermost place with its own lever pushing on that makes it an end stop at the first visit."""
+"""Minimum time at an outermost position with the lever pushing outwards that identifies an end stop at the first visit,
+s."""
 PUSHED = 0.5
-"""Fraction of the largest command above which a lever would move an actuator anywhere but at its stop."""
+"""Minimum command, as a fraction of the largest command, that would move an actuator at any position except an end
+stop."""
 
 
 def scales_for(twin: RecurrentTwin, own: TwinScales, train: list[Series]) -> TwinScales:
@@ -58,9 +61,9 @@ def _is_stop(there: Sequence[np.ndarray], pushes: Sequence[np.ndarray], rate_hz:
     """Return whether an outermost place is an end stop.
 
     Args:
-        there: of each segment, tick by tick, whether it is there.
-        pushes: the lever towards that place, as a share of its largest value; empty: nothing tells which lever it is.
-        rate_hz: of the ticks.
+        there: mask of the samples at the position, one array per segment.
+        pushes: lever command towards the position, as a fraction of its maximum; empty if the lever is unknown.
+        rate_hz: sample rate, Hz.
     """
     if sum(_visits(one, round(APART_S * rate_hz)) for one in there) >= VISITS:
         return True
@@ -107,7 +110,7 @@ def replace_scales(twin: RecurrentTwin, scales: TwinScales) -> RecurrentTwin:
 def separated(twin: RecurrentTwin) -> list[RecurrentTwin]:
     """Return the members of an averaged twin; the twin itself if it is a single network.
 
-    What the average keeps of all members alone (constants of the outputs, pulls, the map) each of them has.
+    Each member gets the parameters that the average stores only once (constants of the outputs, pulls, the map).
     """
     if len(twin.member_rows()) < twin.members or twin.members == 1:
         return [replace_scales(twin, twin.scales)]

@@ -15,9 +15,10 @@ from edp.signals import KINDS
 
 Array = NDArray[np.float32]
 FASTEST = 1.25
-"""Bound of a velocity, as a multiple of the fastest that was seen: beyond it an output can only be wrong."""
+"""Bound of a predicted velocity, as a multiple of the highest velocity in the training data."""
 HIGHEST = 1.1
-"""Bound of a pressure, as a multiple of the highest that was seen, which a relief valve set."""
+"""Bound of a predicted pressure, as a multiple of the highest pressure in the training data, which a relief valve
+limited."""
 
 
 @dataclass(frozen=True, eq=False)

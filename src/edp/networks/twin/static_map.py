@@ -60,7 +60,7 @@ class StaticMap:
         delays = tuple(sorted({delay for delay in self.delays if delay + 1 < longest} or {min(self.delays)}))
         task = LagTask(tuple(delay + 1 for delay in delays), (None,) * len(solved), 1)
         solution = ridge_solution(rows, task, penalties=(PENALTY,))
-        # All delays are judged by the same stretches: those that have an answer after the longest one.
+        # Compare all delays on the same samples: those with an output after the longest delay.
         judged = [s for s in rows if s.samples > delays[-1] + 1]
         best = int(np.argmin([_error(solution, judged, i, delay) for i, delay in enumerate(delays)]))
         arrays = {"corners": corners, "delay": np.array([delays[best]], dtype=np.float32)}
@@ -107,8 +107,8 @@ class StaticTwin(Twin):
         """Return the weighted mean of maps with equal corners and delay.
 
         Args:
-            maps: at least one.
-            weights: of each map and output ``(map, all answers but strokes)``, their sum over maps 1.
+            maps: list of at least one map.
+            weights: weight of each map and output ``(map, all answers but strokes)``, with sum 1 over the maps.
         """
         first = maps[0]
         if all(one is first for one in maps):
@@ -143,7 +143,7 @@ class StaticTwin(Twin):
         """
         numbers, ticks = self.numbers, commands.shape[1]
         earlier = np.concatenate([before, commands], axis=1)
-        # A product a tick, so that a chunk and its single ticks round alike.
+        # One product per sample, so that a chunk and its single samples are rounded equally.
         rows = [polygon(earlier[:, t], numbers["corners"]) @ numbers["rise"] for t in range(ticks)]
         return np.stack(rows, axis=1) + numbers["intercept"], earlier[:, ticks:]
 
@@ -159,7 +159,7 @@ class StaticTwin(Twin):
     def lower(self, build: Builder, commands: str, fed: str) -> str:
         scales, solved, count = self.scales, list_solved_columns(self.channels), len(self.channels.commands)
         if self.delay:
-            # Two taps: nothing of the present, all of the tick at the end of the delay.
+            # Two taps: zero for the present, one for the sample at the end of the delay.
             taps = np.stack([np.eye(count), np.zeros((count, count))], axis=1)
             options = {"weight": taps, "bias": np.zeros(count), "dilation": self.delay}
             commands = build.add(Convolution, "earlier", commands, **options)
@@ -182,8 +182,8 @@ class StaticTwin(Twin):
 def polygon(commands: Array, corners: Array) -> Array:
     """Return how much of the way from each corner ``(knot, command)`` to the next a command has gone, 0 to 1.
 
-    Shares and not distances: sums of what each of them adds have no large parts that cancel, also with weights of
-    eight bits, and a command beyond all that was seen outputs what the farthest one did.
+    Fractions are used instead of distances, so that sums have no large cancelling parts, even with 8-bit weights. A
+    command outside the training range gives the output of the nearest corner.
 
     Args:
         commands: ``(row, command)``.

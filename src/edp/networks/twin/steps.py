@@ -1,7 +1,8 @@
 """A recurrent twin over time, forward and backward by hand, compiled: feedback makes every tick wait for the last one.
 
-One loop over the ticks, without Python and without a graph. What does not wait is left to the caller: the commands'
-part of the gates before it, the gradients of the weights after it. Everything is in scaled numbers, float32.
+One loop over the ticks, without Python and without a graph. The caller computes the parts without feedback: the
+commands' part of the gates before the loop, and the gradients of the weights after the loop. Everything is in scaled
+numbers, float32.
 
 The cell is PyTorch's GRU with feedback ports: at each tick it reads f, measured values or the last outputs, and outputs
 with f plus its change::
@@ -10,10 +11,10 @@ with f plus its change::
     velocity = clip(f + c o + p (m - f)),  pressure likewise,  o = V h' + d
     stroke = clip(f + trapezoid (velocity before + velocity)), and no velocity into an end stop
 
-Where a twin has a static map, m is what it says of the commands, and p the share of the way to it that an output is
-pulled in a tick; else p is zero.
+If a twin has a static map, m is the output of the map for the commands, and p is the fraction of the distance to m by
+which an output is pulled per sample; otherwise p is zero.
 
-All compiled code of a twin is in this file, whose content is the fingerprint of the code that is kept on disk.
+All compiled code of a twin is in this file. A hash of the file identifies the compiled code on disk.
 """
 
 from __future__ import annotations
@@ -106,17 +107,18 @@ def run_forward(
     """Run all ticks.
 
     Args:
-        inputs: the commands' part of the gates ``(time, batch, 3 units)``, biases included; measured values ``(time,
-            batch, output)``, any finite number where a port is free; ports of that shape, 1 where one reads what was
-            measured, 0 where it reads the last output; and what the static map says, of that shape, empty without one.
-        weights: of feedback ``(output, 3 units)``, of h ``(units, 3 units)``, bias of n's inner sum ``(units,)``, of
-            the outputs ``(units, output)`` and their bias ``(output,)``, and p ``(output,)``, zero for strokes; without
-            a map p is empty.
+        inputs: the commands' part of the gates ``(time, batch, 3 units)``, including biases; measured values ``(time,
+            batch, output)``, any finite number for a free port; port flags of the same shape, 1 if a port reads the
+            measured value, 0 if it reads the last output; and outputs of the static map of the same shape, empty
+            without a map.
+        weights: weights of the feedback ``(output, 3 units)`` and of h ``(units, 3 units)``, bias of n's inner sum
+            ``(units,)``, weights ``(units, output)`` and bias ``(output,)`` of the outputs, and pull p ``(output,)``,
+            zero for strokes; p is empty without a map.
         bounds: scale of changes, low, high ``(output,)``, and the trapezoid ``(stroke,)``.
         velocities: number of velocities, the first outputs.
         start: last output ``(batch, output)`` and h ``(batch, units)``.
-        saved: written: outputs, fed values, and where no bound acts, each ``(time, batch, output)``; gates ``(time,
-            batch, 3 units)``; inner ``(time, batch, units)``; h ``(time + 1, batch, units)``.
+        saved: results: outputs, fed-back values and mask of inactive bounds, each ``(time, batch, output)``; gates
+            ``(time, batch, 3 units)``; inner sums ``(time, batch, units)``; h ``(time + 1, batch, units)``.
     """
     projected, measured, port, mapped = inputs
     feedback_weight, h_weight, inner_bias, out_weight, out_bias, pull = weights
@@ -171,16 +173,16 @@ def run_branches(
     """Simulate branches of one run in free run; the common part before each branch is computed once.
 
     Args:
-        inputs: commands in SI units ``(time, run, command)``, and what the static map says ``(time, run, output)``,
-            empty without one.
-        weights: of commands in SI units and feedback ``(command + output, 3 units)`` and bias of the gates
-            ``(3 units,)``; of h, bias of n's inner sum, of the outputs, their bias, and p as in `run_forward`, those of
-            the outputs already scaled; offset and width of the outputs ``(output,)``.
-        bounds: of the outputs.
-        velocities: number of them.
-        start: what the ports read at the first tick ``(output,)``, and h ``(units,)``, of all batch.
-        first: tick at which each lane branches off lane 0 ``(run,)``, ascending, that of lane 0 zero.
-        results: written.
+        inputs: commands in SI units ``(time, run, command)``, and outputs of the static map ``(time, run, output)``,
+            empty without a map.
+        weights: weights of commands in SI units and feedback ``(command + output, 3 units)``, and bias of the gates
+            ``(3 units,)``; then weights of h, bias of n's inner sum, scaled weights and bias of the outputs, and p, as
+            in `run_forward`; then offset and width of the outputs ``(output,)``.
+        bounds: bounds of the outputs.
+        velocities: number of velocities.
+        start: port readings at the first sample ``(output,)``, and h ``(units,)``, equal for all runs.
+        first: sample at which each run branches off run 0 ``(run,)``, ascending; 0 for run 0.
+        results: buffers for the results.
     """
     answers = results.outputs
     commands, mapped = inputs
@@ -240,11 +242,11 @@ def gates_back(
     Args:
         by_h: gradient by the next h ``(batch, units)``; written: by h, but for its part in the products.
         from_out: gradient by the next h that its outputs add.
-        gates: of the forward run; `inner` and `h` likewise.
+        gates: gates of the forward run.
         inner: sums of n.
-        h: before.
-        grads: written: by the pre-activations ``(batch, 3 units)``, by `inner`, and both as the products with h see
-            them ``(batch, 3 units)``.
+        h: h before the sample.
+        grads: results: gradients by the pre-activations ``(batch, 3 units)``, by `inner`, and both combined for the
+            products with h ``(batch, 3 units)``.
     """
     by_gates, by_inner, by_up = grads
     batch, units = by_h.shape
@@ -278,14 +280,14 @@ def run_backward(
 
     Args:
         grad_answers: gradient by the outputs ``(time, batch, output)``.
-        port: as in the forward run; `weights`, `bounds`, `velocities` and `saved` likewise.
-        weights: of the cell.
-        bounds: of the outputs.
-        velocities: number of them.
-        saved: what the forward run wrote.
-        grads: written: by the gates' pre-activations ``(time, batch, 3 units)``, by n's inner sum ``(time, batch,
-            units)``, by o ``(time, batch, output)``; and by the start: last output and h. The last one comes in as the
-            gradient by the final h, the one before it as that by the final output.
+        port: port flags of the forward run.
+        weights: weights of the cell.
+        bounds: bounds of the outputs.
+        velocities: number of velocities.
+        saved: results of the forward run.
+        grads: results: gradients by the gates' pre-activations ``(time, batch, 3 units)``, by n's inner sum ``(time,
+            batch, units)``, by o ``(time, batch, output)``, and by the start (last output and h). On entry the last two
+            contain the gradients by the final output and by the final h.
     """
     feedback_weight, h_weight, _, out_weight, _, pull = weights
     scale, _, _, trapezoid = bounds

@@ -1,4 +1,4 @@
-"""The simulator as an environment of Gymnasium: lever positions in, what sensors show out."""
+"""Simulator as a Gymnasium environment: actions are lever positions, observations are sensor readings."""
 
 from edp.sim.environment.model import NominalMachine
 from edp.sim.environment.registration import register

@@ -30,9 +30,9 @@ class StepOutcome(NamedTuple):
     """Result of a step, shape (count,) each; the next step may change the arrays in place.
 
     Attributes:
-        rewards: of the step.
-        terminated: which episodes ended by what happened.
-        truncated: which episodes ended by their length.
+        rewards: rewards of the step.
+        terminated: mask of the episodes that ended by an event.
+        truncated: mask of the episodes that reached their maximum length.
     """
 
     rewards: Array
@@ -44,10 +44,10 @@ class EpisodeBatch(ABC):
     """Episodes of one environment, each of which begins by itself; all step in one call.
 
     Attributes:
-        count: how many.
+        count: number of episodes.
         rate_hz: ticks per second.
-        observation_space: of one episode.
-        action_space: of one episode.
+        observation_space: observation space of one episode.
+        action_space: action space of one episode.
     """
 
     count: int
@@ -60,10 +60,10 @@ class EpisodeBatch(ABC):
         """Begin one episode and return its description.
 
         Args:
-            index: which.
-            seed: of all that is random in the episode; None draws one.
-            rng: draws the seed.
-            options: of this episode alone.
+            index: index of the episode.
+            seed: seed of all random values in the episode; None chooses a random seed.
+            rng: random generator for the seed.
+            options: options of this episode.
 
         Raises:
             ConfigError: an option is unknown or out of range.
@@ -95,14 +95,14 @@ class PlantBatch(EpisodeBatch):
     """Machines side by side; a machine has no reward, and its episodes end by their length.
 
     Args:
-        channels: of an observation, in its order.
-        count: how many machines.
+        channels: channels of an observation, in order.
+        count: number of machines.
 
     Attributes:
         channels: name, unit and kind of each value of an observation.
-        source: how messages call the machine.
-        observed: what is measured now, shape (count, channel); NaN before an episode begins.
-        ended: which episodes have all their ticks behind them, shape (count,).
+        source: name of the machine in messages.
+        observed: current observation, shape (count, channel); NaN before an episode begins.
+        ended: mask of the completed episodes, shape (count,).
     """
 
     source: str

@@ -25,11 +25,11 @@ class SimulatorBatch(PlantBatch):
     """Simulated excavator fronts, each with its own machine, soil and seed.
 
     Args:
-        settings: of each machine; they show the same channels at the same rate.
+        settings: settings of each machine, with equal channels and sample rates.
 
     Attributes:
-        models: the nominal machine of each present episode, or of the next one where none has begun.
-        episodes: the state of each.
+        models: nominal machine of each current episode, or of the next episode before the first reset.
+        episodes: state of all episodes.
     """
 
     source = "the simulator"
@@ -45,7 +45,7 @@ class SimulatorBatch(PlantBatch):
         self.models = [models[id(each)] for each in settings]
         self.episodes = Episodes(self.count, first.columns)
         rows = self.episodes.new_out()[1]
-        # What has not begun shows nothing.
+        # Episodes that have not begun have no observation.
         rows[:] = np.nan
         self._present = self.observed, rows, self.ended
         self._pilots, self._in_soil = np.zeros(self.count), False

@@ -28,7 +28,7 @@ class SingleEnvironment(gymnasium.Env[Observation, Observation]):
     """An environment that is a batch of one episode.
 
     Args:
-        batch: of one episode.
+        batch: batch of one episode.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012  as Gymnasium declares it
@@ -44,7 +44,7 @@ class SingleEnvironment(gymnasium.Env[Observation, Observation]):
         """Begin an episode.
 
         Args:
-            seed: of all that is random in the episode; None goes on with the environment's own generator.
+            seed: seed of all random values in the episode; None continues with the environment's generator.
             options: settings for this episode alone.
 
         Returns:
@@ -80,16 +80,16 @@ class SingleEnvironment(gymnasium.Env[Observation, Observation]):
 class ExcavatorEnv(SingleEnvironment):
     """An excavator front under lever commands; observations are what its sensors show, in SI units.
 
-    The action is the lever positions of boom, arm and bucket, -1 to 1, extension positive; beyond, they stand at the
-    end. The observation at tick k shows pilot pressures as the lever of tick k - 1 left them. The reward is 0: what is
-    wanted of the machine is a task's affair. Episodes do not terminate; they are truncated at `duration_s`.
+    The action contains the lever positions of boom, arm and bucket, -1 to 1, extension positive; larger values are
+    clipped. The pilot pressures in observation k result from action k - 1. The reward is 0, because a task defines it.
+    Episodes do not terminate; they are truncated at `duration_s`.
 
-    `reset` takes the options of `edp.sim.environment.start`. Its seed is that of start, noise, soil and drawn machine;
-    the scenario of the same seed begins alike. It says ``seed``, ``machine``, ``mass_t`` of a drawn machine,
-    ``material`` and ``truth``, which each step says as well.
+    `reset` accepts the options of `edp.sim.environment.start`. Its seed determines initial pose, noise, soil and random
+    machine; a scenario with this seed begins equally. The info of `reset` contains ``seed``, ``machine``, ``mass_t`` of
+    a random machine, ``material`` and ``truth``; the info of `step` contains ``truth``.
 
     Args:
-        settings: what is simulated and shown.
+        settings: settings of the machine and its observations.
         render_mode: None; there is nothing to render.
         changes: settings of an `EnvironmentSpec` laid over these.
 
@@ -141,13 +141,13 @@ class ExcavatorEnv(SingleEnvironment):
         return self._batch.episodes.moment(0)
 
     def restore(self, snapshot: Moment) -> Observation:
-        """Go to a moment, of this environment or of another: what follows gives the same bits as it gave then.
+        """Restore a snapshot of this or another environment; the following steps give identical bits.
 
         Returns:
-            The observation of that moment.
+            The observation at the restored time.
 
         Raises:
-            ConfigError: the snapshot is of an environment that shows other channels.
+            ConfigError: the snapshot belongs to an environment with other channels.
         """
         self._batch.restore(0, snapshot)
         self._idle = "has ended" if self._batch.ended[0] else ""

@@ -21,10 +21,11 @@ from edp.storage.reading import Table
 from edp.wording import typed
 
 OBSERVED = (*TABLE_A1, "CylStroke_1", "CylStroke_2", "CylStroke_3")
-"""What is shown unless told otherwise: Table A.1, and the strokes, which have no model of a sensor."""
+"""Default observations: the signals of Table A.1, and the strokes, which are observed without a sensor model."""
 MAX_LATENCY = 1000
 MAX_SAMPLES = 10_000_000
-"""Of an episode: its random values are drawn at reset, 152 bytes a tick."""
+"""Maximum number of samples of an episode. The random values of an episode are generated at reset, 152 bytes per
+sample."""
 
 
 @dataclass(frozen=True)
@@ -34,19 +35,19 @@ class EnvironmentSpec:
     Attributes:
         machine: name of a machine, or path of a machine file (`.toml`).
         material: soil that the bucket works in; empty for free air.
-        duration_s: length of an episode, in which there are ``duration_s * rate_hz`` observations with the first one.
+        duration_s: length of an episode, s, with ``duration_s * rate_hz`` observations including the first one.
         rate_hz: ticks per second.
         step_s: integration step; cut in four near the ends of the stroke.
-        sensor_noise: False shows the truth.
+        sensor_noise: whether observations have sensor errors; False gives the true values.
         hand: whether an operator's hand smooths the levers, as in `Simulation`.
-        loop_latency: ticks by which observations come later.
-        lost_frames: share of ticks at which the observation before is shown again.
-        start_strokes: range of the strokes to start from, as shares of full.
-        observed: names of the channels shown, of Table A.1 or of those that `simulate` logs beside it.
+        loop_latency: delay of the observations in samples.
+        lost_frames: fraction of the samples at which the previous observation is repeated.
+        start_strokes: range of the initial strokes, as fractions of the full stroke.
+        observed: names of the observed channels, of Table A.1 or of the additional channels that `simulate` logs.
         sensors: values that replace those of the machine's ``[sensors]``, by key.
-        randomise: True or a spread draws a machine of the family of M22 at each reset; the spread widens its scatter.
+        randomise: whether each reset chooses a random machine of the M22 family; a number also scales the scatter.
         masses_t: range of the masses of that family.
-        faults: of machine and sensors; each may be given as a text or as a table, see `edp.sim.faults`.
+        faults: faults of machine and sensors, each as a text or as a table, see `edp.sim.faults`.
 
     Raises:
         ConfigError: a value is out of range, or a machine, material or channel is unknown (the closest is offered).
@@ -145,7 +146,8 @@ class EnvironmentSpec:
             )
         if columns[name] >= at.LOG_GROUND and not self.material:
             raise ConfigError(f"environment: observed channel '{name}' is there only in soil; choose a material")
-        # Strokes, pump pressures and oil temperature may have faults: what is shown of them is not the row of the log.
+        # Strokes, pump pressures and oil temperature may have faults, so their observation differs from the logged
+        # value.
         return shown_names()[name] if name in shown_names() else chain.SENSED + columns[name]
 
 

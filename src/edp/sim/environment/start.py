@@ -30,7 +30,7 @@ OF_SPEC = (
 )
 """Settings that the options of a reset may override for one episode."""
 OWN = ("strokes", "oil_temperature")
-"""Additional options: strokes to start from (shares of full), and the oil's temperature at the start (degC)."""
+"""Additional options of a reset: initial strokes (fractions of the full stroke) and initial oil temperature (degC)."""
 MAX_SEED = 2**31 - 1
 
 

@@ -34,11 +34,11 @@ class Truth(Mapping[str, object]):
     """Noise-free channels in SI units: Table A.1 without accelerations, and the additional ones logged by `simulate`.
 
     Args:
-        rows: the present row of the plant's log, shape (columns,), or one for each of many machines.
+        rows: current row of the plant's log, shape (columns,), or one row per machine.
         pilot_pressure: full pilot pressure, Pa; for many machines shape (machine,).
-        in_soil: whether there is ground to name.
-        faults: how many faults are named at most.
-        shares: gives how much of each fault is there, shape (machine, fault); None where there are none.
+        in_soil: whether the truth includes the ground.
+        faults: maximum number of faults in the truth.
+        shares: function that returns the current fraction of each fault, shape (machine, fault); None without faults.
     """
 
     __slots__ = ("_faults", "_pilot_pressure", "_rows", "_shares", "_sources")

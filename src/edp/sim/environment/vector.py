@@ -39,8 +39,8 @@ class VectorEnvironment(gymnasium.vector.VectorEnv[Observations, Observations, N
     """Environments that are a batch of episodes.
 
     Args:
-        batch: of the episodes.
-        mode: what happens to an episode that has ended, see `checked_mode`.
+        batch: batch of the episodes.
+        mode: treatment of an episode that has ended, see `checked_mode`.
     """
 
     def __init__(self, batch: EpisodeBatch, mode: Any) -> None:
@@ -60,11 +60,13 @@ class VectorEnvironment(gymnasium.vector.VectorEnv[Observations, Observations, N
         """Begin episodes.
 
         Args:
-            seed: of the first, the others count on; or one for each; None goes on with the generators of each.
-            options: as those of one environment, for all; ``reset_mask``, shape (num_envs,), resets these alone.
+            seed: seed of the first episode, with consecutive seeds for the others; or one seed per episode; None
+                continues with the generator of each episode.
+            options: options for all environments, as for a single environment; ``reset_mask``, shape (num_envs,),
+                selects the environments to reset.
 
         Returns:
-            Observations, shape (num_envs, value), and what began, as arrays beside masks such as ``_seed``.
+            Observations, shape (num_envs, value), and infos about the start as arrays, with masks such as ``_seed``.
 
         Raises:
             ConfigError: an option or the number of seeds is not possible.
@@ -105,7 +107,7 @@ class VectorEnvironment(gymnasium.vector.VectorEnv[Observations, Observations, N
         return self._batch.observation(ALL), rewards, terminated, truncated, {**self._batch.info(ALL), **infos}
 
     def _begin(self, mask: Bools, seeds: Sequence[int | None], options: Options, infos: Infos) -> Infos:
-        """Begin the masked episodes; return the infos with what began."""
+        """Begin the masked episodes; return infos about their start."""
         for index in np.flatnonzero(mask).tolist():
             seed = seeds[index]
             if seed is not None:
@@ -130,15 +132,15 @@ class VectorExcavatorEnv(VectorEnvironment):
     """Excavator fronts side by side, each with its own machine, soil and seed; the same bits as `ExcavatorEnv`.
 
     Args:
-        num_envs: how many.
-        settings: what is simulated and shown, for all or one for each; they differ in machine and soil only.
-        autoreset_mode: what happens to an episode that has ended: a reset at the next step (the usual), in the same
-            step, or none, so that `reset` has to be called with the option ``reset_mask``.
+        num_envs: number of environments.
+        settings: settings for all environments, or one per environment; they may differ only in machine and soil.
+        autoreset_mode: treatment of an episode that has ended: reset at the next step (default), reset in the same
+            step, or no reset. Without automatic reset, call `reset` with the option ``reset_mask``.
         render_mode: None; there is nothing to render.
         changes: settings of an `EnvironmentSpec` laid over all of these.
 
     Attributes:
-        settings: of each machine.
+        settings: settings of each machine.
         channels: name, unit and kind of each value of an observation.
         rate_hz: ticks per second.
 

@@ -17,8 +17,8 @@ Array = NDArray[np.float64]
 
 # numbers[...], the first block of a changing row
 TICK, SAMPLES, CLAMPS, HAND_S, IN_AIR, DELAY, CHANGED = range(7)
-"""Ticks done and in all, clamped pressures, time step of the hand (0: none), 1 in free air, ticks of loop latency, and
-how many of the changes that faults make are done."""
+"""Indices of counters and constants of an episode: completed samples, total samples, number of clamped pressures, time
+step of the operator's hand (0: none), 1 in free air, loop latency in samples, and number of applied fault changes."""
 NUMBERS = 7
 
 # blocks of the row that changes
@@ -31,11 +31,11 @@ NUMBERS = 7
 SENSOR_DRAWS, LOST, SOIL_TABLES, SOIL_COURSE, CHANGES = range(25, 30)
 BLOCKS = 30
 CHANGING = 25
-# changes[number, ...]: what a fault makes of a number of the row that changes: at which tick, its block, its place in
-# that, and its value from then on
+# changes[number, ...]: change of a parameter by a fault: sample, block, position in the block, and new value from this
+# sample on
 AT_TICK, BLOCK, WITHIN, VALUE = range(4)
 ENTRY = 3
-"""Numbers of a table's entry: first place in its row, rows and columns of the block."""
+"""Number of values per entry of the block table: offset in the row, rows and columns of the block."""
 
 
 @pasted

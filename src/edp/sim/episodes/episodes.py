@@ -33,7 +33,7 @@ _FAULTY = (
     blocks.FINE_FILTERS,
     blocks.SOIL_NUMBERS,
 )
-"""Blocks that hold what faults of the machine change, in the order of `edp.sim.faults.course.BLOCKS`."""
+"""Blocks that machine faults change, in the order of `edp.sim.faults.course.BLOCKS`."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +42,11 @@ class EpisodeStart:
 
     Attributes:
         scenario: machine, soil, rate, seed and length; its excitation is not used.
-        machine: the machine itself, which may be drawn or changed.
+        machine: machine parameters, which may be randomised or changed.
         hand: whether an operator's hand smooths the levers.
-        loop_latency: ticks by which observations come later.
-        lost_frames: share of ticks at which the observation before is shown again.
-        strokes: where the cylinders start, shares of full; drawn where None.
+        loop_latency: delay of the observations in samples.
+        lost_frames: fraction of the samples at which the previous observation is repeated.
+        strokes: initial strokes as fractions of the full stroke; random if None.
     """
 
     scenario: Scenario
@@ -68,15 +68,15 @@ class Moment:
 
 
 class Episodes:
-    """Machines under way, one a row.
+    """Batch of running episodes, one machine per row.
 
     Args:
-        count: how many.
-        columns: what observations show, numbers of `tick.SOURCES`.
+        count: number of machines.
+        columns: observed columns, as indices of `tick.SOURCES`.
 
     Attributes:
-        starts: how each began; None where none has.
-        most_faults: largest number of faults that one of them has.
+        starts: start of each episode; None before the first reset.
+        most_faults: largest number of faults of any episode.
     """
 
     def __init__(self, count: int, columns: NDArray[np.int64]) -> None:
@@ -98,7 +98,7 @@ class Episodes:
         tick.begin(self.memory[index], self.drawn[index], self.columns, self._scratch, index, out)
 
     def new_out(self) -> tick.Out:
-        """Return arrays for what `begin` and `step` show.
+        """Return arrays for the results of `begin` and `step`.
 
         Observations, rows of the log, and which episodes have ended.
         """
@@ -133,7 +133,7 @@ class Episodes:
     def shares(self) -> Callable[[], Array] | None:
         """Return a function that computes the present fraction of each fault; None without faults.
 
-        The shares are from 0 to 1, shape (episode, fault), NaN beyond the faults of an episode.
+        The fractions are from 0 to 1, shape (episode, fault); NaN in columns without a fault.
         """
         if self.most_faults == 0:
             return None
@@ -141,7 +141,7 @@ class Episodes:
             ((), 1.0) if start is None else (start.scenario.faults, start.scenario.rate_hz) for start in self.starts
         )
         ticks = self.memory[:, blocks.BLOCKS * blocks.ENTRY + blocks.TICK].astype(np.int64)
-        # No closure: what is true travels between processes.
+        # A class instead of a closure, because the object is sent between processes.
         return partial(_shares_of, plans, ticks, self.most_faults)
 
     def ended(self, index: int) -> bool:
@@ -154,7 +154,7 @@ class Episodes:
         start = self.starts[index]
         if start is None:
             raise ConfigError(f"episode {index} has not begun; reset it first")
-        # Of one episode the drawn row is replaced, never changed, so that it needs no copy.
+        # The row of random values is replaced and never changed, so that it needs no copy.
         drawn = self.drawn[index] if self.count == 1 else self.drawn[index].copy()
         return Moment(start, self.columns, self.memory[index].copy(), drawn)
 
@@ -231,8 +231,8 @@ def _long_enough(rows: Array, length: int) -> Array:
 def _bridge(present: Array, fresh: Array, done: int, depth: int) -> None:
     """Replace the draws of the ticks from `done` on, in place.
 
-    A bias goes on from where it is. No frame is shown that is older than the one before it, nor one that is older than
-    the sensors remember, `depth` ticks.
+    Sensor biases continue from their current value. No frame is older than the previous frame or older than the `depth`
+    samples that the sensors store.
     """
     late = slice(chain.AT_JOINTS, chain.AT_VALVES + 1)
     earliest = (np.arange(len(present)) - (depth - 1.0))[:, None]
@@ -243,7 +243,7 @@ def _bridge(present: Array, fresh: Array, done: int, depth: int) -> None:
 
 
 def _shares_of(plans: Sequence[tuple[tuple[FaultSpec, ...], float]], ticks: NDArray[np.int64], most: int) -> Array:
-    """Return how much of each fault of several episodes is there at their ticks, shape (episode, fault)."""
+    """Return the current fraction of each fault in several episodes, shape (episode, fault)."""
     shares = np.full((len(plans), most), np.nan)
     for index, (faults, rate_hz) in enumerate(plans):
         shares[index, : len(faults)] = shares_at(faults, ticks[index : index + 1], rate_hz)[0]

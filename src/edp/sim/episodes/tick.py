@@ -1,4 +1,4 @@
-"""One tick of many episodes: lever positions in, plant and sensors a sample on, observations out."""
+"""One sample of many episodes: from lever positions over plant and sensors to observations."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from edp.sim.sensors import chain, logbook
 Array = NDArray[np.float64]
 LOG_WIDTH = at.LOG_GROUND + at.GROUND_POINTS
 SOURCES = chain.SENSED + LOG_WIDTH
-"""What an observation may show: the signals that are sensed, then every column of the log."""
+"""Possible observations: the sensed signals, then every column of the log."""
 Out = tuple[NDArray[np.float32], Array, NDArray[np.bool_]]
-"""Observations, shape (episode, column); present rows of the log, shape (episode, LOG_WIDTH); which have ended."""
+"""Results of a time step: observations ``(episode, column)``, current rows of the log ``(episode, LOG_WIDTH)``, and
+mask of ended episodes."""
 KELVIN = 273.15
 
 # what `step_all` reports
@@ -62,7 +63,7 @@ def scratch_of(scratch: Array) -> tuple[Array, ...]:
 
 SCRATCH = places.FROZEN + 28 + 3 * at.OPENINGS + 4 * places.SLOPES + terramechanics.CONTACTS + 5 * at.STATES
 MAX_PAST = 256
-"""Samples of dead time that a machine may have."""
+"""Maximum dead time of a machine in samples."""
 
 
 @pasted
@@ -118,7 +119,7 @@ def change(memory: Array, drawn: Array) -> None:
 
 @inlined
 def look(memory: Array, drawn: Array, setup: Setup, work: Array) -> None:
-    """Log the present instant and let the sensors take it."""
+    """Log the current sample and compute its sensor readings."""
     state, valves = blocks.line(blocks.STATE, memory, memory), blocks.table(blocks.VALVES, memory, memory)
     past, row = blocks.table(blocks.PAST, memory, memory), blocks.table(blocks.ROW, memory, memory)
     tick = int(blocks.line(blocks.NUMBER, memory, memory)[blocks.TICK])
@@ -149,7 +150,7 @@ def show(memory: Array, drawn: Array, columns: NDArray[np.int64], index: int, ou
     measured, row = blocks.line(blocks.MEASURED, memory, memory), blocks.line(blocks.ROW, memory, memory)
     tick, ring = int(numbers[blocks.TICK]), shown.shape[0] - 1
     late = int(numbers[blocks.DELAY])
-    # The last row of the block is what was shown last.
+    # The last row of the block is the previous observation.
     last, now = shown[ring], shown[tick % ring]
     for c in range(columns.shape[0]):
         source = columns[c]
@@ -180,15 +181,15 @@ def step_all(
 
     Args:
         memory: rows that change, shape (episode, ...).
-        drawn: rows that were drawn, shape (episode, ...).
-        levers: positions, shape (episode, 3); beyond [-1, 1] they stand at the end.
+        drawn: rows of random values, shape (episode, ...).
+        levers: lever positions, shape (episode, 3), clipped to [-1, 1].
         active: episodes to step, shape (episode,).
-        columns: what is shown, see `SOURCES`.
+        columns: observed columns, see `SOURCES`.
         scratch: at least `SCRATCH` and ``6 (MAX_PAST + 2) + 9`` values.
-        out: filled for the active ones.
+        out: results, written for the active episodes.
     """
     for e in range(memory.shape[0]):
-        # Before any episode has moved: a bad lever must leave all as they are.
+        # Check before any episode advances, so that an invalid lever changes no episode.
         if active[e] and not finite(levers[e, 0] + levers[e, 1] + levers[e, 2]):
             return e, NOT_FINITE_LEVER
     lever, work = scratch[:3].reshape(1, 3), scratch[3:9].reshape(2, 3)
@@ -210,7 +211,7 @@ def step_all(
         total = 0.0
         for n in range(at.STATES):
             total += blocks.line(blocks.STATE, memory[e], memory[e])[n]
-        # What once is not finite stays so, and one sum shows it.
+        # A non-finite value persists, so one sum detects it.
         if not finite(total) and failed < 0:
             failed, how = e, DIVERGED
     return failed, how

@@ -16,7 +16,7 @@ from edp.sim.view import View
 class Aprbs(Excitation):
     """Steps between nine levels on all levers, with chirps on one lever in between.
 
-    Levels are zero and four of each sign, just inside, just beyond and clear of the dead band, and well open.
+    The levels are zero and four of each sign: just inside, just outside and well outside the dead band, and well open.
     A chirp rises from 0.05 to 5 Hz, 0.1-0.3 in amplitude, on a bias that keeps it beyond the dead band; its sign
     turns where the cylinder nears an end.
     """
@@ -24,17 +24,18 @@ class Aprbs(Excitation):
     by_hand = False
     HOLD_S = (0.15, 2.5)
     LEVELS = (0.92, 1.2, 1.9)
-    """Levels in addition to zero and `TOP`, as multiples of the dead band."""
+    """Command levels in addition to zero and `TOP`, as multiples of the dead band."""
     TOP = (0.75, 0.65, 0.85)
-    """Highest level of boom, arm and bucket."""
+    """Maximum command level of boom, arm and bucket."""
     CHIRP_HZ = (0.05, 5.0)
     CHIRP_S = (12.0, 25.0)
     CHIRP_SHARE = 0.35
-    """Fraction of the time with chirps; more of it made the commands no flatter (journal)."""
+    """Fraction of the time with chirps. A larger fraction did not make the spectrum of the commands flatter (journal).
+    """
     PIECE_S = 0.1
-    """A chirp is given in such segments, since its sign must turn soon after a cylinder nears an end."""
+    """Length of a chirp segment, s. The sign of a chirp must change soon after a cylinder comes near an end stop."""
     TURN = (0.22, 0.78)
-    """Shares of the stroke at which a chirp turns."""
+    """Stroke fractions at which a chirp changes its direction."""
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
         super().__init__(rng, rate_hz, machine)

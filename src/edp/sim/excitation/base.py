@@ -17,14 +17,14 @@ MOTORS = 3
 
 
 class Excitation:
-    """Someone at the levers; subclasses give `block` and register in `EXCITATIONS`.
+    """Generator of lever commands; subclasses implement `block` and register in `EXCITATIONS`.
 
-    What a subclass keeps between blocks must be numbers, arrays, lists of them, random generators, or objects of
-    these made in its constructor, so that a snapshot can hold it.
+    The state of a subclass may only contain numbers, arrays, lists of them, random generators, or objects of these
+    created in its constructor, so that a snapshot can store it.
 
     Attributes:
         by_hand: whether targets pass through an operator's hand; False for test signals and automatic control.
-        works_ground: whether the family is meant for soil; the others always move in free air.
+        works_ground: whether the excitation works the soil; all others always move in free air.
         swings: whether it moves swing and travel, too, of a machine that has their motors.
     """
 
@@ -47,8 +47,8 @@ class Excitation:
     def redraw(self, unused: int) -> None:
         """Discard the last `unused` samples of the latest block, and redraw the duration of the present action.
 
-        A branch of the future calls this: what the operator does now stays, for how much longer is drawn again from
-        what the time held so far leaves possible.
+        A branch of a simulation calls this method. The operator's current action continues; its remaining duration is
+        drawn again, conditional on the elapsed time.
         """
 
 
@@ -58,7 +58,7 @@ EXCITATIONS: Registry[type[Excitation]] = Registry("excitation")
 
 def extend_probability(stroke: float, pull: float = 1.1) -> float:
     """Return the chance to extend next: more when retracted, so that the mean stroke stays near the middle."""
-    # Never certain: moves into the ends of the stroke stay part of the data.
+    # The probability stays below one, so that the data include moves to the ends of the stroke.
     return min(max(0.5 + pull * (0.5 - stroke), 0.03), 0.97)
 
 
@@ -98,7 +98,7 @@ class Hold:
         """Return `unused` samples and redraw the remaining duration, given the elapsed time."""
         self.spend(-unused)
         if self.left > 0:
-            # What has lasted so long already cannot have been drawn shorter.
+            # The total duration is at least the elapsed duration.
             low = max(self._low, self._held / self._rate)
             self.left = max(1, round(self._rng.uniform(low, max(low, self._high)) * self._rate) - self._held)
 
@@ -118,7 +118,7 @@ class AxisStream:
     Attributes:
         axis: index of the cylinder; a stream may change it.
         level: lever position now.
-        hold: remaining duration of the move.
+        hold: remaining duration of the move, in samples.
     """
 
     LEVELS = (0.15, 1.0)

@@ -13,23 +13,26 @@ from edp.sim.view import View
 class Broadband(Excitation):
     """Multisine on all levers at once with equal amplitudes from `LOW_HZ` to `HIGH_HZ` and independent phases.
 
-    A course lasts `COURSE_S`, in which every sine completes whole periods; phases, sizes and the pose that the levers
-    lean to are then drawn again. Of `DRAWS` draws of phases that with the least peak is taken, so that most of the
-    lever's range is used by power and not by rare peaks (Pintelon and Schoukens, System Identification, 2.3).
+    A signal lasts `COURSE_S`, in which every sine completes whole periods; then phases, amplitudes and the target pose
+    are drawn again. The phases with the lowest crest factor of `DRAWS` random sets are used, so that the signal power
+    uses the range of the lever (Pintelon and Schoukens, System Identification, 2.3).
     """
 
     by_hand = False
     LOW_HZ, HIGH_HZ = 0.1, 4.5
-    """The last half octave is given away to the filter of what is measured."""
+    """Frequency range of the commands, Hz. The last half octave below the sensor bandwidth is reserved for the filters
+    of the measurement."""
     COURSE_S = 10.0
     PEAK = (0.5, 0.95)
-    """Drawn size of a course: of the lever, most of which small courses spend within the dead band."""
+    """Range of the random peak of a lever command, as a fraction of the full lever. Smaller peaks would mostly stay
+    within the dead band."""
     DRAWS = 16
     LEAN = 1.2
-    """Lever per share of the stroke from where the pose should be: slow, so that it adds no power above 0.2 Hz."""
+    """Lever command per stroke fraction of distance from the target pose. The gain is low, so that it adds no power
+    above 0.2 Hz."""
     MAX_LEAN = 0.3
     POSES = (0.1, 0.9)
-    """Strokes that courses lean to, as shares."""
+    """Target strokes, as fractions of the full stroke."""
     PIECE_S = 0.1
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
@@ -45,7 +48,7 @@ class Broadband(Excitation):
             self._begin()
         count = min(max(1, round(self.PIECE_S * self._rate)), len(self._course) - self._done)
         asked = np.clip(self.LEAN * (self._pose - view.strokes), -self.MAX_LEAN, self.MAX_LEAN)
-        # A lean that follows the stroke with a second of delay: steps of it would be power at all frequencies.
+        # The correction follows the stroke with a lag of one second, because steps would add power at all frequencies.
         share = 1.0 - np.exp(-np.arange(1, count + 1)[:, None] / self._rate)
         leans = self._lean + (asked - self._lean) * share
         self._lean = leans[-1].copy()
@@ -57,7 +60,7 @@ class Broadband(Excitation):
         """Draw another signal."""
         rng, samples = self._rng, max(1, round(self.COURSE_S * self._rate))
         seconds = np.arange(samples) / self._rate
-        # No sine above what the rate can show; at low rates fewer of them are left, one at least.
+        # Omit sines above the Nyquist limit; at low rates at least one sine remains.
         highest = min(self.HIGH_HZ, 0.4 * self._rate)
         lines = np.arange(1, max(1, int(highest * self.COURSE_S)) + 1) / self.COURSE_S
         lines = lines[lines >= min(self.LOW_HZ, lines[-1])]

@@ -13,7 +13,7 @@ from edp.sim.machine.machine import Machine
 from edp.sim.view import View
 
 LOOSE_DENSITY = 1400.0
-"""kg/m^3, of loosened soil: what the operator takes for a full bucket."""
+"""Density of loosened soil that the operator assumes to detect a full bucket, kg/m^3."""
 APPROACH, PENETRATE, DRAG, CURL, DUMP = range(5)
 
 
@@ -23,8 +23,8 @@ class Dig(Tracked):
 
     The operator lowers the open bucket to the surface and below it, drags it towards the machine at a chosen depth
     while closing it somewhat, curls and lifts, reaches out and dumps, and returns. Where the drag stalls the
-    bucket is raised, as an operator does; a full bucket ends it. Without ground the same is mimed over a surface
-    that is drawn again for each cycle.
+    bucket is raised, as an operator does; a full bucket ends it. In free air the cycles follow a virtual surface that
+    is drawn again for each cycle.
     """
 
     works_ground = True
@@ -32,19 +32,19 @@ class Dig(Tracked):
     DEPTH_M = (0.08, 0.35)
     LENGTH_M = (1.2, 3.5)
     ENTRY_DEG = (-125.0, -85.0)
-    """Attitude of the bucket as it enters; straight down is -90 deg."""
+    """Angle of the bucket as it enters the ground, degrees; straight down is -90 degrees."""
     CLOSING_DEG = (15.0, 60.0)
     CURLED_DEG = (-215.0, -185.0)
-    """Attitude of a closed bucket."""
+    """Angle of a closed bucket, degrees."""
     MIME_M = (-2.5, 0.5)
     MOVE = (0.15, 0.4)
     LIFT_M, DUMP_M, ABOVE_M = (0.8, 2.2), (1.0, 2.8), 0.4
-    """Tip above the surface after lifting, at dumping and before penetrating."""
+    """Height (m) of the bucket tip above the surface after lifting, at dumping, and before penetrating."""
     OPEN_DEG = (-125.0, -60.0)
     RELIEF_RATE = 0.12
-    """m/s at which a stalled drag is raised."""
+    """Speed at which the bucket is raised when the drag stalls, m/s."""
     FULL = 0.9
-    """Fraction of a struck bucket at which the drag ends."""
+    """Fill level at which the drag ends, as a fraction of a struck bucket."""
     TRIES = 60
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:

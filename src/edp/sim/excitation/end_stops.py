@@ -16,10 +16,10 @@ class EndStops(Excitation):
     """Runs one cylinder into its cushion and stop, holds it there, and lets the others move in between."""
 
     STRETCH_S = 0.4
-    """A push is given in segments, so that the end is noticed soon after it is reached."""
+    """Length of one segment of a push, s. Short segments detect the end stop soon after contact."""
     HOLD_S = (0.5, 1.0)
     MAX_STRETCHES = 13
-    """Pushes (5.2 s) after which a cylinder that does not reach its end is left alone."""
+    """Maximum number of segments (5.2 s) after which a cylinder that does not reach its end stop is skipped."""
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
         super().__init__(rng, rate_hz, machine)

@@ -22,19 +22,19 @@ class Grading(Tracked):
     by_hand = False
     works_ground = True
     PROPORTIONAL, INTEGRAL = 4.0, 2.0
-    """Controller gains per second and per second squared: of gains 2 to 5 /s, 4 has the least errors; at 5 the levers
-    change sign twice as often (journal)."""
+    """Controller gains, 1/s and 1/s^2. Among proportional gains of 2 to 5 /s, 4 /s has the smallest errors; at 5 /s the
+    levers change sign twice as often (journal)."""
     SPEED = (0.1, 0.5)
     LENGTH_M = (1.0, 4.5)
     SLOPE = 0.15
-    """Largest rise over run of a line in free air."""
+    """Maximum slope (rise over run) of a line in free air."""
     BITE_M = (-0.02, 0.05)
     PASSES = (1, 4)
     TRIES = 60
     ABOVE_M, LIFT_S = 0.4, 1.5
-    """Over ground: height at which the tip goes from line to line, and the time to get there."""
+    """Height (m) at which the tip moves between lines over ground, and time (s) to reach this height."""
     NEAREST = 0.25
-    """Nearest point of a line, as a share of the machine's reach."""
+    """Distance of the nearest point of a line, as a fraction of the machine's reach."""
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
         super().__init__(rng, rate_hz, machine)
@@ -48,7 +48,7 @@ class Grading(Tracked):
         if self._passes > 0:
             self._raised = False
             x, y, attitude = self.reference_pose()
-            # The reference stands above the line's start: down to it first.
+            # The reference is above the start of the line, so the tip moves down first.
             if np.hypot(x - self._from[0], y - self._from[1]) > 0.05:
                 return self.cartesian_leg((x, y, attitude), tuple(self._from), self.LIFT_S)
             self._passes -= 1

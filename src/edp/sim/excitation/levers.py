@@ -14,9 +14,11 @@ from edp.sim.physics.plant import Plant
 Array = NDArray[np.float64]
 AXES = 3
 LEVERS = (0.25, 0.35, 0.5, 0.7, 1.0)
-"""Levers measured, closer to one another near the dead band, where the speed bends most."""
+"""Lever positions for the measurement of the speed curves. They are closer near the dead band, where the curve bends
+most."""
 RUN_S, SETTLE_S = 0.9, 0.5
-"""A run of each lever, and the part of it in which valve and pump settle and that is left out."""
+"""Duration of the test of each lever position (s), and the initial part (s) that is not evaluated because valve and
+pump settle."""
 
 
 def dead_lever(machine: Machine) -> Array:

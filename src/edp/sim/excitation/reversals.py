@@ -17,7 +17,7 @@ class Reversals(Excitation):
     PAUSE_S = (0.2, 1.0)
     LEVELS = (0.3, 1.0)
     STRENGTH = (0.8, 0.65, 1.0)
-    """Strength for boom, arm and bucket; the bucket is shaken hardest."""
+    """Lever amplitude of the reversals for boom, arm and bucket. The bucket has the largest amplitude."""
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
         super().__init__(rng, rate_hz, machine)

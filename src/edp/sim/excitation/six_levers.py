@@ -22,7 +22,7 @@ class SixLevers(Combined):
 
     swings = True
     MID_STROKE = 0.5
-    """Swing and tracks have no ends that they would lean away from."""
+    """Stroke fraction used for swing and tracks, which have no end stops to avoid."""
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
         super().__init__(rng, rate_hz, machine)

@@ -14,21 +14,21 @@ from edp.sim.view import View
 class SwingDig(Dig):
     """Dig cycles as in `dig`, which swing to a side while the bucket is lifted, dump there, and swing back.
 
-    The swing's lever is let go where the angle left is what the brake valves need. In some cycles the machine travels
-    on while it swings back, both tracks alike but for a small difference. The soil's profile swings and travels with
-    the machine: each dig meets the ground that the last one left.
+    The swing lever is released when the remaining angle equals the braking angle. In some cycles the machine travels
+    while it swings back, with a small difference between both tracks. The soil profile moves with the machine, so each
+    dig starts from the ground of the previous dig.
     """
 
     swings = True
     SIDE_RAD = (0.8, 2.4)
-    """Angle to dump at, either side: 45 to 140 deg."""
+    """Range of the swing angle for dumping to either side, rad (45 to 140 degrees)."""
     LEVEL = (0.55, 1.0)
     BRAKES_AT = 0.4
-    """rad/s^2 that the operator takes for the deceleration of a closed valve."""
+    """Swing deceleration with a closed valve that the operator expects, rad/s^2."""
     CLOSE_RAD, NEAR_RAD = 0.06, 0.25
-    """Angle left at which the swing is not moved any more, and at which the bucket is lowered or emptied."""
+    """Remaining swing angles (rad) at which the swing command ends, and at which the bucket is lowered or emptied."""
     TRAVELS = 0.3
-    """Fraction of cycles with travel."""
+    """Fraction of the cycles with travel."""
     TRAVEL_S, TRAVEL_LEVEL = (0.6, 2.5), (0.4, 1.0)
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
@@ -38,7 +38,7 @@ class SwingDig(Dig):
         self._tracks = np.zeros(2)
 
     def next_leg(self, view: View) -> Array:
-        """Return the motion of the next phase, or a wait while the swing is not there.
+        """Return the motion of the next phase, or a wait until the swing arrives.
 
         Swing and travel follow the phase.
         """

@@ -20,8 +20,9 @@ class Tracked(Excitation):
     A leg is a straight line of the tip at a linearly changing attitude, or of the three strokes. Its reference
     speeds up and slows down over at most `RAMP_S`, and waits while the cylinders are too far behind. Levers are the
     inverse of the measured lever-to-speed curves, dead band included, at the reference speed `LEAD_S` ahead (the
-    machine answers that late) plus a PI correction of each stroke. The jump over the dead band at every change of
-    sign makes light axes hunt, the bucket first: that limit cycle is real, and wanted.
+    machine answers that late) plus a PI correction of each stroke. The jump over the dead band at every change of sign
+    causes a limit cycle of light axes, mainly of the bucket. Real machines show this limit cycle too, so it is
+    intended.
 
     Args:
         rng: source of randomness.
@@ -30,22 +31,23 @@ class Tracked(Excitation):
     """
 
     CONTROL_HZ = 20.0
-    """Rate of control steps; each takes 33 us of Python (journal), so a higher one slows the simulation."""
+    """Rate of the controller, Hz. Each control step takes 33 us of Python (journal), so a higher rate slows the
+    simulation."""
     RAMP_S = 0.5
-    """Time to speed up and to slow down on a leg."""
+    """Time to accelerate and to decelerate in each leg, s."""
     LEAD_S = 0.2
     PROPORTIONAL = 2.0
-    """1/s, on the stroke error."""
+    """Proportional gain on the stroke error, 1/s."""
     INTEGRAL = 0.8
-    """1/s^2."""
+    """Integral gain on the stroke error, 1/s^2."""
     REST_SPEED = 0.004
-    """Wanted speeds below this (m/s) leave the lever centred."""
+    """Reference speed (m/s) below which the lever stays centred."""
     WAITS_BEHIND = 0.12
-    """Stroke error (m) at which the reference does not move."""
+    """Stroke error (m) above which the reference waits."""
     PATIENCE_S = 1.5
-    """A leg that is blocked for so long is given up: the boom is raised instead."""
+    """Time (s) after which a blocked leg is abandoned and the boom is raised instead."""
     RESCUE = 0.15
-    """Fraction of the boom's stroke by which it is then raised."""
+    """Fraction of the boom stroke by which the boom is raised after a blocked leg."""
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
         super().__init__(rng, rate_hz, machine)
@@ -78,7 +80,7 @@ class Tracked(Excitation):
             self._begun = True
             self._queue[:] = view.strokes
             self._leg = self.next_leg(view)
-        # By the reference's own clock, which stands still while the cylinders are behind.
+        # The clock of the reference stops while the cylinders lag behind.
         elif memory[tip_control.TIME] >= self._leg[tip_control.LENGTH]:
             self._leg, memory[tip_control.TIME] = self.next_leg(view), 0.0
         self.steer(view)
@@ -91,7 +93,7 @@ class Tracked(Excitation):
 
     def _give_up(self, view: View) -> None:
         """Let go of a leg that soil or an end blocks: forget errors, and raise the boom from where it is."""
-        # Old references would pull the cylinders back into what blocked them.
+        # Old references would move the cylinders back into the obstacle.
         self._blocked, self._queue[:] = 0.0, view.strokes
         self._memory[: tip_control.LEVER] = 0.0
         goal = view.strokes.copy()
@@ -109,7 +111,7 @@ class Tracked(Excitation):
         return float(self._memory[tip_control.BEHIND])
 
     def end_leg(self) -> None:
-        """Let the leg under way be the past."""
+        """End the current leg."""
         self._memory[tip_control.TIME] = self._leg[tip_control.LENGTH]
 
     def reference_pose(self) -> tuple[float, float, float]:

@@ -20,7 +20,7 @@ Units = Mapping[str, float]
 AXES = ("boom", "arm", "bucket")
 SPOOLS = (*AXES, *(f"{axis}_conflux" for axis in AXES))
 CHAMBERS = tuple(f"{axis}_{side}" for side in ("head", "rod") for axis in AXES)
-"""Chambers in the order of the plant state and of Table A.1: head chambers, then rod chambers."""
+"""Cylinder chambers in the order of the plant state and of Table A.1: head chambers, then rod chambers."""
 
 # Factors to SI units; the first unit of each is that of bounds and ladders.
 FLOW: Units = {"L/min": 1.0 / 6e4, "m^3/s": 1.0}
@@ -33,7 +33,7 @@ VELOCITY: Units = {"mm/s": 1e-3, "cm/s": 1e-2, "m/s": 1.0}
 LENGTH: Units = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 TEMPERATURE: Units = {"K": 1.0}
 NO_UNIT: Units = {}
-"""Units of kinds without a size."""
+"""Unit of fault types without a size."""
 MAX_FAULTS = 8
 """Maximum number of faults per recording. Each fault has one of the channels `edp.signals.FAULT_CHANNELS`."""
 MAX_SECONDS = 1e7
@@ -251,7 +251,7 @@ def _check_size(what: str, kind: FaultKind, size: float | None, unit: str) -> No
     if not isinstance(unit, str) or unit not in kind.units:
         raise ConfigError(f"{what}: unit {shown(unit)} of the size is unknown{among(str(unit), kind.units)}")
     in_first = size * kind.units[unit] / kind.units[kind.unit]
-    # The product may miss a bound by rounding: 900 % as a share of 9.
+    # The product may exceed a bound by rounding: 900 % as the fraction 9.
     if not kind.bound.low - 1e-9 <= in_first <= kind.bound.high + 1e-9:
         raise ConfigError(
             f"{what}: size = {setting_text(size)} {unit}; {kind.bound.rule('size')} {kind.unit} must hold"

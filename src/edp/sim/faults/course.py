@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 STEPS = 1024
 """Maximum number of parameter changes during one ramp."""
 BLOCKS = ("axes", "plant", "delays", "coarse", "fine", "soil")
-"""Arrays of `MachineNumbers` in order."""
+"""Arrays of `MachineNumbers` that faults can change, in order."""
 CHANGE = 4
 """Number of values per change: sample, index in `BLOCKS`, position in the block, new value."""
 
@@ -43,7 +43,7 @@ def shares_at(faults: Sequence[FaultSpec], ticks: NDArray[np.int64], rate_hz: fl
 
 def sizes_of(fault: FaultSpec, shares: Array) -> Array:
     """Return the sizes in SI units at the given fractions of full size."""
-    # At share 0 exactly the neutral size: nothing may be changed by rounding.
+    # Return exactly the neutral size at fraction 0, so that rounding changes no parameter.
     return np.where(shares > 0.0, fault.neutral + shares * (fault.full - fault.neutral), fault.neutral)
 
 
@@ -80,7 +80,7 @@ class MachineCourse:
         self._sound = sound.copy()
         changed = self._numbers(np.ones(len(self.faults)))
         half = self._numbers(np.full(len(self.faults), 0.5))
-        # Only numbers that some fault changes are written: oil and load change others as time goes on.
+        # Only parameters changed by a fault are written, because oil and load change other parameters over time.
         self._touched = [
             np.flatnonzero((a.ravel() != b.ravel()) | (a.ravel() != c.ravel()))
             for a, b, c in zip(self._sound.arrays, changed.arrays, half.arrays, strict=True)
@@ -135,7 +135,7 @@ def _parameters(operation: int, sizes: Array, rate_hz: float, chance: np.random.
     if operation == alterations.DELAY:
         return sizes * rate_hz
     if operation == alterations.LAG:
-        # What is left of a step after one sample; of a lag of nothing, nothing.
+        # Remaining fraction of a step after one sample; zero without a lag.
         return np.where(sizes > 0.0, np.exp(-1.0 / (rate_hz * np.maximum(sizes, 1e-9))), 0.0)
     return sizes
 
@@ -169,7 +169,7 @@ class SensorCourse:
             return healthy
         drawn, columns = healthy.copy(), []
         ticks = np.arange(len(healthy))
-        # A generator each: what one fault draws does not move another.
+        # Each fault has its own generator, so that one fault does not change the random values of another.
         for (fault, kind), child in zip(self._every, chance.spawn(len(self._every)), strict=True):
             sizes = sizes_of(fault, shares_at((fault,), ticks, rate_hz)[:, 0])
             numbers = _parameters(kind.operation, sizes, rate_hz, child)

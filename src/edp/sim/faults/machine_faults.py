@@ -23,7 +23,7 @@ from edp.sim.machine import layout as at
 from edp.sim.physics import terramechanics, valve
 
 LEAK_PRESSURE = 200e5
-"""Pa across the gap at which a leak has its size, at 40 degC."""
+"""Pressure difference at which the size of a leak is defined, at 40 degC, Pa."""
 
 
 def _add_attachment_mass(numbers: MachineNumbers, site: str, size: float) -> None:
@@ -88,7 +88,7 @@ def _widen_dead_band(numbers: MachineNumbers, site: str, size: float) -> None:
     """Widen the dead band of one spool to both sides, to 95 % of the travel at most."""
     i, conflux = SPOOLS.index(site) % len(AXES), SPOOLS.index(site) >= len(AXES)
     first = at.CONFLUX_DEAD_BAND_EXTEND if conflux else at.DEAD_BAND_EXTEND
-    # Behind the band there must be some travel left: the opening divides by it.
+    # Some travel after the dead band is required, because the opening divides by it.
     for column in (first, first + 1):
         numbers.axes[i, column] = min(numbers.axes[i, column] + size, 0.95)
 
@@ -272,7 +272,7 @@ FAULTS.register("return_line")(MachineFault(
 def _slow_spool(numbers: MachineNumbers, site: str, size: float) -> None:
     """Divide the natural frequency of one spool by a factor; its pilot stays."""
     if size == 1.0:
-        # Computed anew, a sound spool's numbers might differ by rounding.
+        # Computing the parameters of a healthy spool again might change them by rounding.
         return
     j, valves = SPOOLS.index(site), numbers.machine.valves
     frequency = (*valves.spool_frequency, *valves.conflux_spool_frequency)[j] / size
@@ -316,7 +316,7 @@ def _limit_travel(numbers: MachineNumbers, site: str, size: float) -> None:
     if size == 0.0:
         return
     i, conflux = SPOOLS.index(site) % len(AXES), SPOOLS.index(site) >= len(AXES)
-    # The opening is r (0.25 + 0.75 r): solved for r, where it is what is left.
+    # Solve opening = r (0.25 + 0.75 r) for the travel r at the remaining opening.
     numbers.axes[i, at.CONFLUX_WIDEST if conflux else at.WIDEST] = (math.sqrt(0.0625 + 3.0 * (1.0 - size)) - 0.25) / 1.5
 
 

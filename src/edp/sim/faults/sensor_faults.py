@@ -91,7 +91,7 @@ FAULTS.register("pressure_lag")(SensorFault(
     channels=_each(CHAMBERS, chain.PRESSURES),
 ))  # fmt: skip
 
-# A transmitter without noise stays without.
+# A transmitter without noise stays noise-free.
 FAULTS.register("pressure_noise")(SensorFault(
     text="the noise of a cylinder pressure is larger by a factor",
     part="sensor of {site} pressure",

@@ -14,9 +14,9 @@ valve frequencies        s^-1/2, spools of greater mass; dead times and pump tim
 chassis                  pitch frequency s^-1/2, lifting moment s^4
 =======================  ======================================================================
 
-Front proportions, masses, valves, friction, leakage and wear scatter about the laws. A cylinder and its pins are
-scaled as one, so that joint ranges and the shape of the lever arms stay and every linkage closes. ``scatter`` widens
-all ranges about their middles but those of wear and oil, which span new to worn machines as they are.
+Front proportions, masses, valves, friction, leakage and wear scatter about the laws. A cylinder and its pins have one
+scale factor, so that joint ranges and lever arm shapes are unchanged and every linkage closes. ``scatter`` widens all
+ranges about their middle, except those of wear and oil, which already span new to worn machines.
 """
 
 from __future__ import annotations
@@ -43,12 +43,13 @@ from edp.wording import typed
 BASE_MASS_T = 21.7
 """Operating weight of M22, t."""
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
-"""Step of a sequence that fills a range evenly for any number of members (multiples of the golden ratio, modulo 1)."""
+"""Increment of the golden-ratio sequence modulo 1, which fills a range evenly for any number of members."""
 LIGHTEST_T, HEAVIEST_T = 1.0, 200.0
 MASSES_T = (10.0, 50.0)
-"""Range of masses of a family, unless another is asked for."""
+"""Default range of the operating weights in a family, t."""
 WIDEST = 2.5
-"""Most scatter: three times the ranges of pump and hoses would reach below zero."""
+"""Maximum scatter of the parameters. With three times the scatter, the ranges of pump and hoses would reach below zero.
+"""
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class Draws:
 
     Attributes:
         rng: source of the scatter.
-        scatter: factor on the width of every range but those of wear.
+        scatter: factor on the width of every range except wear.
     """
 
     rng: np.random.Generator
@@ -272,7 +273,7 @@ def _pumps(base: Machine, s: float, draws: Draws) -> Any:
         relief_slope=pumps.relief_slope * s**2,
         bypass=(pumps.bypass[0] * s**2, pumps.bypass[1]),
     )
-    # Of an engine, power over that of the pumps and energy of its wheel a watt stay.
+    # The ratio of engine power to pump power, and the flywheel energy per watt, stay constant.
     share = scaled.power_limit / pumps.power_limit
     return replace(scaled, engine_power=pumps.engine_power * share, engine_inertia=pumps.engine_inertia * share)
 
@@ -291,7 +292,7 @@ def _valves(valves: Valves, s: float, draws: Draws) -> Valves:
         changed[key] = _times(getattr(valves, key), quicker)
     for key in ("dead_band_extend", "dead_band_retract", "conflux_dead_band_extend", "conflux_dead_band_retract"):
         band = np.asarray(getattr(valves, key)) + wear + draws.uniform(-0.01, 0.01, 3)
-        # Wear and scatter must leave a dead band, and most of the spool's travel behind it.
+        # After wear and scatter a dead band is required, and most of the spool's travel after it.
         changed[key] = _times((1.0, 1.0, 1.0), np.clip(band, 0.04, 0.35))
     for key in (
         *("meter_in_extend", "meter_in_retract", "conflux_in_extend", "conflux_in_retract"),

@@ -69,7 +69,7 @@ MOTOR_STATES = 5
 
 ATMOSPHERE = 1.013e5
 LOWEST_PRESSURE = 0.1e5 - ATMOSPHERE
-"""Gauge pressure of 0.1 bar absolute: the floor at which pressures are clamped, and counted."""
+"""Minimum gauge pressure, Pa (0.1 bar absolute). Lower pressures are clamped and counted."""
 
 # columns of one logged sample: the plant state, then
 LOG_DEMAND = LOGGED_STATES
@@ -86,7 +86,7 @@ EVENTS = 5
 LOG_PORT = LOG_EVENTS + EVENTS  # pressures of heads and rods at the valve (Pa); the chambers' where there are no lines
 LOG_COLUMNS = LOG_PORT + 2 * AXES
 LOG_GROUND = LOG_COLUMNS
-"""First of the ground's height columns, `GROUND_POINTS` of them, which a log has only where there is ground."""
+"""Index of the first ground height column. There are `GROUND_POINTS` such columns, only in recordings with ground."""
 
 # columns of the motors in one logged sample, behind all others, only where they move; three of a kind stand together
 LOG_MOTOR_SPEED, LOG_MOTOR_A, LOG_MOTOR_B, LOG_MOTOR_DEMAND, LOG_MOTOR_SPOOL, LOG_SWING = 0, 3, 6, 9, 12, 15

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 Triple = tuple[float, float, float]
 PumpNumbers = tuple[int, int, int]
-"""Pump 1 or 2 of each cylinder; integers, since they index pumps."""
+"""Pump index (1 or 2) of each cylinder, as integers."""
 Rating = tuple[float, float]
-"""A flow in L/min at a pressure difference in bar."""
+"""Rated flow (L/min) and the pressure difference (bar) of this flow."""
 Ratings = tuple[Rating, Rating, Rating]
 
 
@@ -51,7 +51,7 @@ class BucketLinkage:
 class Cylinders:
     """Sizes, cushions, stops and leakage; SI units.
 
-    What `edp.sim.physics.lines` needs may be left out; then a line is a part of its chamber.
+    The parameters of `edp.sim.physics.lines` are optional; without them a line is part of its chamber.
 
     Attributes:
         line_bore: bore of the line from the valve to each chamber, m; its length follows from `hose_volume`.
@@ -104,12 +104,12 @@ class Oil:
 class Pumps:
     """Two equal pumps with electronic positive control, or with load sensing; SI units.
 
-    The numbers of the engine may be left out; then it turns at one speed, whatever the load.
+    The engine parameters are optional; without them the engine speed is constant.
 
     Attributes:
-        load_margin: Pa by which each pump stays above its highest load; 0 for positive control.
-        engine_droop: share of the governed speed by which the engine falls from no load to its full power.
-        engine_power: its full power, W.
+        load_margin: pressure of each pump above its highest load, Pa; 0 for positive control.
+        engine_droop: speed drop of the engine from no load to full power, as a fraction of the governed speed.
+        engine_power: full power of the engine, W.
         engine_inertia: inertia of engine, flywheel and pumps, kg m^2.
         engine_speed_rpm: governed speed without load, 1/min; `max_flow` belongs to it.
     """
@@ -137,7 +137,7 @@ class Valves:
 
     Attributes:
         flow_sharing: one of `edp.sim.machine.parameters.FLOW_SHARING`.
-        compensator_drop: Pa that a pressure compensator leaves across its section; for `pre_compensated` alone.
+        compensator_drop: pressure drop that a compensator keeps across its section, Pa; only for `pre_compensated`.
     """
 
     pilot_pressure: float
@@ -205,9 +205,9 @@ class Chassis:
 
     Attributes:
         boom_foot_height: height of the boom foot above level ground.
-        pitch_inertia: about the tipping line, kg m^2.
+        pitch_inertia: moment of inertia about the tipping line, kg m^2.
         pitch_frequency: frequency of rocking on the tracks, Hz.
-        pitch_damping: share of critical.
+        pitch_damping: damping ratio of the pitch motion.
         lift_moment: pitching moment at which the front of the tracks leaves the ground, N m.
     """
 
@@ -240,8 +240,8 @@ class Motor:
         pilot_frequency: Hz, as in `Valves`.
         spool_frequency: Hz.
         dead_time: dead time of its command, s.
-        dead_band: share of full spool travel, both ways.
-        pump_demand: share of full displacement that its full pilot asks for.
+        dead_band: dead band in both directions, as a fraction of the full spool travel.
+        pump_demand: pump displacement demanded by full pilot pressure, as a fraction of the full displacement.
         meter_in: area from the pump, at full opening.
         meter_out: area to the tank, at full opening.
     """
@@ -291,14 +291,15 @@ class Sensors:
         angle_quantum_deg: quantum of the joint angles, from which the lever arms follow.
         pin_backlash: play of the pins between cylinder and joint, m.
         pressure_range: full scale of a pressure transmitter, from 0.
-        pressure_offset: smallest and largest offset of an instance, either sign, as a share of full scale.
+        pressure_offset: smallest and largest magnitude of a sensor's offset, as fractions of full scale.
         pressure_bits: resolution of full scale.
         pressure_lag: time constant, s.
-        pressure_drift: share of full scale per K of oil temperature away from 40 degC.
+        pressure_drift: temperature drift of a pressure sensor, as a fraction of full scale per K of oil temperature
+            away from 40 degC.
         can_period: time between frames of an ECU, s; 0 for no bus.
         can_latency: shortest and longest latency, s.
         can_jitter: rms of the latency, s.
-        can_loss: share of frames lost.
+        can_loss: fraction of lost frames.
         instance_seed: seed of the instance, together with the machine's name: offsets, clock phases, latencies.
         pressure_at: location of the pressure transmitters: "cylinder" or, if lines are modelled, "valve".
     """
@@ -327,7 +328,7 @@ class Sensors:
 class Machine:
     """One parameter set of the simulator; order of triples: boom, arm, bucket.
 
-    What swings and travels may be left out, both or none; it moves only where a way of driving uses it.
+    Swing and travel are optional, but only together. They move only with excitations that use them.
     """
 
     name: str

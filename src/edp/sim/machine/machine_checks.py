@@ -23,13 +23,14 @@ from edp.wording import setting_text, typed
 
 MACHINE_FILE = SettingsTree(what="machine file", positions={Triple: CYLINDERS, Ratings: CYLINDERS})
 BEYOND_STOPS = math.radians(4.0)
-"""How far beyond its stops a joint must still have a lever arm: impacts push it there."""
+"""Angle beyond its stops at which a joint must still have a lever arm, rad, since impacts can push the joint there."""
 MIN_LEVER = 0.08
-"""Least lever arm |dx/dpsi| (m/rad) as a share of the stroke (m): below it an impact can turn the linkage over."""
+"""Minimum lever arm |dx/dpsi| (m/rad) as a fraction of the stroke (m). With a smaller arm, an impact can turn the
+linkage over."""
 
 
 LARGEST = 1e15
-"""Largest number of a machine, of either sign; bristles and oil are of the order of 1e9."""
+"""Maximum magnitude of a machine parameter. Bristle stiffness and bulk modulus are of the order of 1e9."""
 
 
 @dataclass(frozen=True)
@@ -197,11 +198,11 @@ BOUNDS: Mapping[str, ParameterBound] = {
     "sensors.instance_seed": ParameterBound(0.0, 2.0**63, integer=True),
     **{f"{section}.{key}": bound for section in SECTIONS_OF_MOTORS for key, bound in _MOTOR.items()},
 }
-"""By `section.key`; a number without an entry must be finite."""
+"""Bounds of machine parameters by ``section.key``. A parameter without an entry must be finite."""
 WORDS: Mapping[str, tuple[str, ...]] = {"flow_sharing": FLOW_SHARING, "pressure_at": ("cylinder", "valve")}
-"""What a key that takes a word may say."""
+"""Accepted words by key, for machine keys with a word as value."""
 FLOWING = ("meter_in_extend", "meter_in_retract", "meter_out_extend", "meter_out_retract", "meter_in", "meter_out")
-"""Ratings without which a cylinder or a motor could not move."""
+"""Rated flows that must be positive, because a cylinder or a motor could not move without them."""
 
 
 def check_machine(machine: Machine, where: str) -> None:
@@ -358,7 +359,7 @@ def _check_levers(axis: int, low: float, high: float, axes: Any, plant: Any, whe
     closes = linkage.bucket_closes(psi, plant) if axis == 2 else np.full(len(psi), True)
     # By convention extension raises the boom angle and lowers those of arm and bucket.
     sign = 1.0 if axis == 0 else -1.0
-    # Where the loop cannot close there is no lever arm: worse than any that is too short.
+    # Without a closed loop there is no lever arm, which is reported before a short lever arm.
     levers = [sign * linkage.cylinder(axis, p, plant)[1] if ok else -math.inf for p, ok in zip(psi, closes)]
     worst = int(np.argmin(levers))
     least = MIN_LEVER * float(axes[axis, at.STROKE])

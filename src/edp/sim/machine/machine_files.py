@@ -20,7 +20,7 @@ from edp.wording import typed
 FAMILY = re.compile(
     r"FAMILY-(\d{1,9})-(\d{1,6})(?:-(\d{1,3}(?:P\d{1,3})?)-(\d{1,3}(?:P\d{1,3})?))?(?:-X(\d(?:P\d{1,3})?))?"
 )
-"""A machine of a family, see `member_name`: it needs no file."""
+"""Pattern of the name of a machine in a family, see `member_name`. Such a machine has no file."""
 
 
 def machine_names() -> tuple[str, ...]:

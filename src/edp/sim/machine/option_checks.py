@@ -12,13 +12,13 @@ from edp.wording import typed
 
 CYLINDERS = ("boom", "arm", "bucket")
 MAX_BLED = 0.1
-"""Largest share of a pump's flow that the bleed of a load-sensing block takes at its margin."""
+"""Maximum fraction of a pump's flow that a load-sensing block bleeds at its margin."""
 MIN_BORE = 1e-3
-"""m: below it a line is an orifice, and its length has no meaning."""
+"""Minimum bore of a line, m. A narrower line acts as an orifice, and its length has no effect."""
 SOFTEST = 1e7
-"""Pa, bulk modulus of walls that give way more than any hose's, 1e8 to 1e9 Pa."""
+"""Minimum bulk modulus of hose walls, Pa. Real hoses have 1e8 to 1e9 Pa."""
 LINE_LENGTHS = 0.3, 60.0
-"""m: shorter lines are a part of their chamber, longer ones are no excavator's."""
+"""Accepted line lengths, m. Shorter lines belong to their chamber; excavators have no longer lines."""
 
 
 def check_engine(machine: Machine, where: str) -> None:

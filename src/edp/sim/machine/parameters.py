@@ -14,13 +14,14 @@ from edp.sim.physics import lines, thermal
 
 Array = NDArray[np.float64]
 REFERENCE_PRESSURE = 343e5
-"""Main relief, Pa: friction is given as a share of head area times this."""
+"""Pressure of the main relief valve, Pa. Friction is specified as a fraction of head area times this pressure."""
 
 
 FLOW_SHARING = ("parallel", "compensated", "pre_compensated")
-"""Orifices side by side; behind them compensators that show the highest load; before them ones of a drop each."""
+"""Methods of flow sharing: parallel orifices; compensators after the orifices that transmit the highest load pressure;
+compensators before the orifices, each with its own pressure drop."""
 UNBOUNDED = 1e12
-"""Pa: the drop across a section that nothing limits."""
+"""Pressure drop across a section without a limit, Pa."""
 
 
 def conductance(rating: Rating) -> float:

@@ -22,15 +22,17 @@ Array = NDArray[np.float64]
 SHARE, WEIGHT, HOLD, LIFT = range(4)
 VALUES = 4
 MIN_FRICTION = math.radians(0.1)
-"""Friction (rad) below which that of cohesion alone, 2 c, is reached to 0.2 %."""
+"""Friction angle (rad) below which the cohesive limit 2 c is accurate to 0.2 %."""
 AHEAD_CELLS, BEHIND_CELLS, ASIDE_CELLS = 4, 2, 3
-"""Cells over which soil spreads ahead of the back, behind it, and on either side of the heel."""
+"""Number of ground cells over which soil spreads ahead of the bucket's back, behind it, and to either side of the heel.
+"""
 TRIMMED = 0.005
-"""Travel (m) within which soil below the floor plate that lies above its line has gone."""
+"""Travel (m) within which soil above the line of the floor plate is removed below the plate."""
 FURTHER_M = 1.0
-"""Way (m) ahead of the back at which no heap of it stands: at its angle of repose one of 0.4 m is shorter."""
+"""Distance (m) ahead of the bucket's back beyond which its heap does not reach. A heap of 0.4 m at its angle of repose
+is shorter."""
 HEEL_CELLS = 2
-"""Cells on either side of the heel's that its 0.2 m press."""
+"""Number of cells on either side of the heel's cell that are pressed by its length of 0.2 m."""
 
 
 def passive_coefficient(friction: float, wall: float) -> float:
@@ -61,8 +63,8 @@ def pack(material: Material, width: float) -> Array:
 def pressure(depth: float, grown: float, back: Array) -> float:
     """Return the horizontal force (N) of the soil on the back immersed by `depth` (m).
 
-    `grown`: how far (m) it stands below the level of the ground `FURTHER_M` ahead. What is heaped up above that weighs,
-    and holds together no more.
+    `grown` is the depth (m) below the ground level `FURTHER_M` ahead. Soil heaped above this level adds weight but no
+    cohesion.
     """
     force: float = back[WEIGHT] * depth * depth + back[HOLD] * min(max(grown, 0.0), depth)
     return force
@@ -85,11 +87,12 @@ def push(points: Array, moved: float, share: float, heights: Array, memory: Arra
     """Move the soil above the floor plate's line that an outward motion has reached to both sides.
 
     Args:
-        points: x and y of tip and of heel (m).
-        moved: way outwards in this step (m).
-        share: of the soil, which goes ahead; the rest flows around the bucket and lies behind it.
-        heights: profile.
-        memory: of the ground, with its ruts.
+        points: x and y of tip and heel (m).
+        moved: outward travel in this step (m).
+        share: fraction of the soil that moves ahead of the bucket; the rest flows around the bucket and stays behind
+            it.
+        heights: height profile of the ground.
+        memory: memory of the ground, including its ruts.
     """
     rear, front, low, high = points[0], points[2], points[1], points[3]
     if front < rear:

@@ -12,7 +12,8 @@ from edp.sim.physics.jit import compiled
 
 Array = NDArray[np.float64]
 LEVER_BANDWIDTH_HZ, LEVER_RATE = 2.5, 5.0
-"""Hand on the lever: second-order smoothing and the largest rate in full strokes per second."""
+"""Bandwidth (Hz) of the second-order smoothing by the operator's hand, and maximum lever rate (full strokes per
+second)."""
 
 
 @compiled
@@ -59,8 +60,7 @@ def shape_commands(
 ) -> None:
     """Write the spool demands of `levers`, shape (samples, 3), after the `past` demands; then update `past`.
 
-    A `step_s` above 0 puts the operator's hand between the levers given and those of the machine. `held_commands` is
-    scratch.
+    With `step_s` above 0 the operator's hand smooths the levers. `held_commands` is a buffer.
     """
     axes, plant, _, _ = setup
     put_first(past, demands)

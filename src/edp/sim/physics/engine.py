@@ -12,7 +12,8 @@ from edp.sim.physics.jit import compiled
 
 Array = NDArray[np.float64]
 MIN_SPEED = 0.3
-"""Share of the governed speed at which an engine that would stall is held: below it no diesel engine runs."""
+"""Minimum engine speed as a fraction of the governed speed. A diesel engine does not run at lower speeds, so the
+simulated engine does not stall."""
 
 
 @compiled

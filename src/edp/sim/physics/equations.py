@@ -14,7 +14,7 @@ from edp.sim.physics import motors as places
 from edp.sim.physics.jit import inlined
 from edp.sim.physics.motors import Motors
 
-# Side by side, as they are in their file: one a line would be a page.
+# One name per line would fill a page, so the names stay side by side.
 # isort: off
 from edp.sim.physics.scratch import (
     ACROSS, BRISTLE_K, C_HEAD, C_PUMP_1, C_ROD, CONTACT, F_BY_V, F_BY_Z, FROZEN_W, H_BY_1, H_BY_2, H_BY_W, HEAD_BY_1,
@@ -58,7 +58,7 @@ def factorise(g: float, axes: Array, long: bool, work: tuple[Array, ...], motors
     `long` says whether lines lie between valves and chambers.
     """
     s, lu, e, contact = work[FROZEN_W], work[LU], work[SLOPE], work[CONTACT]
-    # The pumps feel what the sections see: the chambers, or the lines' ends at the valve.
+    # The pump load is the pressure at the sections: of the chambers, or of the line ends at the valve.
     seen = H_BY_W
     if long:
         line_step.eliminate_lines(g, axes, s, e)

@@ -10,12 +10,12 @@ from edp.sim.physics.jit import compiled, inlined
 
 Array = NDArray[np.float64]
 SPACING = 0.05
-"""Cell (m) of the profile."""
+"""Cell size of the ground profile, m."""
 GRAVITY = 9.81
 DEEPEST = 1.2
-"""Depth (m) beyond which forces of the soil stay: about the height of a bucket."""
+"""Depth (m) beyond which soil forces stay constant: about the height of a bucket."""
 DEEPEST_RUT = 0.1
-"""Depth (m) to which soil can be pressed together: a third of the layer that 0.2 m of plate press; E."""
+"""Maximum depth (m) to which soil can be compacted: a third of the layer affected by a plate of 0.2 m; E."""
 
 
 @inlined
@@ -38,7 +38,7 @@ def rut_depth(x: float, heights: Array, memory: Array) -> float:
 def press(x: float, bottom: float, share: float, heights: Array, memory: Array) -> None:
     """Keep the rut that a heel at `x` makes down to `bottom` (m): its cells are never less deep than before.
 
-    `share` of it lasts. Deeper than `DEEPEST_RUT` soil is no longer pressed but flows aside and back, without a rut.
+    The fraction `share` of the rut is permanent. Below `DEEPEST_RUT` soil flows aside and back without a rut.
     """
     middle = int(x / SPACING + 0.5)
     for k in range(max(middle - 2, 0), min(middle + 3, heights.shape[0])):

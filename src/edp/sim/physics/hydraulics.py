@@ -13,9 +13,9 @@ from edp.sim.physics.jit import inlined
 
 Array = NDArray[np.float64]
 SMOOTH2 = 1e5**2
-"""Square of the pressure (Pa) below which an orifice turns laminar."""
+"""Square of the pressure difference (Pa) below which the flow through an orifice is laminar."""
 UNLOADING = 1.5
-"""Margins above the highest load at which a block for load sensing unloads its pump."""
+"""Pressure of the unloading valve of a load-sensing block above the highest load, in load-sensing margins."""
 
 
 @inlined
@@ -69,8 +69,9 @@ def section(
 ) -> tuple[float, float, float]:
     """Flow from a pump line through a load check into a chamber, and its slopes by pump pressure and by load.
 
-    `highest` is the pressure that a section with its compensator behind the spool shows its pump instead of its own
-    lower load; `most` the drop (Pa) that a compensator before the spool leaves it, whatever pump and load.
+    `highest` is the load pressure that a section with a compensator after the spool signals to its pump instead of its
+    own lower load. `most` is the pressure drop (Pa) that a compensator before the spool keeps, independent of pump and
+    load.
     """
     if area <= 0.0:
         return 0.0, 0.0, 0.0

@@ -33,7 +33,7 @@ from edp.sim.physics.equations import factorise, solve
 from edp.sim.physics.jit import inlined
 from edp.sim.physics.motors import Motors
 
-# Side by side, as they are in their file: one a line would be a page.
+# One name per line would fill a page, so the names stay side by side.
 # isort: off
 from edp.sim.physics.scratch import (
     MovingParts,
@@ -45,10 +45,11 @@ from edp.sim.physics.scratch import (
 
 Array = NDArray[np.float64]
 GAMMA = 1.0 - 1.0 / math.sqrt(2.0)
-"""One of the two values at which ROS2 is L-stable; the other, 1 + 1/sqrt(2), has the larger error constant."""
+"""Coefficient of the ROS2 method with L-stability. The other L-stable value, 1 + 1/sqrt(2), has the larger error
+constant."""
 
 ANCHORED = 0.03
-"""Turn (rad) from its anchor up to which the series of `turned` are exact to rounding."""
+"""Maximum rotation (rad) from the anchor for which the series of `turned` are exact to rounding."""
 
 
 @inlined
@@ -112,8 +113,8 @@ def section_loads(w: Array, opened: Array, plant: Array, jacobian: bool, motors:
 def rates(w: Array, axes: Array, plant: Array, work: tuple[Array, ...], jacobian: bool, motors: Motors | None) -> None:
     """Write F(w) to `work[RATES]`: torque balance (not yet divided by M), pressure and bristle rates.
 
-    `w` is a state vector; its part from RATE to BRISTLE is used, and that of the lines where there are any. Derivatives
-    go to `work[SLOPE]` if asked for. Motors are at their state then, and at that of the stage otherwise.
+    `w` is a state vector, of which the part from RATE to BRISTLE and the part of the lines are used. Derivatives are
+    written to `work[SLOPE]` if requested; the motors are then at their own state, otherwise at that of the stage.
     """
     s, strokes, opened, e, out = work[FROZEN_W], work[STROKES_W], work[OPENED], work[SLOPE], work[RATES]
     w1, w2, w3, pump_1, pump_2 = w[at.RATE], w[at.RATE + 1], w[at.RATE + 2], w[at.PUMP], w[at.PUMP + 1]
@@ -299,7 +300,7 @@ def step(
     pump.displacement_step(state, valves, axes, plant, share, motors)
     valve.spool_half_step(filters, valves)
     valve.pilot_half_step(demand, filters, axes, valves)
-    # Last: within a step the stages may pass below vacuum, and a clamp there would break the order.
+    # Clamp at the end of a step. Stages may pass below vacuum, and a clamp there would reduce the order.
     lifted = clamp_pressures(state, plant[at.LINES] > 0.0)
     if motors is not None:
         places.advance(motors, 0.5 * h)

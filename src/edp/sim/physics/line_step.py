@@ -14,7 +14,7 @@ from edp.sim.machine import layout as at
 from edp.sim.physics import hydraulics, lines
 from edp.sim.physics.jit import inlined
 
-# Side by side, as they are in their file: one a line would be a page.
+# One name per line would fill a page, so the names stay side by side.
 # isort: off
 from edp.sim.physics.scratch import (
     ACROSS, C_HEAD, C_PORT_HEAD, C_PORT_ROD, C_ROD, DROP_HEAD, DROP_ROD, FROZEN_W, H_BY_1, H_BY_W, HEAD_BY_1,
@@ -48,7 +48,7 @@ def line_rates(
     head, rod, into_head, into_rod = w[at.HEAD + i], w[at.ROD + i], w[at.FLOW_HEAD + i], w[at.FLOW_ROD + i]
     port_head, port_rod = w[at.PORT_HEAD + i], w[at.PORT_ROD + i]
     wall, half = axes[i, at.LINE_WALL], axes[i, at.PORT_VOLUME]
-    # Half of the wall gives way to the chamber's pressure, half to the valve's.
+    # Half of the wall expands with the chamber pressure, half with the valve pressure.
     c_head = 1.0 / (1.0 / (hydraulics.stiffness(head, plant) * s[PER_HEAD + i]) + wall)
     c_rod = 1.0 / (1.0 / (hydraulics.stiffness(rod, plant) * s[PER_ROD + i]) + wall)
     c_port_head = 1.0 / (half / hydraulics.stiffness(port_head, plant) + wall)

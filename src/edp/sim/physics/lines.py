@@ -1,4 +1,4 @@
-"""Long lines between valves and cylinders: the oil in them has inertia, gives way, and drags along the wall.
+"""Long lines between valves and cylinders: their oil has inertia, compressibility and wall friction.
 
 A lumped line (pi section; Merritt, Hydraulic Control Systems, 1967; Watton, Fluid Power Systems, 1989) of length L,
 bore d and area A = pi d^2 / 4. Half of its volume V lies at the valve, half belongs to the chamber:
@@ -8,8 +8,8 @@ bore d and area A = pi d^2 / 4. Half of its volume V lies at the valve, half bel
 with C = V / 2 (1 / beta(p) + 1 / K), K the bulk modulus of its wall, I = rho L / A, and the drop by Hagen and
 Poiseuille, 128 mu L q / (pi d^4), or by Blasius' friction factor 0.3164 Re^(-1/4), whichever is larger: they meet at
 Re = 1187. The viscosity follows the oil's temperature. Reliefs, make-up valves and leakage to tank sit at the valve,
-the piston's leakage between the chambers. One section shows the slowest mode of a line; waves that travel along it,
-faster than (beta / rho)^(1/2) / (4 L), some 40 Hz in 8 m, are not shown.
+the piston's leakage between the chambers. One section represents the slowest mode of a line. Travelling waves above
+(beta / rho)^(1/2) / (4 L), about 40 Hz for 8 m, are not represented.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from edp.sim.physics.jit import inlined
 
 Array = NDArray[np.float64]
 DENSITY = 860.0
-"""kg/m^3 of mineral oil, as of the viscosity grade that machine files name."""
+"""Density of mineral oil of the viscosity grade in the machine files, kg/m^3."""
 
 
 def modelled(cylinders: Cylinders) -> bool:
@@ -39,7 +39,7 @@ def lengths(cylinders: Cylinders) -> Array:
 
 
 def pack_lines(machine: Machine, axes: Array) -> None:
-    """Fill what `drop` and the balances of the lines read, at 40 degC, into `axes`."""
+    """Write the line parameters at 40 degC into `axes`."""
     cylinders = machine.cylinders
     bore, length = np.array(cylinders.line_bore), lengths(cylinders)
     area = math.pi / 4.0 * bore**2

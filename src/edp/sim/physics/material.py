@@ -33,24 +33,25 @@ BOUNDS = {
     "back_push": span(0.0, 1.0),
     "back_friction_deg": span(0.0, 40.0),
 }
-"""Of a material; the softest mud has a cone index of some kPa, rock has no cone index."""
+"""Bounds of the parameters of a material. The softest mud has a cone index of some kPa; rock has no cone index."""
 
 
 @dataclass(frozen=True)
 class Material:
-    """One soil; SI units, angles in degrees. `cone_index` is a range from which each ground draws.
+    """One soil; SI units, angles in degrees. Each ground has a random `cone_index` within its range.
 
     Attributes:
         density: density in the bank, kg/m^3.
         bekker_exponent: n of p = (k_c / b + k_phi) z^n.
-        shear_length: Janosi's K.
-        swell: loose over bank volume.
-        roughness: spread of the logarithm of the resistance along the way.
-        roughness_length: length over which it varies, m.
-        sawtooth: share of the resistance lost when a chip breaks off.
-        compaction: share of the heel's lasting sinkage, up to 0.1 m of it, that stays as a rut once the heel has left.
-        back_push: share of the soil in the way of the bucket's back that it pushes ahead; the rest flows around it and
-            lies behind. 0: the back meets resistance and moves no soil.
+        shear_length: Janosi's shear deformation modulus K, m.
+        swell: ratio of loose volume to bank volume.
+        roughness: standard deviation of the logarithm of the resistance along the path.
+        roughness_length: correlation length of the resistance, m.
+        sawtooth: fraction of the resistance that is lost when a chip breaks off.
+        compaction: fraction of the heel's permanent sinkage, up to 0.1 m, that remains as a rut after the heel has
+            left.
+        back_push: fraction of the soil in front of the bucket's back that the bucket pushes ahead; the rest flows
+            around the bucket and stays behind it. With 0, the back meets resistance and does not move soil.
         back_friction_deg: friction angle of the soil on the back while it pushes, at most that of the soil.
 
     Raises:

@@ -93,9 +93,9 @@ class MotorCircuit:
         return self.state, self.valves, self.hand, self.past
 
     def demands_of(self, levers: Array, hand_s: float) -> Array:
-        """Return the demands of levers of shape (samples, 3), behind the past ones, which are brought up.
+        """Return the demands of levers, shape (samples, 3), after the past demands, which are updated.
 
-        A hand smooths the levers at steps of `hand_s`, none where it is 0.
+        The operator's hand smooths the levers in steps of `hand_s`; 0 omits the smoothing.
         """
         demands, shaped = np.empty((len(self.past) + len(levers), at.MOTORS)), np.empty(at.MOTORS)
         shape_motor_commands(levers, self.hand, hand_s, self.past, self._zone, demands, shaped)

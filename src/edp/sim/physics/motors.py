@@ -11,8 +11,8 @@ after the spool has closed. The inertia J of the swing is that of the upper stru
 J_0 + sum(m X^2 + I cos^2), X from the axis; by Lagrange's equations the joints of the front feel w^2 / 2 dJ/dpsi.
 Tracks move half of the machine each, on level ground, and do not move the soil's profile.
 
-Within a step of the integrator each motor is eliminated as a function of its pump's pressure, so that the cylinders'
-5 x 5 equations stay. Functions take `Motors`, the tuple that `motor_circuit.MotorCircuit` makes.
+Within a step of the integrator each motor is eliminated as a function of its pump's pressure, so that the cylinders
+keep their 5 x 5 equations. Functions take `Motors`, a tuple created by `motor_circuit.MotorCircuit`.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from edp.sim.physics.jit import compiled, inlined, pasted
 Array = NDArray[np.float64]
 Motors = tuple[Array, ...]
 STILL = 5e-3
-"""Speed (rad/s, m/s) below which dry friction fades, so that it needs no state of its own."""
+"""Speed (rad/s, m/s) below which dry friction decreases to zero, so that the friction model has no state."""
 NEVER = 1e12
-"""Pa, at which no relief opens."""
+"""Opening pressure of a relief valve that never opens, Pa."""
 
 # Motors[...]
 (
@@ -101,7 +101,7 @@ def freeze_inertia(motors: Motors, turns: Array, axes: Array) -> None:
         far = x + axes[k, at.COM_X] * c - axes[k, at.COM_Y] * s
         high = height + axes[k, at.COM_X] * s + axes[k, at.COM_Y] * c
         total += mass * far * far + own * c * c
-        # A joint turns what is behind it about itself: dX/dpsi is minus the height above it.
+        # A joint turns all following bodies about its axis, so dX/dpsi is minus the height above the joint.
         turn = -2.0 * own * c * s
         first += turn - 2.0 * mass * far * high
         if k > 0:
@@ -145,7 +145,8 @@ def port_flows(pressure: float, i: int, motors: Motors, plant: Array) -> tuple[f
     numbers = motors[NUMBERS]
     flow, slope = hydraulics.port_flows(pressure, NEVER, numbers[i, at.MOTOR_DRAIN] * plant[at.THINNING], plant)
     above, relief_slope = pressure - numbers[i, at.MOTOR_RELIEF], numbers[i, at.MOTOR_SLOPE]
-    # Softer than those of the cylinders: oil of a port is little, and a step would chatter about a steep one.
+    # The slope is smaller than for cylinders: ports have a small oil volume, and a step would chatter about a steep
+    # one.
     if above > 0.0:
         return flow - relief_slope * above, slope - relief_slope
     return flow, slope
@@ -157,7 +158,8 @@ def port_rates(
 ) -> tuple[float, float, float]:
     """Return the rates of both ports of motor `i` and the flow from its pump, m^3/s; optionally with derivatives.
 
-    `supply` is the pump's pressure, and what a compensated section shows it in place of a lower load.
+    `supply` contains the pump pressure, and the load pressure that a compensated section signals instead of a lower
+    load.
     """
     numbers, opened, e = motors[NUMBERS], motors[OPENED], motors[SLOPE]
     a, b, tank = state[i, at.PORT_A], state[i, at.PORT_B], plant[at.TANK]
@@ -198,12 +200,12 @@ def rates(
     Return the flow from both pumps, m^3/s.
 
     Args:
-        joints: rates of the front, rad/s.
-        supply: both pumps' pressures, then what compensated sections show them, Pa.
-        motors: at their state where slopes are asked for, otherwise at that of the second stage.
+        joints: joint rates of the front, rad/s.
+        supply: pressures of both pumps, and the load pressures that compensated sections signal to the pumps, Pa.
+        motors: state of the motors: the current one if derivatives are requested, otherwise that of the second stage.
         plant: parameters.
-        jacobian: whether slopes are asked for.
-        front: torque balance of the front, to which the torques are added that fling it outwards.
+        jacobian: whether derivatives are requested.
+        front: torque balance of the front, to which the centrifugal torques of the swing are added.
     """
     state = present(motors, jacobian)
     numbers, frozen, out, e = motors[NUMBERS], motors[FROZEN], motors[RATES], motors[SLOPE]

@@ -13,10 +13,10 @@ from edp.sim.physics.jit import compiled, inlined
 
 Array = NDArray[np.float64]
 FILM = 4e5
-"""N s/m that the grease in a pin resists being squeezed; E: 12 pi mu L (R / c)^3 of a full journal, with mu 1 Pa s,
-L 0.1 m, R 35 mm and c 0.75 mm."""
+"""Squeeze-film damping of the grease in a pin, N s/m; E: 12 pi mu L (R / c)^3 of a full journal, with mu 1 Pa s, L 0.1
+m, R 35 mm and c 0.75 mm."""
 PARTS = 10
-"""Parts of a sample in which a crossing is followed."""
+"""Number of substeps of a step in which the pin play is crossed."""
 
 
 @compiled
@@ -57,7 +57,7 @@ def cross_play(
 ) -> tuple[float, float]:
     """Return the offset (m) and speed (m/s) of a pin in its bore after a sample, from those before it.
 
-    `pull` is the force at the beginning and at the end of the sample, `half` the half of the play.
+    `pull` contains the force at the beginning and at the end of the sample; `half` is half of the play.
     """
     part = step_s / PARTS
     pin_offset, speed = before
@@ -87,7 +87,7 @@ def follow_play(force: Array, mass: Array, width: Array, step_s: float, out: Arr
     A pin that pushes lies half of `width` (m) ahead of its bore. Once the force turns, no force passes until the play
     is crossed: against a cylinder without play the joint is then accelerated by -force / mass, and held back by the
     grease, `FILM`. It does not bounce.
-    The mean since the sample before, so that its sum is the way within the play.
+    Mean velocity since the previous sample, so that its integral is the travel within the play.
     """
     for i in range(force.shape[1]):
         half = 0.5 * width[i]

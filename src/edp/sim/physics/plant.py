@@ -24,9 +24,9 @@ from edp.sim.sensors import logbook
 Array = NDArray[np.float64]
 
 FINE = 4
-"""A step is cut in this many near the ends of the stroke, where cushions and stops are stiff."""
+"""Number of substeps of a step near the ends of the stroke, where cushions and stops are stiff."""
 RESTING_PRESSURE = 10e5
-"""Pa, of pump lines and of the less loaded chamber at the start: no chamber begins in vacuum."""
+"""Initial pressure of pump lines and of the less loaded chamber, Pa. It prevents a start in vacuum."""
 Clock = tuple[int, float, float, Array]
 
 
@@ -100,9 +100,9 @@ def run_samples(
 ) -> int:
     """Run one sample per row of `log`; returns the number of clamped pressures.
 
-    The demands hold past ones first: the last rows belong to `log`. `times` are delays in samples, and clocks: the
-    number of steps in a sample and the clock of one step, for coarse and for fine steps. `motors` move, where given,
-    and log into an array of their own.
+    The first rows of the demands are past demands; the last rows belong to `log`. `times` contains delays in samples,
+    the number of steps per sample, and the clock of one step, for coarse and for fine steps. Optional `motors` write
+    into a separate log.
     """
     demands = commands.demands
     first = demands.shape[0] - log.shape[0]
@@ -137,11 +137,11 @@ class Plant:
 
     Args:
         machine: the parameter set.
-        strokes: initial strokes as a share of each cylinder's stroke, shape (3,).
+        strokes: initial strokes as fractions of each cylinder's stroke, shape (3,).
         rate_hz: logging and command rate.
-        step_s: integration step; a whole number of them must fill a sample.
+        step_s: integration step, s; the sample time must be a multiple of it.
         ground: ground that the bucket digs in; None in free air.
-        spare_s: dead time that may be added while it runs, s.
+        spare_s: maximum dead time that can be added during the simulation, s.
         moves: whether swing and travel move, too; without them both do not move and take no oil.
 
     Raises:
@@ -219,7 +219,7 @@ class Plant:
 
     @property
     def finite(self) -> bool:
-        """Whether every state is a finite number; what once is not stays so."""
+        """Whether every state is finite; a non-finite state persists."""
         # One sum instead of a test of each value: NaN and infinity survive every addition.
         turning = 0.0 if self.motors is None else float(self.motors.state.sum())
         return math.isfinite(sum(self.state.tolist()) + turning)
@@ -264,7 +264,7 @@ class Plant:
         Oil in long lines begins in steady state, at the chambers' pressures.
 
         Args:
-            strokes: m, shape (3,); held within the stroke.
+            strokes: strokes of the cylinders, m, shape (3,); limited to the stroke range.
             velocities: velocities of the cylinders, m/s, shape (3,).
             pressures: pressures of head chambers, rod chambers and pump lines, Pa, shape (8,); NaN leaves a pressure
                 unchanged.

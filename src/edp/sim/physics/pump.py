@@ -7,8 +7,8 @@ p stays `load_margin` above, or at the main relief's pressure if that is lower:
     x = (min(p_L + margin, relief) - p) / (DROOP margin), held within the least displacement and 1,
 
 behind the first-order lag of the displacement; the power limit stays. With `DROOP` the margin falls by that share from
-no flow to full. In want of oil (full displacement or power limit) p falls towards the loads: what then moves is decided
-by the sections, see `flow_sharing`. The open centre is a bleed orifice that does not close.
+no flow to full. If the flow is insufficient (full displacement or power limit), p falls towards the loads; the sections
+then determine the distribution, see `flow_sharing`. The open centre is a bleed orifice that does not close.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from edp.sim.physics.motors import Motors
 
 Array = NDArray[np.float64]
 DROOP = 0.3
-"""Share of the margin by which a pump that senses loads falls from no flow to its full one; usual 20 to 30 %."""
+"""Pressure drop of a load-sensing pump from zero flow to full flow, as a fraction of the margin. Usual values are 20 to
+30 %."""
 
 
 @inlined
@@ -114,7 +115,7 @@ def displacement_step(
 ) -> None:
     """Move both displacements towards demand under the power limit; `share` = exp(-step / time constant)."""
     first, second = asked(state, valves, axes, plant, motors)
-    # A line below tank pressure takes no power from the other pump's share.
+    # A line below tank pressure does not increase the power of the other pump.
     power = plant[at.MAX_FLOW] * (first * max(state[at.PUMP], 0.0) + second * max(state[at.PUMP + 1], 0.0))
     # At least 1 W: idle pumps do not divide by zero.
     limit = min(1.0, plant[at.POWER_LIMIT] / max(power, 1.0))

@@ -1,4 +1,4 @@
-"""The state of a simulation as plain data: what any of its objects holds, to a file without pickle and back, exact."""
+"""Snapshots of a simulation: exact storage of its state in a file without pickle."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from edp.storage.reading import Table
 
 SCHEMA = 4
 MOST_BYTES = 1 << 30
-"""Largest file of a snapshot: days of a simulation's log."""
+"""Maximum size of a snapshot file, bytes: the log of several days of simulation."""
 _FACTS = "facts"
 _LIMITS = ArchiveLimits(MOST_BYTES, MOST_BYTES, 100_000)
 
@@ -29,11 +29,11 @@ class Snapshot:
     """A simulation at one instant.
 
     Attributes:
-        scenario: what is simulated, as plain data.
+        scenario: simulated scenario, as a dictionary of JSON types.
         samples: samples done so far.
         state: everything that changes, as JSON-able data; arrays are places in `arrays`.
         arrays: the arrays.
-        log: what was logged so far, shape (samples, columns).
+        log: logged samples, shape (samples, columns).
     """
 
     scenario: Table
@@ -163,14 +163,14 @@ def restored(current: Any, plain: Any, arrays: tuple[NDArray[Any], ...]) -> Any:
     for name, part in content.items():
         old = getattr(current, name)
         new = restored(old, part, arrays)
-        # Frozen parts refuse to be set, and what was restored in place needs no setting.
+        # Frozen objects cannot be assigned, and values restored in place need no assignment.
         if new is not old:
             setattr(current, name, new)
     return current
 
 
 def _restore_array(current: Any, saved: NDArray[Any]) -> NDArray[Any]:
-    # In place where it fits: other parts may hold the same array.
+    # Restore in place if the shape fits, because other objects may refer to the same array.
     if isinstance(current, np.ndarray) and current.shape == saved.shape and current.dtype == saved.dtype:
         current[...] = saved
         return current

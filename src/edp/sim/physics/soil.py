@@ -14,11 +14,11 @@ from edp.sim.physics.material import Material
 
 Array = NDArray[np.float64]
 SPACING_M = ground_profile.SPACING
-"""Cell (m) of the height profile."""
+"""Cell size of the height profile, m."""
 BEYOND_M = 1.0
-"""How far the ground goes on beyond the machine's reach."""
+"""Distance by which the ground extends beyond the machine's reach, m."""
 UNEVENNESS_M = 0.04
-"""Deviation (m) of the surface at its bends, a metre apart."""
+"""Standard deviation of the surface height at its support points, which are one metre apart, m."""
 
 
 class Ground:
@@ -30,7 +30,7 @@ class Ground:
     Args:
         material: soil.
         machine: machine whose bucket digs; defines height of the boom foot and reach.
-        rng: draws unevenness, strength, stones and the course of the resistance, all of it at once.
+        rng: random generator for unevenness, strength, stones and resistance, which are all generated at once.
     """
 
     spacing_m = SPACING_M
@@ -96,7 +96,7 @@ def redraw_course(material: Material, numbers: Array, memory: Array, course: Arr
     ahead = (here + np.arange(count)) % count
     course[ahead, 0] = keep * old[here % count, 0] + np.sqrt(1.0 - keep**2) * fresh[:, 0]
     stone = (int(memory[at.DISTANCE] / terramechanics.STONE_STEP) + np.arange(count)) % count
-    # A stone that the edge is in now stays until it has passed.
+    # A stone in contact with the edge stays until the edge has passed it.
     inside = np.logical_and.accumulate(old[stone, 1] > 0.0)
     course[stone, 1] = np.where(inside, old[stone, 1], fresh[:, 1])
     # The strength of the present dig was already felt; that of the later ones was not.

@@ -1,7 +1,7 @@
-"""Soil that is moved: swept cells, the load and its spilling, the heap before the edge, slopes that slide.
+"""Soil transport: excavated cells, bucket load and spilling, heap ahead of the edge, sliding slopes.
 
-Heights count soil at bank density: what leaves one place arrives at another, and the mass stays the same. What the
-heel has pressed lies lower by its rut; a cut takes the pressed soil with its mass, and leaves soil that bore nothing.
+Heights refer to soil at bank density, and the mass of soil is conserved. Compacted soil is lower by its rut. A cut
+removes the compacted soil with its mass and leaves soil that was not loaded before.
 """
 
 from __future__ import annotations
@@ -18,17 +18,18 @@ from edp.sim.physics.jit import compiled
 
 Array = NDArray[np.float64]
 SPILL_S = 0.25
-"""Time constant of soil that slides out of the bucket; E."""
+"""Time constant of soil that slides out of the bucket, s; E."""
 HOLDS_RAD, EMPTY_RAD = 0.61, 1.75
-"""Tilt of the bucket's mouth from level up to which it holds a struck load, and at which it holds nothing; E."""
+"""Tilt of the bucket opening from the horizontal (rad) up to which the bucket holds a struck load, and at which the
+bucket is empty; E."""
 DROP_CELLS = 8
-"""How far (cells) ahead of the edge soil falls that the heap cannot hold."""
+"""Distance ahead of the edge, in cells, at which soil falls that the heap cannot hold."""
 NEAR_M = 0.1
-"""Gap (m) below which the bucket may touch the ground within a sample: it moves by less than 5 cm."""
+"""Gap (m) below which the bucket may touch the ground within one sample. The bucket moves less than 5 cm per sample."""
 LANDING = 0.05
-"""Speed (m/s) from which a landing is taken in fine steps."""
+"""Impact speed (m/s) above which a landing is simulated in fine steps."""
 LEFT_M = 0.03
-"""Height above the ground at which a dig has ended."""
+"""Height above the ground at which a dig has ended, m."""
 
 
 @compiled

@@ -1,4 +1,4 @@
-"""Forces of soil on the bucket: cutting, edge, heel and the chassis that gives way. The reaction of soil: `terrain`.
+"""Soil forces on the bucket: cutting, edge, heel and compliant chassis. Module `terrain` moves the soil.
 
 Cutting follows the earthmoving equation of Reece and McKyes, heel contact Bekker's pressure-sinkage law with elastic
 unloading and Janosi's shear. Where soil keeps what the heel has pressed (`compaction`), repeated loading follows Wong
@@ -44,23 +44,23 @@ CONTACTS = 41
 CREEP = 0.02
 """Speed (m/s) over which the direction of soil forces is smoothed."""
 STONE_STEP = 0.005
-"""Travel (m) a cell of the stones' column."""
+"""Travel per cell of the array of stone forces, m."""
 COURSE = 8192
-"""Cells of a course; its stones repeat after 41 m of travel in soil."""
+"""Number of cells of the periodic array of soil resistance. The stones repeat after 41 m of travel in soil."""
 MIN_RAKE, MAX_RAKE = 10, 120
-"""Rake (deg) to which the table of cutting factors is limited."""
+"""Rake angles (degrees) to which the table of cutting factors is limited."""
 MIN_LEAN, MAX_LEAN = 0.17, 2.1
-"""Rake (rad) within which the direction of the cutting force follows it."""
+"""Rake angles (rad) within which the direction of the cutting force follows the rake."""
 EDGE_DEPTH = 0.05
-"""Depth (m) at which the whole edge is in the ground."""
+"""Depth at which the whole edge is in the ground, m."""
 HEEL_CONTACT = 0.2
-"""Length (m) of floor plate that bears on the ground; E."""
+"""Length of the floor plate in contact with the ground, m; E."""
 PIN_STIFFNESS = 1.2e7
-"""Stiffness (N/m) of the front behind the heel; E."""
+"""Stiffness of the front attachment that supports the heel, N/m; E."""
 TURNING = 0.05
-"""Horizontal speed (m/s) over which the soil before the edge changes from one side to the other."""
+"""Horizontal speed (m/s) over which the soil ahead of the edge changes from one side to the other."""
 PUSHED_BACK = 0.5
-"""Share of the cutting force that the back of the bucket meets where it moves no soil (`back_push` is 0); E."""
+"""Fraction of the cutting force on the bucket's back while the back does not move soil (`back_push` is 0); E."""
 
 
 def cutting_factors(rake_deg: float, friction_deg: float, metal_deg: float) -> tuple[float, float, float]:
@@ -283,7 +283,7 @@ def engage(state: Array, angles: Array, axes: Array, ground: Ground, c: Array) -
     if numbers[COMPACTION] > 0.0:
         uncut -= inward * rut_depth(c[POINTS] - 1.5 * SPACING, heights, memory)
         uncut -= (1.0 - inward) * rut_depth(c[POINTS] + 1.5 * SPACING, heights, memory)
-        # Within its rut the heel touches nothing.
+        # Within its rut the heel has no contact.
         if c[HEEL_DEPTH] <= rut_depth(c[POINTS + 2], heights, memory):
             c[HEEL_DEPTH] = 0.0
     c[DEPTH] = min(uncut - c[POINTS + 1], DEEPEST)
@@ -322,7 +322,7 @@ def engage_back(w1: float, w2: float, w3: float, ground: Ground, c: Array) -> No
         push *= outward * strength(ground[0], ground[2], ground[4])[0]
         if tip_lower:
             c[DRAG] += push
-            # Its friction lifts the floor plate, the more so the steeper that stands.
+            # Friction on the back lifts the floor plate, more at steeper angles.
             c[ACROSS] += push * back[bucket_back.LIFT] * -c[EDGE_Y]
         else:
             c[SLIDE] += push
@@ -350,7 +350,7 @@ def torques(c: Array, w1: float, w2: float, w3: float) -> tuple[float, float, fl
 
 @compiled
 def hold(w1: float, w2: float, w3: float, c: Array) -> None:
-    """Turn forces of a size into dampers for one step, from the velocities at its beginning.
+    """Convert forces of constant magnitude to dampers for one step, from the velocities at its start.
 
     Force over speed does not move within a step: both stages of the integrator see the linear damper that its
     Jacobian knows. A force that keeps its size while the velocity turns round is what ROS2 would amplify, by 2.4 a

@@ -1,7 +1,7 @@
 """Effect of faults on sensor readings at one sample; part of the chain, see `edp.sim.sensors.chain`.
 
-A fault is a row of a table (what happens, to which value, and with which other one), a number a tick (0 for nothing)
-and a row of memory. Faults act in the order of their rows.
+A fault is a row of a table (operation, affected value, second value), one number per sample (0: no effect) and a row of
+memory. Faults act in the order of their rows.
 """
 
 from __future__ import annotations
@@ -34,12 +34,13 @@ def alter(
     """Put faults into the values of one tick, in place.
 
     Args:
-        tick: counted from 0; ticks are taken in order.
+        tick: index of the sample from 0; samples are processed in order.
         sizes: the number of each fault at this tick, shape (fault,).
         table: shape (fault, COLUMNS).
         memory: shape (fault, values), which must be at least as wide as a delay in ticks and 2.
-        pressures: first value that a transmitter cuts and rounds, the one behind the last, its range and its quantum.
-        out: the values.
+        pressures: index of the first pressure, index after the last pressure, range and quantisation step of the
+            transmitters.
+        out: sensor values; updated in place.
     """
     first, behind, full_scale, quantum = pressures
     for f in range(table.shape[0]):
@@ -51,7 +52,7 @@ def alter(
                 memory[f, 0] = x
             y = memory[f, 0]
         elif what == LAG:
-            # At 0 the memory follows, so that a lag begins at what was shown last.
+            # Without a fault the memory follows the value, so that a lag begins at the previous reading.
             memory[f, 0] = x + size * (memory[f, 0] - x) if size > 0.0 and tick > 0 else x
             y = memory[f, 0]
         elif what == DELAY:
@@ -75,7 +76,7 @@ def alter(
                 b = int(table[f, OTHER])
                 y = out[b]
                 out[b] = x
-        # The fault sits in the element that feels; range and converter of the transmitter come behind it.
+        # The fault is in the sensing element, before the range and the converter of the transmitter.
         if first <= a < behind and size != 0.0 and what in (OFFSET, SCALE, LAG):
             y = transducers.quantised(transducers.limited(y, full_scale), quantum)
         out[a] = y

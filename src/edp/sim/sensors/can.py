@@ -18,7 +18,7 @@ class Bus:
         period: time between two frames of an ECU.
         latency: shortest and longest time from taking a value to its arrival at the logger.
         jitter: rms of the latency from frame to frame, before it is cut to its bounds.
-        loss: share of frames that never arrive.
+        loss: fraction of lost frames.
     """
 
     period: float
@@ -52,7 +52,7 @@ def frames(samples: int, rate_hz: float, bus: Bus, phase: float, latency_s: floa
         samples: samples of the recording.
         rate_hz: their rate.
         bus: timing of the bus.
-        phase: the ECU's clock against the logger's, as a share of the period.
+        phase: time offset between the clocks of the ECU and of the logger, as a fraction of the period.
         latency_s: usual latency of this ECU.
         rng: source of jitter and losses.
     """
@@ -65,10 +65,10 @@ def frames(samples: int, rate_hz: float, bus: Bus, phase: float, latency_s: floa
     count = before + int(np.ceil(samples / rate_hz / bus.period)) + 1
     sample_times = np.asarray((np.arange(count) - before + phase) * bus.period, dtype=np.float64)
     latency = np.clip(latency_s + rng.normal(0.0, bus.jitter, count), *bus.latency)
-    # Frames of one ECU keep their order: a late one holds up those behind it.
+    # Frames of one ECU keep their order: a late frame delays the following frames.
     arrivals = np.maximum.accumulate(sample_times + latency) * rate_hz
     lost = rng.random(count) < bus.loss
-    # The first frame always arrives, or the first samples would have nothing to show.
+    # The first frame always arrives, because the first samples need a value.
     lost[0] = False
     arrived = np.flatnonzero(~lost)
     seen = arrived[np.searchsorted(arrivals[arrived], ticks, side="right") - 1]

@@ -1,7 +1,7 @@
 """Sensor and bus model for one logged sample; the only implementation of the chain.
 
-Recordings and episodes run the same compiled function, the former over all rows of a log, the latter a row at a time.
-Everything random of a recording is drawn before it begins (`edp.sim.sensors.draws`), one row a tick.
+Recordings and episodes run the same compiled function: recordings for all rows of a log, episodes row by row. All
+    random values of a recording are generated before it begins (`edp.sim.sensors.draws`), one row per sample.
 """
 
 from __future__ import annotations
@@ -16,19 +16,20 @@ from edp.sim.sensors import alterations, filters, transducers
 
 Array = NDArray[np.float64]
 REFERENCE_TEMPERATURE = 313.15
-"""Oil temperature in K at which pressure transmitters are adjusted (40 degC)."""
+"""Oil temperature at which pressure transmitters are calibrated, K (40 degC)."""
 MEASURED = 24
-"""Signals of Table A.1."""
+"""Names of the signals of Table A.1."""
 STROKES, PUMPS, OIL = 24, 27, 29
 SENSED = 30
-"""What is shown in all: behind Table A.1 strokes, pump pressures and oil temperature, which have no noise."""
+"""Names of all observable signals: Table A.1, then strokes, pump pressures and oil temperature, which have no noise."""
 VELOCITIES, PRESSURES, PILOTS = 0, 6, 12
 
 # drawn[tick, ...]: when the values that each ECU shows were read, in ticks; bias and errors of joint rates (rad/s),
 # errors of cylinder velocities (m/s) and pressures (Pa)
 AT_JOINTS, AT_PRESSURES, AT_VALVES, RATE_BIAS, RATE_ERROR, VELOCITY_ERROR, PRESSURE_ERROR = 0, 1, 2, 3, 6, 9, 12
 DRAWS = 18
-"""Behind them, one column a fault of the sensors: its number of the tick, see `edp.sim.sensors.alterations`."""
+"""Number of random values per sample. One column per sensor fault follows with the fault value of the sample, see
+`edp.sim.sensors.alterations`."""
 # numbers[...]: sizes of one machine's sensors at one rate
 (
     NOISY, STEP_S, PILOT_FULL, DERIVATIVE, LAGGED, LAG, RANGE, QUANTUM, DRIFT, ANGLE_QUANTUM, LEVERED, PLAYING, PLAY,
@@ -43,7 +44,7 @@ SENSOR_MEMORY = 30
 VELOCITY, ANGLE, RATE, PRESSURE, TEMPERATURE, DEMAND = 0, 3, 6, 9, 15, 16
 REMEMBERED = 22
 Setup = tuple[Array, Array, Array, Array]
-"""Numbers of the sensors, `axes` and `plant` of the machine as built, and the table of faults."""
+"""Configuration of the sensors: sensor parameters, `axes` and `plant` of the machine as built, and table of faults."""
 State = tuple[Array, Array, Array, Array]
 
 
@@ -88,7 +89,7 @@ def between(history: Array, position: float) -> tuple[Array, Array, float]:
     """Return the stored rows around a position in samples, and the interpolation weight of the second."""
     low = int(position)
     part = position - low
-    # At a tick itself the one behind it may not have come yet.
+    # At the time of a sample the next sample may not be available.
     high = low + 1 if part > 0.0 else low
     return history[low % history.shape[0]], history[high % history.shape[0]], part
 
@@ -106,7 +107,8 @@ def read_joints(drawn: Array, setup: Setup, history: Array, out: Array) -> None:
             shown = transducers.quantised(angle, numbers[ANGLE_QUANTUM])
             lever = linkage.cylinder(i, shown, plant)[1]
             error = drawn[RATE_BIAS + i] + drawn[RATE_ERROR + i]
-            # The play is in the velocity already; added is what angle quantum and rate error change of J times rate.
+            # The velocity already includes the play; add the effect of angle quantisation and rate error on J times
+            # rate.
             v = v + (lever - linkage.cylinder(i, angle, plant)[1]) * rate + lever * error
         out[i] = v + drawn[VELOCITY_ERROR + i]
 
@@ -121,7 +123,7 @@ def read_pressures(drawn: Array, numbers: Array, history: Array, out: Array) -> 
         p = low[PRESSURE + n] + part * (high[PRESSURE + n] - low[PRESSURE + n])
         p = p + numbers[RANGE] * (numbers[OFFSET + n] + drift)
         p = p + drawn[PRESSURE_ERROR + n]
-        # In the order of a transmitter: the converter sees what the range has cut.
+        # In the order of a transmitter: first the range limit, then the converter.
         out[6 + n] = transducers.quantised(transducers.limited(p, numbers[RANGE]), numbers[QUANTUM])
 
 
@@ -160,13 +162,13 @@ def sense(
 ) -> None:
     """Write the 24 signals of Table A.1 and the additional observed values at one sample to `out`, shape (SENSED,).
 
-    Ticks must be taken in order from 0, which starts everything in steady state.
+    Samples must be processed in order from 0, which starts the chain in steady state.
 
     Args:
-        sample: the tick's row of the log, shape (1, columns).
-        kelvin: oil temperature.
-        tick: counted from 0.
-        drawn: the tick's row of `draws.draw`.
+        sample: row of the log, shape (1, columns).
+        kelvin: oil temperature, K.
+        tick: index of the sample, from 0.
+        drawn: random values of the sample, a row of `draws.draw`.
         setup: result of `draws.pack_sensors`.
         state: memory, history (a ring of ticks), scratch of shape (2, 3) and memory of the faults.
         out: filled.

@@ -15,7 +15,7 @@ from edp.sim.sensors import alterations, can, chain, filters, transducers
 
 Array = NDArray[np.float64]
 ECUS = ("joints", "pressures", "valves")
-"""Senders on the bus: rates of the joints, cylinder pressures, and pilot demands."""
+"""Names of the control units that send on the bus: joint rates, cylinder pressures and pilot demands."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,9 +23,9 @@ class Instance:
     """Properties that differ between machines of one type and are constant over recordings.
 
     Attributes:
-        pressure_offset: offsets of the six cylinder pressures as a share of full scale.
-        phase: clock of each of `ECUS` against the logger's, as a share of the frame period.
-        latency_s: usual latency of each of them.
+        pressure_offset: offsets of the six cylinder pressures, as fractions of full scale.
+        phase: time offset between the clocks of each of `ECUS` and of the logger, as a fraction of the frame period.
+        latency_s: mean latency of each of `ECUS`, s.
     """
 
     pressure_offset: Array
@@ -51,7 +51,7 @@ def draw(machine: Machine, samples: int, rate_hz: float, rng: np.random.Generato
     Args:
         machine: machine with the ``[sensors]`` to use.
         samples: number of samples.
-        rate_hz: their rate.
+        rate_hz: sample rate, Hz.
         rng: source of noise, bias, jitter and losses of this recording.
     """
     drawn = np.zeros((samples, chain.DRAWS))
@@ -92,7 +92,7 @@ def _bus(machine: Machine, samples: int, rate_hz: float, rng: np.random.Generato
     """Return the frames of each of `ECUS`, with independent random values."""
     own, instance = machine.sensors, instance_of(machine)
     bus = can.Bus(own.can_period, own.can_latency, own.can_jitter, own.can_loss)
-    # A generator each: what one ECU draws does not move the noise of the others.
+    # Each ECU has its own generator, so that one ECU does not change the noise of the others.
     each = zip(instance.phase, instance.latency_s, rng.spawn(len(ECUS)), strict=True)
     return [can.frames(samples, rate_hz, bus, phase, latency, child) for phase, latency, child in each]
 

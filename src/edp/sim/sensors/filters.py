@@ -11,14 +11,15 @@ from edp.sim.physics.jit import compiled, inlined
 
 Array = NDArray[np.float64]
 DERIVATIVE_DAMPING = 0.7
-"""Share of critical: nearly flat up to the bandwidth, with hardly any overshoot of the acceleration."""
+"""Damping ratio of the derivative filter: nearly flat up to the bandwidth, with little overshoot of the acceleration.
+"""
 
 
 @inlined
 def biquad(x: float, numbers: Array, state: Array) -> float:
     """Return one sample of a filter of order two with a[0] = 1, transposed direct form II.
 
-    `numbers` is b[0], b[1], b[2], a[1], a[2]; `state`, two values, goes on.
+    `numbers` contains b[0], b[1], b[2], a[1], a[2]; `state` (two values) is updated.
     """
     y: float = numbers[0] * x + state[0]
     state[0] = numbers[1] * x - numbers[3] * y + state[1]

@@ -46,7 +46,7 @@ def write_events(
     if motors is not None and places.relieved(motors):
         relief = 1.0
     first, second = pump.asked(state, valves, axes, plant, motors)
-    # Demand, not displacement: the limit acts where more power is asked for than there is.
+    # Use the demand and not the displacement: the limit acts if the demanded power exceeds the available power.
     power = plant[at.MAX_FLOW] * (first * state[at.PUMP] + second * state[at.PUMP + 1])
     if power > plant[at.POWER_LIMIT]:
         limited = 1.0

@@ -12,7 +12,7 @@ from edp.sim.sensors import alterations, chain, draws
 Array = NDArray[np.float64]
 OIL = "OilTemperature"
 KELVIN = 273.15
-"""0 degC: logs of the plant have degC, recordings K."""
+"""Offset from degC to K. Plant logs use degC, recordings use K."""
 
 
 def measure_signals(
@@ -70,7 +70,7 @@ def observe_signals(
 def truth_columns(width: int) -> dict[str, int]:
     """Return the columns of a log with this width by the names of `EXTRA_CHANNELS`.
 
-    Behind them those of `GROUND_CHANNELS` in soil, then of `MOTOR_CHANNELS` where swing and travel move.
+    In soil the columns of `GROUND_CHANNELS` follow, then `MOTOR_CHANNELS` if swing and travel move.
     """
     columns: dict[str, int] = {}
     for m in range(2):

@@ -13,7 +13,7 @@ from edp.networks.twin.scales import TwinScales
 
 Doubles = NDArray[np.float64]
 FARTHEST_TURN = 1e6
-"""rad in either direction, 160,000 turns: bounds of a free angle that no run reaches."""
+"""Bound of an unlimited angle in either direction, rad (160,000 turns). No simulation reaches the bound."""
 
 
 @dataclass(frozen=True, eq=False)

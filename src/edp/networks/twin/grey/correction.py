@@ -21,8 +21,9 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Singles = NDArray[np.float32]
 LARGEST = 1e3
-"""Maximum gradient by a state; beyond it the earlier samples of that run are left out of the gradient. A gradient of a
-mean loss grows this much only in chaotic runs (a chattering check valve, an end stop), where it has no meaning."""
+"""Maximum gradient by a state. For a larger gradient, the earlier samples of the run are omitted. The gradient of a
+mean loss becomes this large only in chaotic simulations (a chattering check valve, an end stop), where it has no
+meaning."""
 
 
 class OutputBounds(NamedTuple):

@@ -93,12 +93,12 @@ class MotorElement:
         name: name used by valves.
         velocity: channel of its angular velocity, positive where oil goes from `a` to `b`.
         angle: channel of its angle; empty: the one of the velocity, where positions are measured.
-        a: channel of the pressure at the port that extension feeds; empty: not measured.
-        b: channel of the pressure at the other port; empty: not measured.
+        a: channel of the pressure at the port fed in positive direction; empty if not measured.
+        b: channel of the pressure at the other port; empty if not measured.
         displacement: displacement of one motor, m^3/rad; 0 if unknown, to be fitted from its prior.
-        count: motors side by side on one shaft.
-        load_by_angle: whether inertia and potential depend on its angle, which must be measured then and stays where it
-            was in the training data; otherwise it turns without end, and no load depends on it.
+        count: number of motors on one shaft.
+        load_by_angle: whether inertia and potential depend on the angle. The angle must then be measured and stays
+            within the range of the training data. Otherwise the angle is unlimited, and no load depends on it.
 
     Raises:
         ConfigError: a size out of range.
@@ -147,7 +147,7 @@ class ValveElement:
         retract: channel that commands retraction.
         supply: name of the pump; empty: a supply of constant pressure.
         meter_out: whether it opens the other chamber to the tank, too; a second spool may only feed.
-        regeneration: whether a part of what leaves goes to the other chamber.
+        regeneration: whether a part of the outflow returns to the other chamber.
     """
 
     name: str
@@ -185,7 +185,7 @@ def default_elements(channels: TwinChannels) -> Elements:
     """Return the elements derived from channels: a cylinder or motor per velocity, a spool per command.
 
     Raises:
-        ConfigError: pressures whose place they do not tell.
+        ConfigError: pressures that cannot be assigned to a chamber.
     """
     every = channels.commands + channels.answers
     names = {channel.name for channel in channels.answers}
@@ -223,7 +223,7 @@ def _actuator(name: str, velocity: Channel, pressures: Sequence[str], angles: bo
     """Return a cylinder, or a motor for an angular velocity."""
     first, second = (*pressures, "", "")[:2]
     if velocity.kind is Kind.ANGULAR_VELOCITY:
-        # A measured angle may be that of a joint, which gravity turns: nothing tells that it is not.
+        # A measured angle may belong to a joint with a gravity load, so the load depends on it.
         return MotorElement(name=name, velocity=velocity.name, a=first, b=second, load_by_angle=angles)
     return CylinderElement(name=name, velocity=velocity.name, head=first, rod=second)
 

@@ -23,9 +23,10 @@ from edp.networks.twin.grey import parameter_index as at
 SMOOTH2 = 0.1**2
 """Square of the pressure difference below which orifice flow becomes laminar, MPa^2."""
 CHECK = 1e-3
-"""Backward flow of a load check as a fraction of its forward flow; above zero, so that a closed check has a slope."""
+"""Backward flow of a load check valve as a fraction of its forward flow. It is above zero, so that a closed valve has a
+derivative."""
 IDLE = 1e-9
-"""Minimum pump power in a division, MW."""
+"""Minimum pump power in a denominator, MW."""
 MISSING = 65535
 """Missing entry in arrays of unsigned integers."""
 GAMMA = 1.0 - 1.0 / math.sqrt(2.0)

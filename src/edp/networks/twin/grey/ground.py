@@ -1,7 +1,7 @@
-"""Laws of the ground under a grey box with a known linkage: what resists the tip of the bucket below the surface.
+"""Ground laws for a grey box with a known linkage: forces on the bucket tip below the surface.
 
-A law is one file and one registration in `GROUNDS`. It is fitted to forces that logs in soil show (see
-`edp.training.ground_fit`); it belongs to the bundle of a twin and acts where a loop asks for a material.
+A law is one file and one registration in `GROUNDS`. It is fitted to forces estimated from logs in soil (see
+`edp.training.ground_fit`), is stored in the bundle of a twin, and acts in control loops with a material.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 RENEWED_TICKS = 5
-"""After how many ticks in the ground the effect of a force on the velocities is asked for again."""
+"""Interval in samples at which the effect of a force on the velocities is computed again while the bucket is in the
+ground."""
 
 
 class GroundContact(ABC):
@@ -35,7 +36,7 @@ class GroundContact(ABC):
         """Return forces against the actuators (N) in the next sample.
 
         Args:
-            strokes: before it, of each actuator, m.
+            strokes: strokes of all actuators before the sample, m.
             free: velocities after it without any ground, m/s.
             slopes: derivatives of the velocities by a force against each actuator ``(actuator, actuator)``, m/s per N.
         """
@@ -50,7 +51,7 @@ class GroundLaw(ABC):
 
     Attributes:
         numbers: parameters of the law, SI units.
-        deviations: standard errors of these; an infinite one says that the logs do not tell.
+        deviations: standard errors of the parameters; infinite if the logs do not identify a parameter.
     """
 
     numbers: Array
@@ -64,7 +65,7 @@ class GroundLaw(ABC):
         Args:
             twin: twin with a known linkage.
             logs: strokes, velocities and estimated forces against each actuator, ``(tick, actuator)`` each, SI units.
-            machine: name or file of the machine, which says where the surface is.
+            machine: name or file of the machine, which defines the height of the ground surface.
 
         Raises:
             DataError: the logs are hardly ever in the ground.
@@ -88,7 +89,7 @@ class GroundLaw(ABC):
         """Create the law from the result of `to_dict`.
 
         Raises:
-            ValueError: it is damaged; likewise KeyError and TypeError.
+            ValueError: the dictionary is damaged; KeyError and TypeError have the same cause.
         """
 
     @property
@@ -109,8 +110,8 @@ GROUNDS: Registry[type[GroundLaw]] = Registry("ground")
 class GroundedRunner(TwinRunner):
     """Runner whose machine is in contact with a ground.
 
-    What the ground does in a tick belongs to the velocity at its end, as a stage of the grey box does: an explicit
-    force of some 10 kN that turns with the velocity would swing from tick to tick.
+    The ground force of a sample depends on the velocity at its end, as in an implicit stage of the grey box. An
+    explicit force of about 10 kN that changes sign with the velocity would oscillate from sample to sample.
 
     Args:
         twin: a grey box with a known linkage.

@@ -22,21 +22,23 @@ Array = NDArray[np.float64]
 compiler = Compiler("grey_ground", lambda: (*jit.compiler.sources(), Path(__file__)))
 compiled, inner = compiler.compiled, compiler.inner
 CELL_M = 0.05
-"""Of the profile of the ground."""
+"""Cell size of the ground profile, m."""
 AHEAD_M = 0.075
-"""Before the edge, where the ground is that it has not cut yet: the cell of the edge itself is down to it already."""
+"""Distance ahead of the bucket edge at which the uncut ground height is read, m. The cell of the edge itself is already
+cut."""
 CREEP = 0.02
-"""Speed (m/s) over which the direction of a force is smoothed."""
+"""Speed (m/s) over which the direction of a ground force is smoothed."""
 TURNING = 0.05
-"""Speed (m/s) over which a force changes from that of one direction to that of the other."""
+"""Speed (m/s) over which a ground force changes from the value of one direction to that of the opposite direction."""
 EDGE_M = 0.05
-"""Depth at which the whole edge is in the ground."""
+"""Depth at which the whole bucket edge is in the ground, m."""
 INWARDS, OUTWARDS, DOWN, UP, ACROSS = 0, 3, 6, 9, 12
-"""First of the numbers of each direction: of the edge, by depth and by its square; across has those by depth alone."""
+"""Index of the first ground parameter of each direction. Each direction has three parameters (edge, by depth, by depth
+squared); ``ACROSS`` has one (by depth)."""
 NUMBERS = 13
-"""In which forces are linear."""
+"""Number of ground parameters. The ground forces are linear in them."""
 ROUNDS = 4
-"""Of the velocity at the end of a tick and the damper that belongs to it."""
+"""Number of fixed-point iterations between the velocity at the end of a sample and the damping at this velocity."""
 
 
 @inner
@@ -47,8 +49,8 @@ def tip_at(linkage: Array, bucket_m: float, strokes: Array, tip: Array, slopes: 
         linkage: linkage of `parameter_index`.
         bucket_m: length of the last body, m.
         strokes: ``(actuator,)``, m.
-        tip: written ``(2,)``, m.
-        slopes: written ``(2, actuator)``.
+        tip: result: position of the tip ``(2,)``, m.
+        slopes: result: derivatives of the position by the strokes, ``(2, actuator)``.
     """
     slopes[:] = 0.0
     x, y, angle = 0.0, 0.0, 0.0
@@ -137,12 +139,12 @@ def hold(
 
     Args:
         front: linkage and length of the bucket, as `tip_at` reads them.
-        strokes: before the tick ``(actuator,)``, m.
+        strokes: strokes before the sample ``(actuator,)``, m.
         free: velocities after it without any ground ``(actuator,)``, m/s.
         slopes: derivatives of the velocities by a force against each actuator ``(actuator, actuator)``, m/s per N.
         numbers: parameters of the law ``(NUMBERS,)``.
         memory: profile, which is cut, and x of the tip before ``(1,)``.
-        forces: written ``(actuator,)``, N.
+        forces: result: ground forces ``(actuator,)``, N.
     """
     profile, last = memory
     n = len(strokes)
@@ -189,8 +191,8 @@ def follow(
         strokes: ``(tick, actuator)``, m.
         velocities: ``(tick, actuator)``, m/s.
         profile: cut along the log.
-        tips: written: depth (m) and speed (m/s) ``(tick, 2)``.
-        terms: written ``(tick, NUMBERS, actuator)``, N by each number.
+        tips: result: depth (m) and speed (m/s) of the tip ``(tick, 2)``.
+        terms: result: force per unit of each ground parameter ``(tick, NUMBERS, actuator)``, N.
     """
     ticks, n = strokes.shape
     tip, by, one = np.empty(2), np.empty((2, n)), np.zeros(NUMBERS)

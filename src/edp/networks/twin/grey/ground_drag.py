@@ -5,10 +5,10 @@ At a depth d below ground that the edge has not cut yet, and a velocity w of the
     F_x = -w_x / |w| A_x(d) - w_y / |w| c d,  F_y = -w_y / |w| A_y(d) + w_x / |w| c d
     A(d) = a min(d / 5 cm, 1) + b d + e d^2
 
-A has numbers of its own inwards, outwards, downwards and upwards, none below zero; c acts inwards only. The first part
-is the edge, which meets the same strength wherever it is, the others are what is cut loose (the earthmoving equation is
-quadratic in the depth). |w| is smoothed over `CREEP`. The ground is level before it is cut: a mean over uneven heights
-explained forces a little better, but began softly, and loops hunted on it that the machine damps (docs/journal).
+A has separate non-negative parameters inwards, outwards, downwards and upwards; c acts inwards only. The first term is
+the constant resistance of the edge, the others are the cut soil (the earthmoving equation is quadratic in the depth).
+|w| is smoothed over `CREEP`. The ground is level before it is cut: a mean over uneven heights explained forces a little
+better, but began softly, and loops hunted on it that the machine damps (docs/journal).
 """
 
 from __future__ import annotations
@@ -42,14 +42,15 @@ PARAMETERS = [
 ]
 PARAMETERS += [Parameter("ground", "across_by_depth", "N/m", 1.0, 0.0, 5e4, positive=False)]
 PLAUSIBLE = Priors.from_parameters(PARAMETERS).width
-"""Prior standard deviations of the numbers."""
+"""Prior standard deviations of the ground parameters."""
 MIN_DEPTH, MIN_SPEED = -0.1, 0.03
-"""Rows of a fit are at least as deep (m), and at least as fast (m/s): in steady state friction outputs, whatever the
-ground."""
+"""Minimum depth (m) and minimum speed (m/s) of the rows of a fit. In steady state the force is determined by friction
+and not by the ground."""
 CLEAR_M = 0.3
-"""Above the surface; forces that the logs show there are errors of the equations, and are taken off."""
+"""Height above the ground surface at which the bucket is in free air, m. Ground forces estimated there are model errors
+and are subtracted."""
 BLOCK = 200
-"""Ticks whose errors are taken as one: they lie close together."""
+"""Number of consecutive samples whose errors count as one, because neighbouring errors are correlated."""
 ROUNDS, HUBER = 4, 1.345
 MIN_ROWS = 500
 METRES, BUCKET = span(-20.0, 20.0), above(0.0, 20.0)
@@ -168,7 +169,7 @@ class DragLaw(GroundLaw):
             tips, terms = np.empty((len(strokes), 2)), np.empty((len(strokes), contact.NUMBERS, strokes.shape[1]))
             contact.follow(self._front(twin), strokes, velocities, self._level(twin), tips, terms)
             depths, speeds = tips.T
-            # Estimates follow what acts with a lag; so do the terms.
+            # Estimated forces lag behind the actual forces, so the terms get the same lag.
             terms = lfilter([LOG_SHARE], [1.0, LOG_SHARE - 1.0], terms, axis=0)
             clear = depths < -CLEAR_M
             bias = np.median(forces[clear], axis=0) if clear.sum() > BLOCK else np.zeros(strokes.shape[1])
@@ -204,6 +205,6 @@ def _solve_parameters(terms: Array, forces: Array, blocks: NDArray[np.int64]) ->
     np.add.at(sums, np.unique(blocks, return_inverse=True)[1], slopes)
     inverse = np.linalg.inv(information)
     spread = np.sqrt(np.diag(inverse @ (sums.T @ sums) @ inverse))
-    # Without a tick in which the number acts, the logs say nothing of it.
+    # A parameter that acts in no sample is not identifiable from the logs.
     seen = np.abs(terms).sum(axis=(0, 2)) > 0.0
     return x * PLAUSIBLE, np.where(seen, spread * PLAUSIBLE, np.inf)

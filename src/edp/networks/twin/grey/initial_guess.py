@@ -2,8 +2,8 @@
 
     A_A p_A = A_B p_B + M v' + grad U(s) + F_C sign(v) + F_v v
 
-For a motor these are torques, and both areas are its displacement. The balance is linear in all that is not known, so
-it needs no starting values of its own. Pose-dependent inertia is left to the fit on free runs.
+For a motor these are torques, and both areas are its displacement. The balance is linear in all unknown parameters, so
+it needs no initial values. Pose-dependent inertia is fitted later on free-run simulations.
 """
 
 from __future__ import annotations
@@ -21,19 +21,21 @@ from edp.networks.twin.grey.parameters import ParameterTable
 
 Array = NDArray[np.float64]
 REACH = 2
-"""Ticks before and after over which velocities are differenced: noise falls, and swings of a few Hz stay."""
+"""Number of samples before and after a sample over which velocities are differentiated. The interval reduces noise and
+keeps oscillations of a few Hz."""
 FEW = 40_000
-"""Rows that are solved for at most."""
+"""Maximum number of rows in the initial fit of the load."""
 MIN_INERTIA = 0.02
-"""Of what is plausible."""
+"""Minimum inertia as a fraction of the prior mean."""
 SHARE_RANGE = (0.2, 1.0)
-"""Of rod area by head area; values outside are not believed."""
+"""Accepted ratio of rod-side area to head-side area. Estimates outside this range are not used."""
 MIN_ERROR = 0.02
-"""Of the forces, as a share of their deviation: rows never agree better with what the bodies leave out."""
+"""Minimum error of the forces, as a fraction of their standard deviation: the rigid-body model omits some effects."""
 INDEPENDENT = 1_000
-"""Rows that many rows count as: neighbours say the same."""
+"""Number of independent rows that all rows count as, because neighbouring rows are correlated."""
 LIMITS = DescentLimits(steps=30, tries=12, radius=np.inf, ftol=1e-9)
-"""The balance is nearly linear in the bodies, so steps are not bounded."""
+"""Limits of the initial fit. The force balance is nearly linear in the body parameters, so the step size is unlimited.
+"""
 
 
 def load_start(
@@ -47,12 +49,12 @@ def load_start(
     """Return nominal parameters; the load parameters come from the force balance if everything is measured.
 
     Args:
-        table: of numbers.
+        table: parameters with their priors.
         train: training segments.
-        columns: of velocity, stroke, head and rod pressure of each actuator among the outputs; -1: not measured.
+        columns: output columns of velocity, stroke, head and rod pressure of each actuator; -1 if not measured.
         z_of: middle and scale of the strokes.
         rate_hz: samples per second.
-        declared: whether the areas of each actuator are known, or one follows of the other.
+        declared: whether both areas of each actuator are known, or one area follows from the other.
     """
     values = table.nominal
     by_stroke = np.asarray(table.exponents.any(axis=0)) | (len(table.linkage) > 0)
@@ -95,7 +97,7 @@ def _balance_bodies(table: ParameterTable, matrix: Array, goal: Array) -> tuple[
         goal: forces in the same unit ``(row,)``.
     """
     bodies, others = matrix[:, : at.BASE], matrix[:, at.BASE :]
-    # All else is solved for, given the bodies: what is left is a square form in the nine numbers.
+    # All other parameters are eliminated for given bodies, which leaves a quadratic form in the nine body parameters.
     normal = others.T @ others
     normal += 1e-9 * np.diag(np.maximum(np.diag(normal), 1e-30))
     of_bodies, of_goal = np.linalg.solve(normal, others.T @ bodies), np.linalg.solve(normal, others.T @ goal)
@@ -157,7 +159,7 @@ def _insert_solution(table: ParameterTable, solution: Array, declared: Sequence[
     mass = np.zeros((n, n))
     for k, (p, r) in enumerate(inertia):
         mass[p, r] = mass[r, p] = solution[k]
-    # In plausible inertias of each actuator: those of a motor may be a millionth of a cylinder's.
+    # Scale by the prior inertia of each actuator: the inertia of a motor may be a millionth of a cylinder's.
     start = np.diag([values[table.inertia_at + k * table.inertia_terms] for k, (p, r) in enumerate(inertia) if p == r])
     moments, vectors = np.linalg.eigh(np.linalg.solve(start, np.linalg.solve(start, mass).T))
     # At least a fiftieth of it along each direction (200 kg): noise must not make an inertia negative.

@@ -9,7 +9,7 @@ from edp.storage.machine_code import Compiler, files_with
 _FOLDER = Path(__file__).parent
 compiler = Compiler(
     "grey",
-    # The cell on top of a grey box is that of the recurrent twin.
+    # The correction network of a grey box uses the cell of the recurrent twin.
     lambda: (
         _FOLDER / "parameter_index.py",
         _FOLDER / "equations.py",

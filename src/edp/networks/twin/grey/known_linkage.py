@@ -20,16 +20,18 @@ from edp.wording import typed
 Array = NDArray[np.float64]
 Singles = NDArray[np.float32]
 BODY_NAMES = ("boom", "arm", "bucket")
-"""Cylinders by what they turn, from the first joint on, as in machine files."""
+"""Names of the bodies that the cylinders turn, from the first joint on, as in machine files."""
 GIGA = 1e6
 """Factor from Gg to kg."""
 BEYOND = 0.03
-"""Fraction of the machine's stroke by which recordings may leave it, for sensor offsets and compliant stops."""
+"""Fraction of the machine's stroke by which recorded strokes may exceed its ends, to allow for sensor offsets and
+compliant stops."""
 ANGLE_STEP = 1e-5
-"""rad by which a lever arm is differenced: half of the digits are left, 1e-10 of it."""
+"""Angle step for the numerical derivative of a lever arm, rad. The relative error is about 1e-10."""
 MASS_WIDTH, CENTRE_WIDTH, INERTIA_WIDTH = 0.5, (0.15, 0.1), 0.6
-"""Plausible deviations of a body from that of the machine file: of the logarithms of mass and inertia, and of its
-centre of gravity along and across, as shares of its length. Buckets are changed, lines and oil are rarely weighed."""
+"""Prior standard deviations of a body relative to the machine file: logarithm of the mass, centre of mass along and
+across the body (fractions of its length), and logarithm of the inertia. They allow for other buckets and for the mass
+of lines and oil."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +39,8 @@ class KnownLinkage:
     """Three bodies in a row, each turned by one cylinder.
 
     Attributes:
-        values: as `parameter_index` orders them ``(LINKAGE_VALUES,)``, rounded to what a bundle keeps.
+        values: linkage parameters in the order of `parameter_index` ``(LINKAGE_VALUES,)``, rounded to the precision of
+            a bundle.
         bodies: mass (Gg), centre of gravity (m) and inertia about it (Gg m^2) of each body, in that order; a fit
             starts from them ``(BODIES * BODY_VALUES,)``.
     """
@@ -55,9 +58,9 @@ class KnownLinkage:
         """Read the linkage of a machine.
 
         Args:
-            name: of the machine, or of its file.
-            elements: with cylinders called as `BODY_NAMES`.
-            channels: of the twin.
+            name: name of the machine, or path of its file.
+            elements: elements whose cylinders have the names in `BODY_NAMES`.
+            channels: channels of the twin.
             scales: whose bounds are the ends of the strokes in the recordings.
 
         Raises:
@@ -112,7 +115,7 @@ class KnownLinkage:
         lengths = [*self.values[at.LENGTH : at.JOINTS], 0.0]
         rows = []
         for name, length, own in zip(BODY_NAMES, lengths, self.bodies.reshape(at.BODIES, -1), strict=True):
-            # The last body carries no other one: its centre says how long it is, about half of it.
+            # The last body carries no other body; its length is about twice the distance of its centre of mass.
             size = length or max(2.0 * float(np.hypot(own[at.CENTRE_X], own[at.CENTRE_Y])), 1e-3)
             element = f"{name}_body"
             along, across = (share * size for share in CENTRE_WIDTH)

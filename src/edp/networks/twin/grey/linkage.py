@@ -21,8 +21,8 @@ from edp.networks.twin.grey.jit import inner
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BEYOND = 1.0
-"""Fraction of a segment between knots by which the polynomials continue beyond the first and last knot. Beyond that the
-angle continues linearly, so that a run that leaves the stroke stays finite."""
+"""Fraction of a segment by which the polynomials continue outside the first and last knot. Farther outside, the angle
+continues linearly, so that a simulation that leaves the stroke range stays finite."""
 
 
 @inner

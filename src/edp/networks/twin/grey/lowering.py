@@ -30,7 +30,7 @@ def add_layer(build: Builder, twin: GreyTwin, fed: str) -> str:
     Args:
         build: the layers in the making.
         twin: whose tick it is.
-        fed: what the ports read, scaled.
+        fed: scaled port readings.
     """
     table, wiring, scales = twin.table, twin.wiring, twin.scales
     tick_s, steps = twin.time

@@ -44,7 +44,7 @@ LINKAGE_VALUES = JOINTS + BODIES * JOINT_VALUES
 MASS, CENTRE_X, CENTRE_Y, INERTIA = range(4)
 BODY_VALUES = 4
 BASE = 3 * BODIES
-"""Numbers in which inertia and gravity are linear: two moments and an inertia of each body."""
+"""Number of parameters in which inertia and gravity are linear: two first moments and one inertia per body."""
 
 # valves[j, ...]: pilot (two lags), play, spool (two lags), as shares of full, extension positive
 PILOT_1, PILOT_2, PLAYED, SPOOL_1, SPOOL = range(5)
@@ -59,6 +59,6 @@ OWN = 4
 NONE, BY_PARAMETERS, BY_STATE = range(3)
 
 ATMOSPHERE = 0.1013
-"""MPa; pressures are gauge."""
+"""Atmospheric pressure, MPa. All other pressures are gauge pressures."""
 LEAST_ABSOLUTE = 1e-3
-"""MPa, below which no oil is left that could boil."""
+"""Minimum absolute pressure of oil, MPa."""

@@ -33,15 +33,17 @@ from edp.networks.twin.parameters import Parameter, Priors
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 MAX_ACTUATORS, MAX_VALVES = 12, 48
-"""Maximum numbers of elements: their equations are compiled, which takes seconds and a gigabyte at these sizes."""
+"""Maximum number of actuators and of valves. The equations are compiled, which takes seconds and a gigabyte of memory
+at these sizes."""
 MAX_OF_LOAD = 5_000
-"""Numbers of a load: a fit holds their matrix, 200 MB of it."""
+"""Maximum number of load parameters. The matrix of a fit needs 200 MB at this number."""
 LEFT_OUT = {
     "power_limit": {"power_limit": 1e6},
     "cushions": {"cushion_length": 1.0, "cushion_least": 1.0},
     "play": {"play": 0.0},
 }
-"""What can be left out of the equations: its numbers, and where they do nothing (1 TW, whole outflow, no width)."""
+"""Optional parts of the equations, each with the parameter values that disable the part (1 TW, full outflow, zero
+width)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,13 +133,13 @@ def number_table(
     """Return the parameters of connected elements, with initial values from the data.
 
     Args:
-        elements: connected.
-        travels: of each cylinder.
+        elements: connected elements.
+        travels: travel of each cylinder.
         highest_pump: highest pressure of each pump's line, MPa.
-        degrees: of the polynomials of L and of U.
+        degrees: degrees of the load polynomials L and U.
         left_out: keys of `LEFT_OUT`.
         front: linkage whose bodies are the load; None: polynomials.
-        stretches: of each opening curve, one of `STRETCHES`.
+        stretches: number of segments of each opening curve, one of `STRETCHES`.
 
     Raises:
         ConfigError: the load would have more numbers than can be fitted.
@@ -240,7 +242,7 @@ def _inertia(actuators: Sequence[Actuator], areas: Sequence[float], exponents: I
         unit = "kg^0.5 m" if isinstance(actuator, MotorElement) else "kg^0.5"
         for c in range(a + 1):
             for b, exponent in enumerate(exponents):
-                # 10 t on the diagonal of a cylinder: a start for where nothing is measured.
+                # Start with 10 t on the diagonal of a cylinder if there is no measurement.
                 start = 0.1 * size if a == c and b == 0 else 0.0
                 label = f"inertia_root_{actuator.name}_{actuators[c].name}_{_power(exponent)}"
                 numbers.append(Parameter("load", label, unit, 1e3, start, 0.05 * size, False))

@@ -15,24 +15,28 @@ from edp.wording import typed
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 COARSE = np.array([0.0, 0.1, 0.25, 0.45, 0.7, 1.0])
-"""Knots of an opening curve of five segments, as shares of the spool's travel behind the dead band: denser where
-levers are finer."""
+"""Knots of an opening curve with five segments, as fractions of the spool travel after the dead band. Knots are closer
+at small openings, where levers are more sensitive."""
 STRETCHES = (5, 10, 20)
-"""Of an opening curve. Each number halves the segments of the one before: a finer curve can be a coarser one."""
+"""Numbers of segments of an opening curve. Each number halves the segments of the previous one, so a finer curve can
+reproduce a coarser one."""
 MEGA, LITRE = 1e6, 1e3
 PLAUSIBLE_AREAS = (0.015, 0.008)
-"""m^2, of head and rod side where no bore is known."""
+"""Prior areas of the head side and the rod side of a cylinder with unknown bore, m^2."""
 PLAUSIBLE_FLOW = 0.005
-"""m^3/s at the fastest turning, of which the displacement of a motor follows where it is not known: 300 l/min."""
+"""Prior flow at the highest speed of a motor with unknown displacement, m^3/s (300 l/min). The prior displacement
+follows from this flow."""
 NO_STOP = 1e9
-"""rad. The two stops of a motor stand crossed, the lower one here and the upper one at its negative: no chamber has
-room beyond its own volume then. A cushion that leaves all of the outflow, and a stop without stiffness, do nothing. So
-a motor has the equations of a cylinder, and none of its own."""
+"""Stop position of a motor without stops, rad: the lower stop is at this angle and the upper stop at its negative. The
+chambers then have no volume beyond their dead volume, and the cushions and stops have no effect. A motor can therefore
+use the equations of a cylinder."""
 ACTING_LIMIT = 0.2
-"""Of the power of all pumps at full flow and the highest pressure, where the common limit starts: low enough to act in
-many ticks. A limit that never acts has no slope, and a fit that begins there never finds it."""
+"""Initial limit of the total pump power, as a fraction of the power of all pumps at full flow and maximum pressure. The
+value is low, so that the limit is active in many samples; a limit that is never active has no derivative and cannot be
+fitted."""
 START_CURVE = (0.25, 0.75)
-"""Linear and quadratic share of the opening that a curve starts from: fine control near closed, as spools are cut."""
+"""Linear and quadratic fraction of the initial opening curve: fine control near the closed position, as in usual
+spools."""
 
 
 def opening_knots(stretches: int) -> Array:

@@ -19,7 +19,7 @@ Doubles = NDArray[np.float64]
 SINGLE_TICKS = 4
 """Number of samples of a plan with single steps. Later steps take two samples, where levers change block by block."""
 LONGEST_S = 0.0205
-"""Maximum length of such a step, s: ten steps per period of the fastest load oscillation."""
+"""Maximum length of a step over two samples, s: ten steps per period of the fastest load oscillation."""
 
 
 def goes_twice(twin: GreyTwin) -> bool:
@@ -31,8 +31,8 @@ class GreyRunner(TwinRunner):
     """See `TwinRunner`; states that it makes are in double precision.
 
     Args:
-        twin: that runs.
-        names: of the parts of its state, as compiled code orders them.
+        twin: grey box to simulate.
+        names: names of the state's parts, in the order of the compiled code.
     """
 
     def __init__(self, twin: GreyTwin, names: tuple[str, ...]) -> None:

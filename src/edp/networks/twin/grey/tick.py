@@ -23,7 +23,7 @@ ITERATIONS = 30
 TOLERANCE = 1e-9
 """Maximum Newton step of a solved stage, MPa and m/s; far below the rounding of single precision."""
 LARGEST = 4.0
-"""Maximum change of a pressure in a Newton step, MPa: the slope of a square root holds only nearby."""
+"""Maximum pressure change in a Newton step, MPa. The derivative of a square root is valid only in a small range."""
 
 
 class MachineArrays(NamedTuple):

@@ -1,10 +1,11 @@
 """Shapes of the equations of elements, the same in fits, runs and exported layers."""
 
 SLIP = 0.005
-"""Share of the fastest velocity over which friction turns round; less makes the fit stiff, more lets loads creep."""
+"""Fraction of the highest velocity over which friction changes sign. Smaller values make the fit stiff; larger values
+let loads creep."""
 EDGE = 0.01
-"""Share of a tank's height over which its overflow sets in; a hard edge leaves the fit in valleys of its own."""
+"""Fraction of a tank's height over which the overflow starts. A sharp edge gives the fit additional local minima."""
 SPILL = 0.8
-"""Share of what stands above the edge that leaves in a tick; explicit steps stay stable below 2 a step."""
+"""Fraction of the volume above the edge that leaves in one sample. Explicit steps are stable for fractions below 2."""
 EMPTY = 1e-30
-"""Share of a tank's height below which it counts as this full: a logarithm has no zero."""
+"""Minimum level as a fraction of a tank's height, because the logarithm of zero is undefined."""

@@ -15,11 +15,12 @@ from edp.networks.twin.scales import TwinScales
 
 Doubles = NDArray[np.float64]
 MAX_ELEMENTS = 32
-"""Of a kind; tangents of all numbers run side by side, and twice the elements take four times as long."""
+"""Maximum number of elements of one kind. All derivatives are computed in parallel, so twice the elements take four
+times as long."""
 ZERO = 0.04
-"""Plausible height of a gauge's zero above the orifice, or below it, as a share of the highest level."""
+"""Prior standard deviation of a level gauge's zero relative to the orifice, as a fraction of the highest level."""
 LONGEST_NAME = 64
-"""Of an element: a line of the datasheet holds it."""
+"""Maximum length of an element name. The name must fit a line of the datasheet."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +28,7 @@ class TankElement:
     """A tank that is filled by a pump or by another tank, and leaves through an orifice and over its edge.
 
     Attributes:
-        name: that other tanks call it by.
+        name: name of the tank, to which other tanks refer.
         source: channel that commands the pump, or name of the tank above.
         level: stroke of the twin that measures it; empty: a state that forms in the prefix.
     """
@@ -42,7 +43,7 @@ class MassElement:
     """A mass (or inertia) with a drive and friction.
 
     Attributes:
-        name: for readers.
+        name: name of the mass in reports.
         command: channel of the drive.
         velocity: channel.
     """
@@ -57,7 +58,7 @@ class LagElement:
     """A pressure that follows a command with a lag of first order.
 
     Attributes:
-        name: for readers.
+        name: name of the lag in reports.
         command: channel.
         pressure: channel.
     """
@@ -155,7 +156,7 @@ def lumped_parameters(parts: Parts, channels: TwinChannels, scales: TwinScales) 
     commands = {c.name: float(w) for c, w in zip(channels.commands, scales.command_width, strict=True)}
     rows: list[Parameter] = []
     measured = [answers.index(tank.level) for tank in parts.tanks if tank.level]
-    # A level crosses its own spread as fast as the changes from tick to tick say.
+    # Typical rate of a level: standard deviation of its changes per sample, relative to its own, times the sample rate.
     speed = [float(scales.change_width[i] / scales.answer_width[i]) * channels.rate_hz for i in measured]
     rate = float(np.mean(speed)) if speed else 0.1 * channels.rate_hz
     for tank in parts.tanks:
@@ -168,7 +169,7 @@ def lumped_parameters(parts: Parts, channels: TwinChannels, scales: TwinScales) 
             else Parameter(tank.name, "spilled_into", "1", 1.0, 0.7, 0.5),
             Parameter(tank.name, "outflow", "1/s", 1.0, rate, 1.0),
             Parameter(tank.name, "exponent", "1", 1.0, 0.5, 0.4),
-            # Nothing tells how high a tank is whose level is not measured: it counts in shares of its height.
+            # The height of a tank with an unmeasured level is unknown, so its level is a fraction of the height.
             Parameter(tank.name, "edge", "m", 1.0, 1.03 * full, 0.1)
             if tank.level
             else Parameter(tank.name, "start", "1", 1.0, 0.6, 0.3),

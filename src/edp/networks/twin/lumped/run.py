@@ -14,7 +14,7 @@ from edp.networks.twin.lumped.constants import EDGE, EMPTY, SLIP, SPILL
 from edp.networks.twin.lumped.jit import compiled, inner
 
 Values = NDArray[Any]
-"""Real, or complex where the imaginary part carries a derivative."""
+"""Real array, or complex array whose imaginary part carries a derivative."""
 Doubles = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Wiring = tuple[Integers, Integers, Integers, Doubles, Doubles, Doubles, tuple[int, int, bool], float]
@@ -25,7 +25,7 @@ or -1, hidden state or -1. Then low and high of each output, width of each comma
 are measured), and ticks in a second.
 """
 SMALL = 1e-8
-"""Below it log(1 + x) is x (1 - x / 2) to rounding, and its argument would lose digits."""
+"""Argument below which log(1 + x) is computed as x (1 - x / 2), because 1 + x would lose digits."""
 
 
 @inner
@@ -167,10 +167,10 @@ def free_run(numbers: Values, commands: Doubles, answer: Values, hidden: Values,
     """Simulate outputs ``(run, tick, output)`` from commands only.
 
     Args:
-        numbers: of each lane ``(run, number)``; `commands` ``(run, tick, command)``.
-        commands: see above.
-        answer: before the first tick ``(run, output)``; `hidden` likewise ``(run, level)``.
-        hidden: see above.
+        numbers: parameters of each run ``(run, number)``.
+        commands: commands in SI units ``(run, tick, command)``.
+        answer: outputs before the first sample ``(run, output)``.
+        hidden: unmeasured levels before the first sample ``(run, level)``.
         wiring: see `Wiring`.
     """
     lanes, ticks = commands.shape[0], commands.shape[1]
@@ -195,8 +195,8 @@ def simulate_measured(
 ) -> NDArray[np.float32]:
     """Simulate outputs ``(run, tick, output)``; a port reads the measurement, or the last output if it is NaN.
 
-    State is rounded at each tick, so that a run that goes on from a kept state is the same one. `answer` and `hidden`
-    are moved to the end of the run.
+    The state is rounded in each sample, so that a continued simulation gives identical bits. `answer` and `hidden` are
+    updated to the end of the run.
     """
     answers = np.empty(measured.shape, np.float32)
     work, read, after = np.zeros((5, len(wiring[2]))), np.zeros(answer.shape[1]), np.zeros(answer.shape[1])

@@ -184,4 +184,4 @@ def _call(typing: Any, address: Any, parameters: Any, constants: Any, inputs: An
 
 
 call: Any = intrinsic(_call)
-"""``call(address, parameters, constants, inputs, results)`` for code compiled by Numba."""
+"""Function ``call(address, parameters, constants, inputs, results)`` for code compiled by Numba."""
