@@ -21,7 +21,7 @@ from edp.sim.environment.spec import EnvironmentSpec
 Array = NDArray[np.float64]
 Rows = NDArray[np.float32]
 OPTIONS = ("strokes", "material")
-"""Options of a reset; ``material`` must be empty but for a twin with a ground."""
+"""Options of a reset. ``material`` must be empty unless the twin includes a ground."""
 MIDDLE = (0.5, 0.5, 0.5)
 TIP = ("TipX", "TipY", "TipAngle")
 

@@ -19,7 +19,7 @@ from edp.wording import setting_text, typed
 
 FMU = ".fmu"
 SAME_STROKE = 0.01
-"""Share by which a stroke may differ from that of a twin's machine: measured machine files do."""
+"""Maximum relative difference between a stroke and the stroke of the twin's machine file, which may be measured."""
 
 
 def is_fmu(plant: str | Path) -> bool:

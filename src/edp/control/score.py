@@ -13,9 +13,9 @@ from edp.control.reference import TipReference
 
 Array = NDArray[np.float64]
 ARRIVED_M = 0.02
-"""Distance from the end of the reference within which the tip has arrived; a grading tolerance."""
+"""Distance from the end of the reference within which the tip has arrived, m (a grading tolerance)."""
 MOST_SEGMENTS = 2_000
-"""Of a path to which distances are computed: at 100 Hz 20 s; longer ones are thinned."""
+"""Maximum number of path segments for distances: 20 s at 100 Hz. Longer paths are thinned."""
 LIMITS = ("lever", "slew", "stroke", "pressure")
 
 

@@ -30,7 +30,7 @@ NEAR_STOP = 0.05
 DEAD_BAND = 0.15
 """Fraction of the largest command: spools open at 12 to 17 % in the machine files, and slowly at first."""
 FASTEST = 0.995
-"""Quantile of speeds that stands for the fastest: beyond it are single events."""
+"""Quantile of the speeds that defines the maximum speed. Larger speeds are single events."""
 
 
 @dataclass(frozen=True)

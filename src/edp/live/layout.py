@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from edp.signals import KINDS, Channel, display_offset
 
 MOST_LABEL = 80
-"""Characters of a name on the page; a longer one would push everything else off it."""
+"""Maximum number of characters of a name on the page."""
 
 
 @dataclass(frozen=True)

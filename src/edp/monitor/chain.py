@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 MAX_SUMMARIES = 5_000
 MAX_WATCHES = 16
 MEAN, WIDTHS, MATRIX = (ArrayRule(shape) for shape in (("summaries",), ("summaries",), ("summaries", "columns")))
-"""Arrays of a watch in a file: its mean, and a width of each summary or a matrix."""
+"""Array rules of a watch: its mean, and the width of each summary or a whitening matrix."""
 _TREE = SettingsTree({"detector": DETECTORS}, what="monitor")
 
 

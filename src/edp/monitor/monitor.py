@@ -27,15 +27,15 @@ from edp.wording import figure, number
 
 Array = NDArray[np.float64]
 PIECE = 4096
-"""Ticks of a recording that are taken at once: long enough for speed, short enough for memory."""
+"""Number of samples of a recording processed at once: a compromise between speed and memory."""
 MAX_EVIDENCE = 8
-"""Summaries that an alarm names."""
+"""Maximum number of summaries listed as evidence of an alarm."""
 OTHER_MACHINE = 6.0
-"""Healthy deviations of a session's mean of a channel, beyond which the channel is not that of this machine."""
+"""Deviation of a channel's session mean, in healthy standard deviations, that indicates a different machine."""
 IMPOSSIBLE = 1e5
-"""Healthy deviations beyond which a value is a broken number, as exported code takes it."""
+"""Deviation in healthy standard deviations beyond which a value counts as invalid, as in the exported code."""
 OTHER_SHARE = 0.25
-"""Fraction of the channels beyond `OTHER_MACHINE` above which the log is of another machine."""
+"""Fraction of the channels beyond `OTHER_MACHINE` above which the log is attributed to a different machine."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,16 +25,18 @@ ARRAYS = {
     "level": ArrayRule(("level",), np.int64, low=0, high="inputs"),
     "drivers": ArrayRule(("drivers", "residuals", 2), np.int64, low=-1, high="inputs"),
 }
-"""Of its file."""
+"""Arrays of the summaries in the monitor file, with their rules."""
 SUMMARIES = ("mean", "spread", "gain", "lag", "peak")
-"""Summaries of each residual and block, in this order, followed by one for each driver."""
+"""Summaries of each residual per block, in this order. One more for each driver follows."""
 MAX_DRIVERS = 8
 NEAR_ZERO = 0.05
-"""Variance in healthy units that is added below `gain` and `lag`: a channel in steady state tells neither."""
+"""Variance in healthy units added to the denominators of `gain` and `lag`, because a channel in steady state determines
+neither.
+"""
 BLOCKS_AT_ONCE = 32
-"""Side by side: their sums stay in the processor's cache."""
+"""Number of blocks processed together, small enough that their sums stay in the processor's cache."""
 MAX_BLOCK = 1_000_000
-"""Ticks of a block."""
+"""Maximum number of samples in a block."""
 
 
 @dataclass(frozen=True, eq=False)

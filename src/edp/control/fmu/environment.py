@@ -23,9 +23,9 @@ from edp.wording import setting_text, typed
 Array = NDArray[np.float64]
 Rows = NDArray[np.float32]
 REST_S = 2.0
-"""Rest before the prefix, in which the memory of a twin forgets where a reset left it: at the means of its data."""
+"""Duration of the steady state before the prefix, s. The memory of a twin settles during this time."""
 START_SHARE = 0.02
-"""Share of a stroke by which an FMU may begin elsewhere than asked."""
+"""Maximum difference between the requested and the actual initial stroke of an FMU, as a fraction of the stroke."""
 STEP_SLACK = 1e-6
 
 

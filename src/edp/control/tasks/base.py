@@ -20,11 +20,11 @@ from edp.wording import setting_text, typed
 
 Array = NDArray[np.float64]
 TRIES = 200
-"""Draws of a task's numbers before it is refused: at 1 % that fit, 87 % of the seeds find one."""
+"""Maximum number of random draws of a task. If 1 % of the draws are valid, 87 % of the seeds succeed."""
 SPEED_RESERVE = 0.8
-"""Share of a cylinder's free-air top speed that a reference may ask for: flow is shared where three move at once."""
+"""Maximum reference speed as a fraction of a cylinder's free-air top speed, because moving cylinders share the flow."""
 SPEED_M_S = (0.3, 0.5)
-"""Of the tip, where a task's speed is drawn: usual for grading."""
+"""Range of the tip speed for tasks that draw it, m/s: typical for grading."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +127,7 @@ def check_order(what: str, **ranges: tuple[float, float]) -> None:
 
 
 TASKS: Registry[type[TaskSpec]] = Registry("task")
-"""Specs by name: one file and one registration each."""
+"""Registry of the task settings by name. Each task has a file and a registration."""
 
 
 def draw_task(spec: TaskSpec, geometry: TipGeometry, rate_hz: float, seed: int) -> ControlTask:

@@ -12,7 +12,9 @@ from edp.registry import Registry
 Array = NDArray[np.float64]
 
 LAWS: Registry[Callable[[Array], Array]] = Registry("time law")
-"""Share of a ramp's way at a share of its time, shape (...); 0 to 0.5, since the mean speed of a ramp is half."""
+"""Registry of the time laws of a ramp: completed fraction of the ramp's length, shape (...), as a function of the
+elapsed fraction of its duration. Values go from 0 to 0.5, since the mean speed of a ramp is half.
+"""
 
 
 @LAWS.register("trapezoid")

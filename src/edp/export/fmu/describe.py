@@ -12,7 +12,7 @@ from edp.export.fmu.units import BASES, shown, units_of
 
 # 500 ticks are 5 s at 100 Hz: several windows, and done at once.
 EXPERIMENT_TICKS = 500
-"""Length of the simulation that is proposed to an importer."""
+"""Number of samples of the default experiment."""
 CATEGORIES = {
     "logStatusWarning": "bad or missing inputs, ticks left out",
     "logStatusError": "calls that are refused, with the reason",

@@ -81,9 +81,9 @@ DETECTORS = {
     "glr": "EDP_GLR",
     "separate_cusums": "EDP_SEPARATE_CUSUMS",
 }
-"""Detectors in C, by their names."""
+"""C names of the detectors."""
 PIECE, ROW = 8, 32
-"""Directions of a detector, and summaries, that one part of the work on a block takes; in C `EDP_PIECE`, `EDP_ROW`."""
+"""Number of detector directions, and of summaries, per computing step of a block; in C `EDP_PIECE` and `EDP_ROW`."""
 
 
 def pieces(count: int, size: int) -> list[int]:

@@ -21,11 +21,11 @@ from edp.training.twin_bundle import TwinBundle
 
 Rows = NDArray[np.float32]
 MAX_RESIDUALS = 512
-"""Maximum number of residuals of a source. A machine with more channels is monitored in parts."""
+"""Maximum number of residuals per source. Machines with more channels must be monitored in parts."""
 MIDDLE = ArrayRule(("inputs",), np.float32)
-"""Substitutes for absent channels, an array of each source."""
+"""Array rule for the substitutes of missing channels, which each source has."""
 SISTERS = 11
-"""Seeds of drawn machines are apart from all others."""
+"""Seed component that separates randomly drawn machines from other random draws."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from edp.table import Table
 from edp.wording import unbroken
 
 DRAWING = ("figure_axes.js", "figure_marks.js", "figures.js")
-"""Draw the figures of a page from plotly's description of each; plotly has 4.8 MB and takes a second to start."""
+"""Scripts that draw figures from their plotly description. Plotly itself has 4.8 MB and takes a second to load."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Subsection:
 
 
 Part = str | Markup | Paragraph | Points | Terms | Fold | Subsection | Table | Chart
-"""Plain text explains what follows, `Markup` is HTML of its own."""
+"""Part of a page. Plain text explains the next part; `Markup` is HTML."""
 
 
 @dataclass(frozen=True)

@@ -18,13 +18,13 @@ from time import perf_counter
 HERE = Path(__file__).resolve().parent
 LIBRARY = "libcore.so"
 LATE_TICKS = 2.0
-"""Ticks after which a pressure is too old to be used."""
+"""Maximum age of a pressure in samples."""
 RATE_TOLERANCE = 0.1
-"""How far the median time between messages may be from a tick, as a share of it."""
+"""Maximum relative difference between the median message interval and the sample interval."""
 RATE_MESSAGES = 11
-"""Messages over which the rate is evaluated."""
+"""Number of messages over which the rate is evaluated."""
 LOOPED_S = 1.0
-"""A step back in time by more than this is another recording, not a late message."""
+"""Backward time step in s above which a new recording is assumed instead of a late message."""
 
 
 class CallStatus(IntEnum):
