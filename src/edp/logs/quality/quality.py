@@ -22,7 +22,7 @@ from edp.settings.results import json_value
 from edp.signals import KINDS
 
 VERDICTS = {"error": "unusable", "warning": "check", "note": "good"}
-"""Verdict on a channel or a recording by its worst finding; without a finding it is good."""
+"""Verdict on a channel or recording by its worst finding. Without a finding the verdict is good."""
 
 
 @dataclass(frozen=True)
