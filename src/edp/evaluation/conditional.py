@@ -27,7 +27,7 @@ class OthersModel:
     centred and brought to deviation 1.
 
     Attributes:
-        lags: ticks back, 0 among them.
+        lags: lags in samples, including 0.
         knees: shape ``(knee, channel)``.
         mean, deviation: mean and standard deviation of the terms, shape ``(term,)``.
         gram: sums of products of the terms over rows, shape ``(term, term)``, over the count.

@@ -197,7 +197,7 @@ class PredictorComparison:
 
     Attributes:
         run: folder of the predictor.
-        label: its name in tables.
+        label: name of the model in tables.
         ticks: samples ahead.
         trained_on: recordings that the predictor was trained on.
         seconds: time ahead.

@@ -79,7 +79,7 @@ class LiveLayout:
     Attributes:
         title: title of the page.
         source: source of the rows, in words.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         width: number of columns.
         traces: traces of the first columns, in order.
         forecasts: predictions in the remaining columns.

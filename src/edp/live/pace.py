@@ -22,7 +22,7 @@ class Pace:
     """The clock of a source that can be steered.
 
     Args:
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         speed: factor on real time; infinite for as fast as possible.
         clock: seconds that never go back.
 

@@ -63,7 +63,7 @@ class BlockVerdict:
     """Result of one block.
 
     Attributes:
-        block: its number from the start.
+        block: index of the block, counted from the start.
         statistics: statistic of each watch divided by its scale.
         row: conditioned summaries, NaN where missing.
         alarm: place of the watch that passed the limit, None without an alarm.

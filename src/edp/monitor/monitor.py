@@ -45,8 +45,8 @@ class MonitorState:
     Attributes:
         sources: state of each source of residuals.
         chain: state of the chain.
-        ticks: since the start.
-        missing: ticks since the end of the last block at which each input was missing, shape (inputs,).
+        ticks: number of samples since the start.
+        missing: number of samples since the end of the last block at which each input was missing, shape (inputs,).
     """
 
     sources: tuple[SourceState, ...]
@@ -94,7 +94,7 @@ class Monitor:
 
     Attributes:
         channels: raw channels, SI units, in the order of a row.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         sources: sources of residuals.
         chain: chain from residuals to statistics.
         limit: alarm limit with its false-alarm rate.

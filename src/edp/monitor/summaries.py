@@ -57,12 +57,12 @@ class BlockSummaries:
     A block in which more than half of the ticks of a residual are missing gives NaN for it.
 
     Attributes:
-        block: ticks of a block.
-        scale: one over the healthy width of each residual, shape (residuals,): a controller multiplies faster than it
-            divides.
+        block: number of samples per block.
+        scale: inverse healthy width of each residual, shape (residuals,), because a controller multiplies faster than
+            it divides.
         channel: place of the channel that each residual evaluates among the raw inputs, shape (residuals,).
         centre: centre of each raw input, shape (inputs,).
-        spread: one over the healthy deviation of each, above zero.
+        spread: inverse healthy standard deviation of each input, above zero.
         change: D, healthy variance of d of the channel of each residual, shape (residuals,).
         moving: places of inputs whose mean size is part of the operating point.
         level: places of inputs whose mean is part of the operating point.

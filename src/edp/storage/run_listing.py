@@ -45,7 +45,7 @@ class ListedRun:
             for a folder that this process has no right to look into.
         when: time of its last state according to its files, otherwise time of its files.
         data: source of its recordings.
-        score: its error on test logs in words; empty where it was not evaluated.
+        score: error on the test logs as text; empty if the run was not evaluated.
     """
 
     folder: Path

@@ -60,7 +60,7 @@ class PredictiveControl:
     """Model predictive controller. Weights apply to squares: tip errors in m^2, changes of requested speeds in (m/s)^2.
 
     Attributes:
-        blocks: ticks of the blocks of the horizon.
+        blocks: length of each block of the horizon in samples.
         along: weight of the tip error along the path, beside 1 across it.
         attitude_m: length of arm (m) by which an error of the attitude in rad counts like one of the tip; None: 2 with
             a twin that is told of forces against the cylinders, as a grey box is, else 1 (`attitude_with`).

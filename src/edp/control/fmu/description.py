@@ -76,7 +76,7 @@ def read_description(content: bytes, where: str) -> FmuDescription:
     """Read a description.
 
     Args:
-        content: its bytes.
+        content: bytes of the XML file.
         where: the FMU, for messages.
 
     Raises:

@@ -121,7 +121,7 @@ class FmuEnvironment(ModelEnvironment):
         path: the file.
         machine: name or file of the machine whose kinematics, nominal commands and pressures in steady state are used.
         duration_s: length of an episode.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
 
     Raises:
         ConfigError: FMPy is not installed, there is no such file, or it is no excavator, or of another rate.

@@ -38,9 +38,9 @@ class LearningSpec:
         machine: name or file of the machine.
         plant: run folder of a twin, or an FMU (`.fmu`), in place of the simulator; or a twin itself.
         trust_fmu: an FMU is native code, which runs with your rights; it is not loaded without this.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         duration_s: longest episode; a longer reference is cut off there.
-        hold: ticks for which an action holds.
+        hold: number of samples for which an action is held.
         observed: measured channels in the observation; strokes are always among what is read.
         preview_s: lead up to which the stroke velocities of the reference are observed, s.
         past_s: time back to which past levers are observed, in addition to the last ones, s.

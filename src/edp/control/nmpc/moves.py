@@ -72,7 +72,7 @@ class Moves:
     """Horizon in blocks of samples with constant requested speeds.
 
     Args:
-        blocks: ticks of each block.
+        blocks: length of each block in samples.
 
     Attributes:
         ticks: length of the horizon.

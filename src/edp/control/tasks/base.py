@@ -56,7 +56,7 @@ class TaskSpec(ABC):
         ramp_s: time to speed up and to slow down, s.
         lead_s: rest before the start, not evaluated.
         hold_s: rest after the end, evaluated.
-        margin: share of the stroke at either end that a reference leaves free.
+        margin: fraction of the stroke at either end that a reference leaves free.
         material: soil; empty for free air.
         limits: limits of the loop.
     """
@@ -136,7 +136,7 @@ def draw_task(spec: TaskSpec, geometry: TipGeometry, rate_hz: float, seed: int) 
     Args:
         spec: options of a registered task.
         geometry: geometry of the machine.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         seed: random seed; equal seeds give equal tasks.
 
     Raises:

@@ -33,7 +33,7 @@ def progress(time_s: Array, length_s: float, ramp_s: float, law: str) -> Array:
     """Share of the way done, 0 to 1, with a ramp at either end.
 
     Args:
-        time_s: since the start, any shape.
+        time_s: time since the start in s, any shape.
         length_s: duration of the whole path, s.
         ramp_s: time to speed up, and to slow down, s; at most half of `length_s`.
         law: name in `LAWS`.
@@ -60,7 +60,7 @@ def timed(
     Args:
         points: shape (legs + 1, values).
         seconds: length of each leg.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         ramp_s: see `progress`.
         law: time law, see `progress`.
         lead_s: rest at the first point, not evaluated.

@@ -34,7 +34,7 @@ class Network:
     Attributes:
         about: content of ``NAME.json``.
         inputs, targets: names, in the order of ``u`` and of the predictions.
-        rate_hz: ticks a second.
+        rate_hz: sampling rate in Hz.
         start: the state after a reset, ``(state,)``.
         step: ``(x, u) -> (x_next, prediction[, lower, upper])``, columns; of a prediction horizons are slowest.
 

@@ -28,7 +28,7 @@ class NearModel:
 
     Attributes:
         name: C prefix.
-        model: its layers, for their constants.
+        model: layer graph of the model, for its constants.
         plant: the twin.
         twin: the grey box.
         machine: its layer.

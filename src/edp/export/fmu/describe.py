@@ -31,7 +31,7 @@ class About:
         name: name of the model and its binaries.
         token: content address of sources and interface, in the form of a GUID.
         title: the network in a line.
-        rate_hz: ticks a second.
+        rate_hz: sampling rate in Hz.
         listed: variables in the order of their value references.
         derivatives: whether directional derivatives are provided.
         facts: further properties by name.

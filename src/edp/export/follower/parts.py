@@ -46,7 +46,7 @@ class FollowerParts:
         twin: the grey box of the machine as it was.
         spec: settings of the parameter adaptation.
         targets: names of the predicted channels, velocities of the twin.
-        horizons: ticks ahead.
+        horizons: prediction horizons in samples.
         limit: largest correction ``(horizon, target)``, SI units.
     """
 

@@ -43,19 +43,19 @@ class Behaviour:
     """Statistics of one numeric column.
 
     Attributes:
-        filled: share of rows that hold a number.
+        filled: fraction of rows that contain a number.
         low: smallest value.
         high: largest value.
-        constant: one value throughout.
+        constant: whether all values are equal.
         whole: integers only.
         levels: distinct values.
-        holds: share of rows that repeat the row before.
+        holds: fraction of rows that repeat the previous row.
         rises: no row is below the one before.
         climbs: every row is above the one before.
         step: median of the steps that are not zero, 0 where there are none.
         even: nearly all steps have one size.
         steady: nearly all steps are between half and twice their median, as those of a clock that waits for others.
-        spanned: share of rows between the first and the last one that hold a number.
+        spanned: fraction of rows between the first and the last row with a number.
         restarts: rows at which an even rise begins again.
         coarse: many levels, but hardly a step of more than one: a slow signal that its sensor rounds.
         falls: rows below the one before.

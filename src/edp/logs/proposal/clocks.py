@@ -21,7 +21,7 @@ _PRINTED, _MANY_STAMPS = 0.995, 50
 """Maximum fraction of rows that repeat the previous stamp, and minimum number of different stamps: whole seconds of
 some minutes at 100 Hz."""
 _FASTEST_HZ = 200.0
-"""Sample rate in Hz above which a rate from `_PLAIN_HZ` is proposed. Machine motion is slower, and samples cost time."""
+"""Sample rate in Hz above which a rate from `_PLAIN_HZ` is proposed. Machine motion is slower than such rates."""
 _PLAIN_HZ = (100.0, 200.0, 500.0, 1000.0, 2000.0)
 _MAX_RESTARTS = 5
 """Maximum number of backward steps of uneven time stamps. Each is a restart of the logger."""

@@ -59,7 +59,7 @@ class LogColumn:
         samples: rows that the file has.
         unit: unit stated in the file.
         kind: kind stated in the file (EDP's own formats).
-        own_time: it has time stamps of its own, as signals of MDF and bags do.
+        own_time: whether the column has separate time stamps, as signals of MDF files and bags do.
         clock: time in these columns; None if they were not examined.
     """
 

@@ -53,7 +53,7 @@ class ColumnGuess:
     """Proposed meaning of a column.
 
     Attributes:
-        column: its name in the file.
+        column: name of the column in the file.
         channel: name of the channel; empty where it becomes none.
         role: ``time``, ``counter``, ``constant``, ``text``, ``remark``, or one of `MAPPED_ROLES`.
         kind: kind and unit.

@@ -46,8 +46,8 @@ class Measures:
         noise: deviation of the white part in steady state, 0 for a state of up to three levels.
         every: samples between new values; 1 where each sample is new.
         busy: sensor noise moves the last digit all the time, so that equal samples in a row mean something.
-        at_low: share of the samples at the minimum.
-        at_high: share of the samples at the maximum.
+        at_low: fraction of the samples at the minimum.
+        at_high: fraction of the samples at the maximum.
         end_run: longest stay at an end of the range, in samples.
         spikes: single samples far off both neighbours.
         first_spike: the first of them, -1 where there is none.

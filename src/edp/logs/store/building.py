@@ -147,8 +147,8 @@ def build_store(
     """Read logs into a store. Unchanged logs are reused; changed logs are read again.
 
     Args:
-        logs: in any order.
-        folder: of the store; a new one, an unfinished one, or one to add logs to.
+        logs: logs in any order.
+        folder: folder of the store: a new one, an unfinished one, or an existing one to which logs are added.
         workers: who reads the logs; nodes see logs and store under the same paths.
         progress: receiver of the progress; its units are logs.
 

@@ -64,7 +64,7 @@ class Balances(ResidualSource):
         pairs: places of level and rate among the inputs, one a residual, shape (residuals, 2).
         gains: gain of each rate.
         memories_s: memory of each residual, s.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         middle: mean of each input on healthy sessions.
         units: SI unit of each residual.
     """

@@ -36,7 +36,7 @@ class FitMaterial:
         train: healthy sessions, all with `channels` at `rate_hz`.
         validation: further ones, for the choice among fits.
         channels: monitored channels, in the order of the monitor's inputs.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         predictors: look-ahead networks of this machine.
         twins: plant models of this machine.
         groups: names of channels that are evaluated together; empty where names and kinds are to tell.
@@ -100,7 +100,7 @@ class ResidualSource(ABC):
     there stands in, so that it never spoils the memory.
 
     Attributes:
-        names: one a residual, such as ``virtual:CylVels_1``.
+        names: name of each residual, such as ``virtual:CylVels_1``.
         judged: channels whose fault shows as a bias of each residual.
         reads: all inputs that each residual depends on, those that are evaluated among them.
         units: SI unit of each residual.

@@ -46,7 +46,7 @@ class SpoolModel:
     Attributes:
         extend: place of the command that extends, among the inputs, shape (spools,).
         retract: index of the command that retracts; -1 if one signed channel commands both directions.
-        gain: one over the full command, shape (spools,).
+        gain: inverse of the full command of each spool, shape (spools,).
         dead: dead time in ticks, shape (spools,).
         stages: b1, b2, a1, a2 of each stage, shape (spools, 2, 4).
         play: half width, as a share of travel, shape (spools,).
@@ -170,7 +170,7 @@ class ChamberPlaces:
 
     Attributes:
         velocity: index of the velocity of its cylinder.
-        own: its pressure.
+        own: index of the chamber's pressure.
         other: index of the pressure of the opposite chamber.
         stroke: -1 where there is none.
         supplies: pressures of the pumps.

@@ -88,10 +88,10 @@ class Section:
     """A section of a page.
 
     Attributes:
-        name: its address on the page.
-        title: its heading.
-        parts: one below the other. None, tables and lists without rows, and sections, folds and groups with nothing but
-            explaining text are left out.
+        name: anchor of the section on the page.
+        title: heading of the section.
+        parts: parts of the section, from top to bottom. The page omits None, tables and lists without rows, and
+            sections, folds and groups that contain only explaining text.
         link: short title in the navigation; the title if empty.
     """
 

@@ -33,7 +33,7 @@ class AlarmFacts:
     """One alarm.
 
     Attributes:
-        recording: its name.
+        recording: name of the recording.
         raised_s: time of the alarm; `since_s` is the estimated start of the change, s from the start.
         detector: detector of the alarm.
         statistic: statistic that exceeded `limit`.

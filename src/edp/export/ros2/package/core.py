@@ -188,7 +188,7 @@ class Tick:
         status: status of the C code; None if the message gave no sample.
         valid: the prediction rests on this tick's inputs and on a whole window, at the network's rate.
         why: reason why the result is not valid.
-        missed: ticks that were missed before this one.
+        missed: number of samples that were missed before this sample.
         step_us: time of the C code, microseconds.
     """
 
