@@ -19,7 +19,7 @@ from edp.training.bundle import Bundle
 
 Array = NDArray[np.float64]
 NEAR = 0.25
-"""Share by which a predictor's horizon may differ from the time that is asked for."""
+"""Maximum relative difference between a predictor's horizon and the requested time."""
 
 
 class VelocityModel(ABC):

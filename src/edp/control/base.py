@@ -25,7 +25,7 @@ from edp.wording import typed
 
 Array = NDArray[np.float64]
 MAX_EVENTS = 1_000
-"""Events that a loop logs; a sensor that flickers must not fill the memory."""
+"""Maximum number of logged events, which bounds the memory when a sensor flickers."""
 
 
 @dataclass(frozen=True)
@@ -239,9 +239,9 @@ class ControllerSpec(Protocol):
     """Options of a controller: a frozen dataclass with bounds."""
 
     needs: ClassVar[tuple[str, ...]]
-    """Attributes of `ControlModels` without which it cannot be built."""
+    """Attributes of `ControlModels` that the controller requires."""
     space: ClassVar[Mapping[str, tuple[float, float]]]
-    """Lowest and highest value worth trying, by option: what a tuning varies."""
+    """Search range of each option for tuning: lowest and highest value."""
 
     def build(self, plant: PlantInterface, limits: LoopLimits, models: ControlModels) -> Controller:
         """Build the controller for a plant.
@@ -264,4 +264,4 @@ def list_unused_models(needs: Sequence[str], available: Collection[str]) -> list
 
 
 CONTROLLERS: Registry[type] = Registry("controller")
-"""Specs by name: one file and one registration each."""
+"""Registry of the controller settings by name. Each controller has a file and a registration."""

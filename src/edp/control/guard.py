@@ -38,7 +38,7 @@ class GuardVerdict:
 
 
 TRUSTED = GuardVerdict()
-"""Nothing is wrong."""
+"""Verdict without an objection."""
 
 
 class LoopGuard(Protocol):

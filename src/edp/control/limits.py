@@ -26,7 +26,7 @@ class LoopLimits:
         lever_low: least lever positions, in [-1, 0].
         lever_high: largest lever positions, in [0, 1].
         slew_per_s: largest speed of a lever, in full positions per second.
-        stroke_margin: share of the stroke at either end that is to stay free.
+        stroke_margin: fraction of the stroke at either end that must stay free.
         pressure_pa: largest cylinder pressure, Pa.
 
     Raises:
@@ -66,7 +66,7 @@ class LoopLimits:
         Args:
             levers: asked for, shape (3,), finite.
             before: levers of the previous sample, shape (3,).
-            rate_hz: ticks per second.
+            rate_hz: sampling rate in Hz.
         """
         step = np.array(self.slew_per_s) / rate_hz
         ranged = np.clip(levers, self.lever_low, self.lever_high)

@@ -24,7 +24,7 @@ from edp.wording import typed
 
 Array = NDArray[np.float64]
 TRUE = "_true"
-"""Behind the name of a channel, for its noise-free value."""
+"""Suffix of a channel name for the noise-free value."""
 TIP = ("TipX", "TipY", "TipAngle")
 PUMPS = ("PumpPressure_1", "PumpPressure_2", "PumpDisplacement_1", "PumpDisplacement_2")
 OTHERS = ("Payload", "OilTemperature", "TipForceX", "TipForceY")

@@ -21,7 +21,7 @@ from edp.sim.environment.spec import EnvironmentSpec
 Array = NDArray[np.float64]
 Rows = NDArray[np.float32]
 OPTIONS = ("strokes", "material")
-"""Options of a reset; ``material`` must be empty but for a twin with a ground."""
+"""Options of a reset. ``material`` must be empty unless the twin includes a ground."""
 MIDDLE = (0.5, 0.5, 0.5)
 TIP = ("TipX", "TipY", "TipAngle")
 
@@ -36,8 +36,8 @@ class ModelBatch(PlantBatch):
         answers: channels of the model's outputs; the strokes are among them.
         commands: channels of the model's inputs, of those that levers command.
         machine: name or file of the machine whose kinematics, nominal commands and pressures in steady state are used.
-        rate_hz: ticks per second.
-        prefix: ticks in steady state before an episode.
+        rate_hz: sampling rate in Hz.
+        prefix: number of samples in steady state before an episode.
         duration_s: length of an episode.
         count: number of plants.
 

@@ -25,7 +25,7 @@ class PlantInterface:
 
     Attributes:
         channels: channels of an observation, in order; SI units.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         geometry: kinematics of the machine.
         command_channels: pilot pressures that levers command, in the order of `commands`.
         commands: nominal pilot pressures (Pa), shape (..., command), of lever positions, shape (..., 3).

@@ -19,7 +19,7 @@ from edp.wording import setting_text, typed
 
 FMU = ".fmu"
 SAME_STROKE = 0.01
-"""Share by which a stroke may differ from that of a twin's machine: measured machine files do."""
+"""Maximum relative difference between a stroke and the stroke of the twin's machine file, which may be measured."""
 
 
 def is_fmu(plant: str | Path) -> bool:
@@ -45,7 +45,7 @@ def plant_of(
     Args:
         machine: name of a machine, or path of a machine file: simulated, or the kinematics of another plant.
         duration_s: longest loop.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         plant: run folder of a twin, or an FMU, that takes the simulator's place.
         trusted: an FMU is native code that runs with the rights of this process; it is not loaded without this.
 

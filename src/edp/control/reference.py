@@ -18,7 +18,7 @@ class TipReference:
     """Strokes and tip over time; row t is the instant at which the levers of tick t are applied.
 
     Attributes:
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         strokes: cylinder strokes, m, shape (ticks, 3).
         tip: tip x, y (m) and attitude (rad), shape (ticks, 3), at these strokes.
         judged: mask of the samples that a score counts, shape (ticks,); a lead-in does not count.
@@ -62,9 +62,9 @@ def reference_of_tip(
         name: name of the task, for messages.
         poses: tip x, y (m) and attitude (rad), shape (ticks, 3).
         geometry: geometry of the machine.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         judged: mask of the samples that count, shape (ticks,); None for all.
-        margin: share of the stroke at either end that must stay free.
+        margin: fraction of the stroke at either end that must stay free.
 
     Raises:
         ConfigError: names the first pose that cannot be reached, and its time.

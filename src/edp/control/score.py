@@ -13,9 +13,9 @@ from edp.control.reference import TipReference
 
 Array = NDArray[np.float64]
 ARRIVED_M = 0.02
-"""Distance from the end of the reference within which the tip has arrived; a grading tolerance."""
+"""Distance from the end of the reference within which the tip has arrived, m (a grading tolerance)."""
 MOST_SEGMENTS = 2_000
-"""Of a path to which distances are computed: at 100 Hz 20 s; longer ones are thinned."""
+"""Maximum number of path segments for distances: 20 s at 100 Hz. Longer paths are thinned."""
 LIMITS = ("lever", "slew", "stroke", "pressure")
 
 
@@ -47,18 +47,18 @@ class LoopScore:
 
     Attributes:
         path_rms_mm: distance of the tip to the nearest point of the path, root of the mean square.
-        path_p95_mm: its 95th percentile.
-        path_max_mm: its largest value.
+        path_p95_mm: 95th percentile of the distance from the path, mm.
+        path_max_mm: maximum distance from the path, mm.
         position_rms_mm: distance of the tip to the reference of the same time, root of the mean square.
-        position_p95_mm: its 95th percentile.
-        position_max_mm: its largest value.
+        position_p95_mm: 95th percentile of the position error, mm.
+        position_max_mm: maximum position error, mm.
         attitude_rms_deg: error of the bucket's attitude.
         arrived_s: seconds from the first evaluated tick until the tip stays within `ARRIVED_M` of the end; None where
             it does not.
         energy_kj: hydraulic energy of the pumps; None where the plant does not tell.
         lever_travel: sum of the changes of all levers, in full positions.
-        violations: ticks at which each of `LIMITS` was violated.
-        missed: ticks at which the controller had no output.
+        violations: number of samples at which each of `LIMITS` was violated.
+        missed: number of samples at which the controller had no output.
         finished: whether the loop ran to the end of the reference.
     """
 
@@ -84,7 +84,7 @@ def scored(trace: LoopTrace, reference: TipReference, limits: LoopLimits, missed
         trace: trace of the loop; it may be shorter than the reference, but must include its evaluated part.
         reference: reference of the loop.
         limits: limits of the loop.
-        missed: ticks at which the controller had no output.
+        missed: number of samples at which the controller had no output.
     """
     ticks, rate = len(trace.tip), reference.rate_hz
     judged = reference.judged[:ticks]

@@ -21,17 +21,17 @@ from edp.wording import setting_text
 
 Array = NDArray[np.float64]
 LEVELS = (*np.arange(0.06, 0.32, 0.02).round(2).tolist(), 0.36, 0.42, 0.5, 0.6, 0.75, 1.0)
-"""Lever positions, 0.02 apart where dead bands end, which is what a feed-forward must know best."""
+"""Lever positions at which the map is measured. The spacing is 0.02 near the ends of the dead bands."""
 RUN_S, SETTLE_S = 0.9, 0.5
-"""A run of each position, and the part of it in which valve and pump settle and that is left out."""
+"""Duration of a run per lever position and its initial transient, which is discarded, s."""
 BEGINS = 0.15
-"""Distance of a run's start from mid stroke, as a share, on the side from which it moves away."""
+"""Distance of the initial stroke from mid stroke, as a fraction of the stroke, opposite to the direction of motion."""
 MOVES_M_S = 0.003
-"""Mean speed above which a lever moves its cylinder: three times what sensors show in steady state."""
+"""Mean speed above which a lever position moves its cylinder, m/s: three times the sensor noise in steady state."""
 SIDES = (1.0, -1.0)
 CYLINDERS = ("boom", "arm", "bucket")
 NEARLY = 0.8
-"""Share of a reference's speed that levers must give: the map is of mid stroke, elsewhere loads change it."""
+"""Fraction of a reference's speed that the map must reach. The map holds at mid stroke; loads differ elsewhere."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ NEAR_STOP = 0.05
 DEAD_BAND = 0.15
 """Fraction of the largest command: spools open at 12 to 17 % in the machine files, and slowly at first."""
 FASTEST = 0.995
-"""Quantile of speeds that stands for the fastest: beyond it are single events."""
+"""Quantile of the speeds that defines the maximum speed. Larger speeds are single events."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class SeenAxis:
     """Inputs that describe the axis of a target.
 
     Attributes:
-        target: its column among the targets.
+        target: index among the targets.
         fastest: speed, SI units.
-        stroke: its column among the inputs and the range of its values; None where no input shows it.
+        stroke: column of the stroke among the inputs, and the range of its values; None if no input measures it.
         command: columns of its command, extend and retract or one that is signed; empty where no input shows it.
         dead_band: size of the command up to which the axis is not asked to move.
     """

@@ -32,7 +32,7 @@ from edp.signals import KINDS
 Array = NDArray[np.float64]
 # Eight stretches give Student's t seven degrees of freedom: an interval that is wide, but means something.
 PIECES = 8
-"""Stretches that intervals are taken over, at least; recordings are cut where there are fewer."""
+"""Minimum number of segments for intervals. Recordings are divided if there are fewer."""
 COVERAGE = 0.95
 
 

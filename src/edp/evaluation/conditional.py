@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 KNEES = (0.5, 0.7, 0.8, 0.9, 0.96)
 """Quantiles at which each channel has a hinge, so that laws with a dead zone or a threshold can be represented."""
 RIDGE = 1e-6
-"""Penalty over the mean squared size of a term."""
+"""Ridge penalty relative to the mean square of a term."""
 BLOCK = 8192
 
 
@@ -27,7 +27,7 @@ class OthersModel:
     centred and brought to deviation 1.
 
     Attributes:
-        lags: ticks back, 0 among them.
+        lags: lags in samples, including 0.
         knees: shape ``(knee, channel)``.
         mean, deviation: mean and standard deviation of the terms, shape ``(term,)``.
         gram: sums of products of the terms over rows, shape ``(term, term)``, over the count.

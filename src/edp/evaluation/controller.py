@@ -22,7 +22,7 @@ BOARD_TYPICAL, BOARD_SLOW = 1.26, 1.43
 
 
 MAX_GRANTED = 2**53
-"""Cycles or bytes: beyond it not every integer is a float, in which estimates are computed."""
+"""Maximum number of cycles or bytes. Larger integers are not exact as floats."""
 
 
 @dataclass(frozen=True)

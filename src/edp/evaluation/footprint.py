@@ -22,7 +22,7 @@ GRAPHS: dict[str, Callable[[Predictor], Graph]] = {
     "float32": lambda predictor: predictor.graph(),
     "w8a16": lambda predictor: outline(predictor.graph()),
 }
-"""Layers of a network by number format of `FORMATS`."""
+"""Functions that return the layer graph of a network, by number format of `FORMATS`."""
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ from edp.settings.bounds import MAX_ROWS, above, check_bounds, integer
 from edp.settings.results import ResultFile, read_part
 
 TWIN = "twin"
-"""Name of the twin among the models."""
+"""Name of the twin in the lists of models."""
 PARTS = ("velocities", "strokes", "pressures")
-"""Kinds of channels, in the order of a twin's outputs."""
+"""Kinds of output channels, in the order of a twin's outputs."""
 RUNS = "free_runs.safetensors"
 MAX_TEXT = 2_000
-"""Characters of a label or reason of a candidate."""
+"""Maximum number of characters of a candidate's label or reason."""
 POSITIVE, COUNT = above(0.0, 1e12), integer(0, MAX_ROWS)
 ByChannel = Mapping[str, float | None]
 
@@ -197,7 +197,7 @@ class PredictorComparison:
 
     Attributes:
         run: folder of the predictor.
-        label: its name in tables.
+        label: name of the model in tables.
         ticks: samples ahead.
         trained_on: recordings that the predictor was trained on.
         seconds: time ahead.

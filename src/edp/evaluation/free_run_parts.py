@@ -30,7 +30,7 @@ AT_STOP = 0.01
 AT_REST = 0.01
 """Fraction of a twin's maximum velocity below which an actuator does not move, unless it is at an end stop."""
 HORIZONS_A_DECADE = 6
-"""Points of an error over the horizon: a line on a page with a logarithmic axis needs no more."""
+"""Number of horizons per decade for which errors are stored, sufficient for a chart with a logarithmic axis."""
 
 
 def by_channel(channels: Sequence[Channel], values: NDArray[Any], integral: bool = False) -> ChannelErrors:

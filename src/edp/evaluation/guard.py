@@ -32,12 +32,13 @@ NETWORK = "network"
 TWIN = "twin"
 TWIN_ADVICE = "take that floor by twin.kind, another formulation, or more recordings with more motion"
 MACHINE, GREY = "identified machine", "grey box"
-"""Names of the result and of the reference of an identification."""
+"""Names of the result and of the reference in the comparison of an identification."""
 MACHINE_ADVICE = "more rounds or starts of the fit (twin.fit), a nearer --machine, or more recordings with more motion"
 MEASURE = "rmse"
-"""Metric for comparing models, here, in headlines and in tables. Trainings minimise squared errors, the preset auto
-selects and promises by them, and published references state them. The mean absolute error of a machine that mostly
-does not move depends on samples in steady state, which persistence predicts exactly."""
+"""Metric for comparing models, also in headlines and tables. Trainings minimise squared errors, the preset auto selects
+models and states expected errors by it, and published references state it. If a machine mostly rests, the mean absolute
+error depends on steady-state samples, which persistence predicts exactly.
+"""
 MEASURE_NAME = "RMSE"
 ADVICE = "train with the preset auto, or on more recordings"
 LEAST = 1e-3
@@ -47,7 +48,7 @@ LEAST = 1e-3
 BEATEN = 6
 """Exit code of the outcome *worse*."""
 FEWEST = 3
-"""Recordings (or references) from which an interval is stated."""
+"""Minimum number of recordings (or references) for an interval."""
 
 
 class ErrorOutcome(StrEnum):

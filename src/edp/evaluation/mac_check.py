@@ -22,7 +22,7 @@ from edp.networks.streaming import State, Streaming
 # Factors of a product, by the place of the one whose last dimension is summed over.
 MATRIX = {"mm": 0, "bmm": 0, "mv": 0, "dot": 0, "addmm": 1, "baddbmm": 1, "addbmm": 1, "addmv": 1}
 MOVES = {"cat", "stack", "index", "index_put", "copy", "gather"}
-"""Operations on several tensors that only move numbers."""
+"""Operations on several tensors that only move data."""
 ARITHMETIC = {"mul", "div", "sqrt", "pow", "reciprocal", "exp", "sin", "cos"}
 """Operations counted in a physics base, which is arithmetic only. Sums and selections do not count."""
 

@@ -22,21 +22,24 @@ CORE_COSTS = {
     "summary": 1_000.0,
     "tick": 500.0,
 }
-"""Cycles of a Cortex-M4F with zero-wait memory, which computes double precision by its compiler's library.
+"""Cycles of a Cortex-M4F with zero-wait memory and software double precision.
 
-Of a residual, of a driver of it and of an input at a tick, of a product with its sum in single and in double precision,
-of a summary of a residual at the end of a block, and of a sample. Fitted to counted code of chains of several
-sizes (``benchmarks/monitor_cycles.py --fit``)."""
+Cycles per sample of a residual, of its driver and of an input; cycles of a product with its sum in single and in double
+precision; cycles of a residual's summary at the end of a block, and of a sample. Fitted to instruction counts of chains
+of several sizes (``benchmarks/monitor_cycles.py --fit``).
+"""
 FLOW_COSTS = {"path": 110.0, "chamber": 450.0, "spool": 160.0}
-"""Cycles of balances of flow at a tick, which are in single precision: of a curve with the root of what drives it (two
-square roots and a division at 14 cycles each, the search of a knot), of a chamber and of a spool. Counted by
-hand from the operations of the code, unlike those above."""
+"""Cycles per sample of flow balances in single precision: of a flow path (knot search, two square roots and a division
+at 14 cycles each), of a chamber and of a spool. Counted by hand from the operations of the code, unlike `CORE_COSTS`.
+"""
 DETECTOR = {"cusum": 2.0, "ewma": 2.5, "glr": 2.0, "separate_cusums": 2.5}
-"""Products in double precision that take as long as a direction in a detector; of the likelihood ratio a length."""
+"""Equivalent number of double-precision products per direction in a detector; per window length for the likelihood
+ratio.
+"""
 CENTRE, VERDICT, POINT = 0.5, 0.6, 4.0
 """Cycles per summary centred for a watch, per summary in a verdict, and per value of the operating point."""
 CHAIN_PROGRAM_BYTES = 9_000
-"""Code of the chain, its runtime and the double precision of the compiler's library on a Cortex-M4F."""
+"""Program size in bytes of the monitor chain, its runtime and the double-precision library on a Cortex-M4F."""
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from edp.stats.metrics import interval_score, interval_scores, score, spread
 from edp.stats.sketch import QuantileSketch
 
 Numbered = Iterable[tuple[int, NDArray[np.float32]]]
-"""Numbers of test series, in any order, and what belongs to each tick of them."""
+"""Numbers of test series, in any order, each with an array that has one entry per sample."""
 
 
 class Ruler:

@@ -14,15 +14,15 @@ from edp.signals import display_offset
 from edp.storage.paths import is_file_at
 
 MEAN = "mean"
-"""Name of the mean over targets beside the names of targets."""
+"""Key of the mean over targets in tables with one entry per target."""
 Metrics = Mapping[str, float | int | None]
-"""Values by name of a metric, such as ``rmse``; None where it is not defined."""
+"""Metric values by metric name, such as ``rmse``; None if a metric is undefined."""
 ByTarget = Mapping[str, Metrics]
-"""Metrics of each target, and of `MEAN`."""
+"""Metrics by target, including `MEAN`."""
 ByHorizon = Mapping[str, ByTarget]
-"""Values by horizon in samples, as text."""
+"""Metrics by horizon in samples (as text)."""
 Means = Mapping[str, float]
-"""A value of each target, and of `MEAN`."""
+"""Value by target, including `MEAN`."""
 PREDICTIONS = "predictions.safetensors"
 FACTOR = above(0.0, 1e12)
 

@@ -12,14 +12,14 @@ from edp.data.series import Series
 from edp.evaluation.scores_file import DataSituation, OutsideRange, TargetChange
 
 MARGIN = 0.01
-"""Fraction of the training range by which a value must leave it, because sensors are noisy."""
+"""Fraction of the training range by which a value must leave it, because of sensor noise."""
 MIN_SHARE = 0.05
 """Minimum fraction of samples outside the training range for a warning. Two of seven measured data sets have 1 and 3 %
 of such samples, and their expected errors were as accurate as the others."""
 MIN_BEYOND = 0.005
 """Minimum fraction of changes larger than any training change for a warning: a few decide a root-mean-square error."""
 MIN_RATIO = 2.0
-"""Times that targets change more, or less, than in training before it is said."""
+"""Minimum ratio between the changes of the targets and their changes in training (or its inverse) for a remark."""
 
 
 def situation_of(data: Prepared) -> DataSituation:

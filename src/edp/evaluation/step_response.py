@@ -14,12 +14,12 @@ from edp.networks.twin import Twin, even_starts
 from edp.signals import KINDS, Channel
 
 LENGTH_S = 2.0
-"""Length of a response, within which a hydraulic axis settles."""
+"""Length of a response in s, within which a hydraulic axis settles."""
 MOMENTS, MAX_STARTS = 24, 8
-"""Steps of which the middle is shown, and of one recording."""
+"""Number of steps whose median response is shown, and maximum number of steps per recording."""
 POINTS, MAX_COMMANDS = 100, 12
 SPAN = (0.05, 0.95)
-"""Quantiles of a command between which its range is; half of it is a step."""
+"""Quantiles that define the range of a command. The step is half of this range."""
 
 
 def step_responses(twin: Twin, series: Sequence[Series]) -> StepResponses:

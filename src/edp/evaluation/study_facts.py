@@ -14,7 +14,7 @@ from edp.stats.variance import PairedVariance, SplitVariance
 
 Scalar = float | int | str | bool
 OPTIONAL = {"optional": True}
-"""Metadata of fields that the file leaves out where they are None."""
+"""Metadata of fields that the file omits if they are None."""
 
 
 @dataclass(frozen=True)
@@ -328,4 +328,4 @@ FACTS: Mapping[str, Mapping[str, type]] = {
     "sound": _COMMON | {"screening": SoundScreening, "planning": SoundPlanning, "confirmation": SoundConfirmation},
     "thesis": _COMMON | {"screening": ThesisScreening, "planning": ThesisPlanning, "confirmation": ThesisConfirmation},
 }
-"""Class of the data, by mode and phase."""
+"""Data class by mode and phase."""

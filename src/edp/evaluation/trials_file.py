@@ -22,15 +22,15 @@ class FeatureSetTrial:
     """Evaluated feature set.
 
     Attributes:
-        name: of the set.
+        name: name of the feature set.
         channels: logged channels that it reads.
-        features: what the network sees, derived channels included.
+        features: channels that the network reads, including derived channels.
         parameters: trainable numbers of the network.
         error: mean absolute error by horizon, mean over targets, seeds and ticks of the held-out recordings.
         by_seed: the same for each seed.
         difference: to the first set by horizon, paired over the held-out recordings; None for the first set, and
             where there is one recording only.
-        seconds: of training, all seeds.
+        seconds: training time of all seeds, s.
     """
 
     name: str

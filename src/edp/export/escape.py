@@ -15,14 +15,18 @@ from string import Template
 from edp.errors import ExportError
 
 LONGEST_TEXT = 500
-"""Characters of a description or title: more is cut. C99 promises 4,095 characters of a line; escapes are up to ten."""
+"""Maximum number of characters of a description or title. C99 guarantees 4,095 characters per line; an escape takes up
+to ten.
+"""
 LONGEST_NAME = 120
-"""Characters of a name in XML, YAML and tables. In octal digits that is a C string of at most 1,920 characters."""
+"""Maximum number of characters of a name in XML, YAML and tables: in octal escapes, a C string of at most 1,920
+characters.
+"""
 C_SIGNIFICANT = 63
-"""Characters of an identifier that C99 promises to tell apart; also the longest name of MATLAB."""
+"""Number of significant characters of an identifier in C99, and maximum length of a MATLAB name."""
 # A name must not be empty in any language.
 UNNAMED = "unnamed"
-"""Stands for an empty name."""
+"""Replacement of an empty name."""
 
 C_WORDS = frozenset(
     re.findall(

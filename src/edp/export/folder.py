@@ -20,9 +20,9 @@ from edp.storage.writing import TEMPORARY
 
 LIST = "export.sha256"
 UNFINISHED = "export.unfinished"
-"""Lists what may lie there while an export is written: files of the one before and of the new one."""
+"""File that lists, while an export is written, the files of the previous and of the new export."""
 LONGEST_LIST = 1_000_000
-"""Bytes of a list that are read; those of the largest export here are 5,000."""
+"""Maximum size of a file list in bytes. The largest lists have about 5,000."""
 _LINE = re.compile(r"([0-9a-f]{64})  ([A-Za-z0-9_./-]+)")
 Listed = dict[str, set[str]]
 

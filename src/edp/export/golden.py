@@ -24,15 +24,15 @@ if TYPE_CHECKING:
 
 GOLDEN_TICKS = 200
 SHARE = 1e-5
-"""How far another form may be from PyTorch, in standard deviations of the target and as a share of the value."""
+"""Tolerance between an exported model and PyTorch, in standard deviations of the target and relative to the value."""
 DISTURBED, ROUNDED = 3, 2.0**-23
-"""Disturbed runs of a plant, and how far what they feed back is off, in deviations: a last place of float32."""
+"""Number of disturbed plant simulations, and disturbance of their feedback in standard deviations: float32 rounding."""
 NEAR = 1e-5
-"""How near a number may be to the threshold of a tree, in standard deviations and as a share, for a form to differ."""
+"""Distance from a tree threshold within which results may differ, in standard deviations and relative to the value."""
 MOVES = 12
-"""How often all thresholds are moved, each by a draw of its own: rounding may decide at several nodes at once."""
+"""Number of random perturbations of all thresholds, because rounding may change the result of several nodes."""
 TRIES, NEAR_GOLDEN = 20, 1e-6
-"""Recordings that are drawn until none of their numbers is so near to a threshold."""
+"""Maximum number of random recordings, and minimum distance of their values from all tree thresholds."""
 Rows = NDArray[np.float32]
 
 

@@ -16,7 +16,7 @@ _SPELLINGS = {
     "l/min": "L/min",
     "°c": "degC",
 }
-"""Units by how they are written within brackets, in lower case."""
+"""Units by their lower-case spelling within brackets."""
 
 
 def si_channels(channels: Iterable[Channel]) -> list[Channel]:

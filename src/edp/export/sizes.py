@@ -9,9 +9,9 @@ from edp.errors import ExportError
 from edp.training.bundle import Bundle
 
 LARGEST = 2**31 - 1
-"""Bytes, numbers and ticks: C counts in ``uint32_t``, MATLAB, Simulink and FMI in ``int32_t``."""
+"""Maximum number of bytes, values and samples: C counts in ``uint32_t``, MATLAB, Simulink and FMI in ``int32_t``."""
 MAX_COLUMNS = 2**16
-"""Numbers of a value from which a table of columns chooses: entries are ``uint16_t``."""
+"""Maximum width of a value from which a column table selects, because its entries are ``uint16_t``."""
 
 
 def check_numbers(bundle: Bundle) -> None:

@@ -36,7 +36,7 @@ HOUR_S = 3600.0
 # Five seconds: Ray itself tries for minutes where nothing answers (docs/journal).
 PROBE_S = 5.0
 _pool: dict[int, LocalPool] = {}
-"""Pool of a Ray process, which runs one training after the other. Its worker stays warm between them."""
+"""Local pool of a Ray process, created once so that the worker stays warm between trainings."""
 
 
 class RayPool(ClosedAtExit):

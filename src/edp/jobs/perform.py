@@ -25,10 +25,10 @@ from edp.storage.ledger import (
 )
 
 CLAIM_WAIT_S = 10.0
-"""Maximum time for which a worker waits for the claim of another worker, such as that of a pool killed a moment ago."""
+"""Maximum waiting time for the claim of another worker, s, for example of a pool that was killed a moment ago."""
 SHOWN_TRACE = 4000
 BEGUN = b"begun"
-"""Message that a worker sends before the function of a job is called."""
+"""Message that a worker sends before it calls the function of a job."""
 
 
 def perform(

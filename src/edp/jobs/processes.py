@@ -35,10 +35,10 @@ from edp.storage.ledger import Record, TrainingStatus
 from edp.wording import typed
 
 TICK_S = 0.1
-"""Interval of checks of the memory of a training; without a cap the pool sleeps until something happens."""
+"""Interval of the memory checks of a training, s. Without a memory limit the pool waits for events."""
 # Five minutes: imports of torch on a busy machine take their time, and a cap must not end them.
 START_S = 300.0
-"""Maximum time until a process calls the function of its training."""
+"""Maximum time from the start of a process until it calls the function of its training, s."""
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 SHOWN_OUTPUT = 2000
 PAGE = os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 4096

@@ -39,13 +39,13 @@ from edp.storage.portable import cores
 from edp.storage.provenance import environment
 
 UNITS = "units"
-"""Name of the folder of results in a run folder, until the run is finished."""
+"""Folder of the results of completed units in a run folder, until the run is finished."""
 TRIED_AGAIN = tuple(status for status in TrainingStatus if status is not TrainingStatus.DONE)
-"""A full disk or a log that was mended since: only what is done stays done when the command is given again."""
+"""Statuses of units that a repeated command runs again. A full disk or a faulty log may have been repaired."""
 PROGRESS = "progress"
-"""Key of `where` under which a unit in this process finds the progress that its stages belong to."""
+"""Key of `where` for the progress display to which the stages of a unit in this process belong."""
 WAKE_S = 0.5
-"""Interval of calls of `waiting` while processes are at work."""
+"""Interval between calls of `waiting` while processes run, s."""
 
 
 class UnitError(EdpError):
@@ -251,7 +251,7 @@ class Workers:
 
 
 IN_PROCESS: Workers = Workers()
-"""Default of every workflow."""
+"""Default workers of every workflow, which run in the calling process."""
 
 
 def _call_all(units: Sequence[WorkUnit], progress: Progress) -> Iterator[tuple[int, UnitResult]]:

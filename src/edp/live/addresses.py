@@ -10,7 +10,7 @@ from edp.errors import ConfigError, brief
 
 LOOPBACK = "127.0.0.1"
 MAX_HOST = 253
-"""Characters of a host name (RFC 1035)."""
+"""Maximum number of characters of a host name (RFC 1035)."""
 
 
 @dataclass(frozen=True)

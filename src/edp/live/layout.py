@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from edp.signals import KINDS, Channel, display_offset
 
 MOST_LABEL = 80
-"""Characters of a name on the page; a longer one would push everything else off it."""
+"""Maximum number of characters of a name on the page."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class LiveLayout:
     Attributes:
         title: title of the page.
         source: source of the rows, in words.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         width: number of columns.
         traces: traces of the first columns, in order.
         forecasts: predictions in the remaining columns.

@@ -11,9 +11,9 @@ from edp.errors import ConfigError
 from edp.wording import typed
 
 SLOWEST, FASTEST = 0.01, 1000.0
-"""Factors on real time that a viewer may ask for."""
+"""Limits of the playback speed that a viewer may request, relative to real time."""
 LATE_S = 1.0
-"""A source that is later than this gives up the lost time: it would otherwise race until it caught up."""
+"""Maximum delay of a source, s. With a larger delay the source skips the lost time instead of catching up."""
 
 LATE_SHOWN_S = 10.0
 
@@ -22,7 +22,7 @@ class Pace:
     """The clock of a source that can be steered.
 
     Args:
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         speed: factor on real time; infinite for as fast as possible.
         clock: seconds that never go back.
 

@@ -15,13 +15,13 @@ from edp.errors import DataError
 
 ROWS, PAST = 1, 2
 HEAD = struct.Struct("<4I d")
-"""Kind, first tick, number of rows, number of columns; time of the newest tick (s since 1970)."""
+"""Message header: kind, first sample, number of rows, number of columns; time of the newest sample (s since 1970)."""
 MAX_REQUEST = 256
-"""Bytes of a request."""
+"""Maximum size of a request in bytes."""
 MAX_PAST = 12_000
-"""Rows of one answer: two minutes at 100 Hz."""
+"""Maximum number of rows per response: two minutes at 100 Hz."""
 REQUESTS = {"past": ("first", "count"), "pause": ("value",), "speed": ("value",), "ahead": ("tick",)}
-"""Requests of a page with the names of their numbers. None of them reaches a machine, a disk or a setting."""
+"""Requests of the page with the names of their numbers. No request affects a machine, a disk or a setting."""
 
 
 @dataclass(frozen=True)

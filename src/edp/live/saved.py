@@ -14,7 +14,9 @@ from edp.report.common.templates import asset, json_text, stylesheet, template
 from edp.storage import write_bytes
 
 SAVED_BYTES = 24 << 20
-"""Maximum size of the rows in a saved page, which is a third larger: the newest 17 minutes of 60 columns at 100 Hz."""
+"""Maximum size of the rows in a saved page, bytes: the newest 17 minutes of 60 columns at 100 Hz. The page is a third
+larger.
+"""
 _SCRIPTS = ("uplot/uPlot.iife.min.js", "side_view.js", "live_store.js", "live_charts.js", "live.js")
 _STYLES = ("uplot/uPlot.min.css", "live.css")
 

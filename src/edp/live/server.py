@@ -28,16 +28,16 @@ from edp.live.session import LiveSession
 from edp.live.viewer import SEND_BUFFER, Viewer
 
 FLUSH_S = 0.04
-"""Time between messages of rows: 25 pictures per second, and at most this delay."""
+"""Interval between messages with rows, s: 25 pictures per second."""
 STATE_S = 1.0
 MAX_ROWS = 3000
-"""Maximum number of rows per message. A faster source omits rows; the page counts and shows them."""
+"""Maximum number of rows per message. A faster source omits rows, and the page shows their number."""
 BACKLOG_S = 30.0
-"""Length of the rows that a new viewer receives at once."""
+"""Duration of the history that a new viewer receives, s."""
 MAX_AHEAD_S = 600.0
 MAX_VIEWERS = 32
 MAX_BREAKS = 50
-"""New beginnings that a page is told of."""
+"""Maximum number of restarts of the time axis that are reported to a page."""
 TOKEN_BYTES = 24
 HEADERS = {
     "Cache-Control": "no-store",

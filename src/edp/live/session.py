@@ -15,9 +15,9 @@ from edp.live.layout import LiveLayout
 
 Rows = NDArray[np.float32]
 HISTORY_BYTES = 64 << 20
-"""Maximum size of the stored rows: 46 minutes of 60 columns at 100 Hz."""
+"""Maximum size of the stored rows, bytes: 46 minutes of 60 columns at 100 Hz."""
 MAX_EVENTS, MOST_TEXT = 500, 400
-"""Events that are kept, and characters of one."""
+"""Maximum number of stored events, and maximum number of characters of an event."""
 KINDS = ("note", "warning", "alarm")
 
 

@@ -12,11 +12,11 @@ from websockets.exceptions import ConnectionClosed
 from edp.live.protocol import text_message
 
 SEND_BUFFER = 1 << 16
-"""Bytes on the way to a viewer; the system's megabytes would show a slow one what was seconds ago."""
+"""Size of the socket's send buffer, bytes. A larger buffer would delay the display of a slow viewer by seconds."""
 MAX_WAITING = 50
-"""Messages of rows: two seconds."""
+"""Maximum number of waiting messages with rows: two seconds."""
 MAX_TEXTS = 1000
-"""Other messages; a viewer that takes none of so many is gone."""
+"""Maximum number of other waiting messages. A viewer with more waiting messages counts as disconnected."""
 REQUESTS_PER_S = 30.0
 
 

@@ -20,9 +20,9 @@ from edp.settings.bounds import above, shown
 from edp.signals import UNITS, VOCABULARY, Kind, SignalMap
 
 RATE = above(0.0, 1e9)
-"""Range of sample rates in Hz; clocks of logs count nanoseconds."""
+"""Valid range of sample rates in Hz. Log clocks count nanoseconds."""
 IN_MEMORY = "memory"
-"""Source of a recording that came from no file."""
+"""Source of a recording that was not read from a file."""
 
 
 def recording_of_columns(

@@ -24,7 +24,7 @@ from edp.storage import make_folder, replacing
 from edp.wording import typed
 
 ADDRESS = re.compile(r"(s3|gs|az):/{1,2}([^/]+)(?:/(.*))?", re.DOTALL)
-"""A path object leaves one of the two slashes."""
+"""Pattern of a bucket address. A path object removes one of the two slashes."""
 CONNECT_S, ANSWER_S, STEP_S = 10.0, 30.0, 120.0
 """Time limits to connect, for the answer to a request, and for a step (a listing, or part of an object) with its
 retries."""
@@ -36,7 +36,7 @@ HELP = {
     "gs": "GOOGLE_APPLICATION_CREDENTIALS; STORAGE_EMULATOR_HOST for another server",
     "az": "AZURE_STORAGE_ACCOUNT and AZURE_STORAGE_KEY, or a login of az; AZURE_STORAGE_ENDPOINT for another server",
 }
-"""Locations of the credentials of each service."""
+"""Where each service looks for credentials."""
 Result = TypeVar("Result")
 
 
@@ -195,7 +195,7 @@ REFUSED = re.compile(
     r"ACCESS_?DENIED|PERMISSION_DENIED|FORBIDDEN|(?<![0-9A-Z:])40[13](?![0-9])|UNAUTHORIZED|AUTHORIZATION|"
     r"AUTHENTICATION|INVALID_?ACCESS_?KEY|SIGNATURE|CREDENTIALS"
 )
-"""Codes of services for a refusal."""
+"""Pattern of service error codes that refuse access."""
 
 
 def _file_system(scheme: str, environment: Mapping[str, str] = os.environ) -> Any:

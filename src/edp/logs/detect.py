@@ -13,9 +13,9 @@ from edp.signals import SignalMap
 from edp.storage.paths import entries_of, is_file_at, is_folder_at, status_of
 
 _HEAD = 4096
-"""Bytes by which a format is recognised: beyond the header of every format."""
+"""Number of bytes read to detect a format, longer than the header of every format."""
 BAG_MARK = "metadata.yaml"
-"""The file that makes a folder a ROS 2 bag."""
+"""File that identifies a folder as a ROS 2 bag."""
 _ARRAYS = (
     "write its arrays as CSV or Parquet, a column a channel (in Python: pandas.DataFrame(...).to_parquet), or give "
     "them to edp.Recordings.from_arrays"

@@ -22,7 +22,7 @@ from edp.storage.paths import files_below, is_file_at, is_there
 from edp.wording import typed
 
 TEXT = (".txt", ".dat")
-"""Endings that logs share with other files: taken where a folder holds no logs of other endings."""
+"""File endings that logs share with other files. They are used if a folder has no logs with other endings."""
 _MAX_FILES = 10_000
 """Maximum number of files in a folder without logs whose endings are examined."""
 RATE_TOLERANCE = 1e-3

@@ -14,7 +14,7 @@ from edp.logs.units import channel_from_entry, check_unit, kind_of_unit, unit_fo
 from edp.signals import VOCABULARY, Channel, ChannelMap, SignalMap, Unit
 
 _LOOKED_ROWS = 1000
-"""Rows looked at to tell a column of numbers."""
+"""Number of rows examined to recognise a numeric column."""
 
 
 @dataclass(frozen=True)

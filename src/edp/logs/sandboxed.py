@@ -29,7 +29,7 @@ from edp.storage.memory import check_memory
 
 WORKER = "edp.logs.sandbox_worker"
 AHEAD = 2
-"""Pieces asked for at a time: the next one is read while the last is worked on."""
+"""Number of segments requested at a time, so that the next segment is read during processing."""
 _NUMBER_BYTES = 8
 """Maximum size of a number in bytes, to predict the size of results."""
 _KINDS: Mapping[str, type[EdpError]] = {kind.__name__: kind for kind in (DataError, ConfigError, StorageError)}

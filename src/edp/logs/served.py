@@ -32,9 +32,9 @@ from edp.storage.memory import announce
 MESSAGE_BYTES = 1 << 24
 """Maximum size of the numbers in one message. Larger parts are divided."""
 BAGS = ("mcap", "rosbag1", "rosbag2")
-"""Formats whose library tells them by the suffix of the path."""
+"""Formats whose library needs the suffix of the path."""
 _TEXT = 4000
-"""Longest message about what is wrong; its end, which says what to change, is kept."""
+"""Maximum length of an error message. Its end is kept, because it states the remedy."""
 _END = 500
 _STAMP_BYTES = 128
 """Memory for a time stamp while it is collected message by message."""

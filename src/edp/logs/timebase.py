@@ -26,17 +26,17 @@ Stamps = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 UNIFORM_RMS = 0.05
-"""Largest rms distance of the stamps from a line, in steps."""
+"""Maximum RMS distance of the time stamps from a line, in steps."""
 UNIFORM_MAX = 0.5
-"""Largest single distance: beyond half a step a row belongs to another tick."""
+"""Maximum single distance from the line, in steps. Beyond half a step a row belongs to another sample."""
 GAP_STEPS = 5.0
-"""Median steps that a gap exceeds; it must exceed `GAP_SECONDS`, too."""
+"""Minimum length of a gap in median steps; a gap must also exceed `GAP_SECONDS`."""
 GAP_SECONDS = 0.05
-"""Shortest gap: fast loggers skip some steps in ordinary operation."""
+"""Minimum length of a gap in s, because fast loggers normally skip some steps."""
 LATEST_SECONDS = 1e11
-"""About 3,000 years: larger stamps count in another unit."""
+"""Maximum time stamp in s, about 3,000 years. Larger stamps have another unit."""
 SHORTEST_STEP_S = 1e-9
-"""Clocks count nanoseconds."""
+"""Minimum step in s, because clocks count nanoseconds."""
 _SAME_TICK = 1e-6
 """Fraction of a sample interval by which rounding may delay a stamp."""
 _EVEN = 1e-4
@@ -44,9 +44,9 @@ _EVEN = 1e-4
 _REPEATED = 0.3
 """Fraction of rows with repeated stamps above which the clock is coarser than the rows."""
 _MAX_REPEATS = 1000
-"""Rows that one stamp may stand for."""
+"""Maximum number of rows with one time stamp."""
 _MIN_ROLLOVERS = 5
-"""Ticks by which a rounded rate must leave the grid behind before lost rows are ruled out."""
+"""Minimum drift in samples between a rounded rate and the grid that excludes lost rows."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,7 +57,7 @@ ALIASES = {
     "Grad": "deg",
     "grad": "deg",
 }
-"""Spellings in files, each with the usual name."""
+"""Alternative spellings of units, with the standard name."""
 
 OTHER_UNITS = frozenset(
     [
@@ -66,7 +66,7 @@ OTHER_UNITS = frozenset(
         *("L", "l", "mL", "ml", "µm", "um", "nm", "ft", "lb", "lbs", "counts", "digit"),
     ]
 )
-"""Units of quantities that have no kind here: their numbers are taken as they are, and they end no name."""
+"""Units of quantities without a kind. Their values are used unchanged, and they are not removed from names."""
 
 
 def normalise_unit(text: str | None) -> str | None:

@@ -19,8 +19,9 @@ def write_recording(recording: Recording, path: str | Path, options: WriteOption
     """Write a recording; the ending of `path` chooses the format, values are written in SI units.
 
     Args:
-        recording: what to write.
-        path: its ending is one of `edp.logs.list_suffixes`; an existing file is replaced only by a complete new one.
+        recording: recording to write.
+        path: path of the file; its ending is in `edp.logs.list_suffixes`. An existing file is replaced only by a
+            complete new one.
         options: the layout of a MAT file; where truth goes.
 
     Raises:

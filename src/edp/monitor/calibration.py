@@ -18,10 +18,10 @@ from edp.wording import figure
 Array = NDArray[np.float64]
 CONFIDENCE = 0.95
 LANES = 48
-"""Limits that one pass over the sessions tries; three passes place a limit to 1 in 1e5 of the range."""
+"""Number of limits tried per pass over the sessions. Three passes resolve a limit to 1e-5 of the range."""
 PASSES = 3
 MIN_PART = 1e-6
-"""Minimum part of an alarm. Smaller parts are rounding of the division."""
+"""Minimum contribution of a summary to an alarm. Smaller contributions are rounding errors of the division."""
 MAX_HOURS = above(0.0, 1e6)
 
 

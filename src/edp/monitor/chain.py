@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 MAX_SUMMARIES = 5_000
 MAX_WATCHES = 16
 MEAN, WIDTHS, MATRIX = (ArrayRule(shape) for shape in (("summaries",), ("summaries",), ("summaries", "columns")))
-"""Arrays of a watch in a file: its mean, and a width of each summary or a matrix."""
+"""Array rules of a watch: its mean, and the width of each summary or a whitening matrix."""
 _TREE = SettingsTree({"detector": DETECTORS}, what="monitor")
 
 
@@ -63,7 +63,7 @@ class BlockVerdict:
     """Result of one block.
 
     Attributes:
-        block: its number from the start.
+        block: index of the block, counted from the start.
         statistics: statistic of each watch divided by its scale.
         row: conditioned summaries, NaN where missing.
         alarm: place of the watch that passed the limit, None without an alarm.

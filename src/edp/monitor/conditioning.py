@@ -20,18 +20,17 @@ ARRAYS = {
     "spread": ArrayRule(("summaries", "points")),
     "floor": ArrayRule(("summaries",), low=POSITIVE),
 }
-"""Of its file."""
+"""Arrays of the conditioning in its file, with their rules."""
 POINT_LIMIT = 3.0
-"""Limit of levels and sizes, in healthy standard deviations. Regression lines are constant beyond it."""
+"""Limit of levels and spreads in healthy standard deviations. Regression lines are constant outside the limit."""
 RIDGE = 1e-3
-"""Ridge penalty per row: operating points that never vary alone."""
+"""Ridge penalty per row, needed because some operating-point values never vary independently."""
 TRIMMED = 4.0
-"""Residuals of the regression in robust deviations, beyond which a row does not count in the second round."""
+"""Largest residual of the regression that counts in the second round, in robust standard deviations."""
 GROSS = 1e3
-"""Largest size of a conditioned summary where gross deviations are to be told from large ones."""
+"""Limit of a conditioned summary in healthy standard deviations, large enough to distinguish gross deviations."""
 MIN_WIDTH = 0.3
-"""Minimum width relative to the usual width, for operating points at which the regression for the width falls below
-it."""
+"""Minimum width relative to the median width, for operating points at which the fitted width is smaller."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,16 +21,16 @@ from edp.storage.reading import Table
 from edp.wording import figure, percent
 
 FOUND_SHARE = 0.8
-"""Fraction of the trials in which a change of the stated size must be found."""
+"""Fraction of the trials in which a change of the reported size must be detected."""
 MAX_CHANNELS, MAX_SEGMENTS, SEGMENT_S = 12, 4, 120.0
-"""Bounds of the work: channels, healthy segments per channel, and length of a segment."""
+"""Maximum number of channels, maximum number of healthy segments per channel, and length of a segment in s."""
 ONSET = 0.3
-"""Fraction of a segment after which the change begins."""
+"""Position of the change in a segment, as a fraction of its length."""
 EFFORT_SHARE, MIN_EFFORT_S = 0.2, 20.0
-"""Processor time that the trials may take: a share of that of the fit before, and at least some seconds."""
+"""Processor time for the trials: fraction of the preceding fit's time, and minimum in s."""
 _SHOWN = 4
 OUTSIDE = 1.5
-"""Margin over what a healthy session reaches of the range of the others, before a residual is called outside of it."""
+"""Factor on the largest ratio of healthy sessions above which a residual is outside its healthy range."""
 
 
 class Change(StrEnum):
@@ -76,7 +76,7 @@ INJECTIONS = {
     Change.SCALE: _Injection((0.01, 0.02, 0.05, 0.1, 0.2, 0.5), (1.0, -1.0), 2, _scale),
     Change.DELAY: _Injection((0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0), (1.0,), 2, _delay),
 }
-"""Shifts come first: they are measured with more trials, and the effort may end before the others."""
+"""Changes tried per type. Shifts come first: they get more trials, and the time limit may stop the other types."""
 
 
 @dataclass(frozen=True)

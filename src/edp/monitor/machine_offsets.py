@@ -24,10 +24,11 @@ FIRST_S = 120.0
 MIN_THERE = 0.5
 """Minimum fraction of the log in which a balance must be available."""
 OFF = 3.0
-"""Healthy deviations of such a mean beyond which an axis is off. Of 65 healthy sessions the axis that is off least
-reaches 2.5, of sister machines within 1 % 2.9 to 15."""
+"""Mean of a balance, in healthy standard deviations, beyond which its axis counts as deviating. The least deviating
+axis of 65 healthy sessions reaches 2.5, of sister machines within 1 % 2.9 to 15.
+"""
 MIN_AXES = 2
-"""Minimum number of axes: one axis alone may have a fault."""
+"""Minimum number of deviating axes. A single deviating axis may have a fault."""
 
 
 def scatter_of(chain: MonitorChain, sessions: Sequence[SessionBlocks], block_s: float) -> Array:

@@ -27,15 +27,15 @@ from edp.wording import figure, number
 
 Array = NDArray[np.float64]
 PIECE = 4096
-"""Ticks of a recording that are taken at once: long enough for speed, short enough for memory."""
+"""Number of samples of a recording processed at once: a compromise between speed and memory."""
 MAX_EVIDENCE = 8
-"""Summaries that an alarm names."""
+"""Maximum number of summaries listed as evidence of an alarm."""
 OTHER_MACHINE = 6.0
-"""Healthy deviations of a session's mean of a channel, beyond which the channel is not that of this machine."""
+"""Deviation of a channel's session mean, in healthy standard deviations, that indicates a different machine."""
 IMPOSSIBLE = 1e5
-"""Healthy deviations beyond which a value is a broken number, as exported code takes it."""
+"""Deviation in healthy standard deviations beyond which a value counts as invalid, as in the exported code."""
 OTHER_SHARE = 0.25
-"""Fraction of the channels beyond `OTHER_MACHINE` above which the log is of another machine."""
+"""Fraction of the channels beyond `OTHER_MACHINE` above which the log is attributed to a different machine."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +45,8 @@ class MonitorState:
     Attributes:
         sources: state of each source of residuals.
         chain: state of the chain.
-        ticks: since the start.
-        missing: ticks since the end of the last block at which each input was missing, shape (inputs,).
+        ticks: number of samples since the start.
+        missing: number of samples since the end of the last block at which each input was missing, shape (inputs,).
     """
 
     sources: tuple[SourceState, ...]
@@ -94,7 +94,7 @@ class Monitor:
 
     Attributes:
         channels: raw channels, SI units, in the order of a row.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         sources: sources of residuals.
         chain: chain from residuals to statistics.
         limit: alarm limit with its false-alarm rate.

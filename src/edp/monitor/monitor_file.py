@@ -48,14 +48,16 @@ from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 SCHEMA = 1
 HEADER = "monitor.json"
 NETWORKS = "networks"
-"""Folder of the networks that residuals are made with, a bundle or a twin each."""
+"""Folder of the models for residuals. Each is a bundle or a twin."""
 _FOLDER = re.compile(r"[a-z0-9]{1,32}-[a-z0-9]{1,32}")
 MOST_CHANNELS, MAX_SOURCES, MAX_NETWORKS = 2_000, 64, 256
 ARRAYS = {
     "session_means": ArrayRule((2, "channels")),
     "scatter": ArrayRule(("summaries",), low=0.0),
 }
-"""Besides those of the chain (``chain.``) and of each source (``source.0.``, ...)."""
+"""Array rules of the monitor file, in addition to the arrays of the chain (``chain.``) and of the sources
+(``source.0.``, ...).
+"""
 LIMIT = ("limit", "alarms", "hours", "promised_hours", "low_hours", "high_hours")
 
 

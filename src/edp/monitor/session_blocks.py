@@ -16,11 +16,13 @@ from edp.signals import Channel, Kind
 
 Array = NDArray[np.float64]
 SCALED_SESSIONS = 12
-"""Sessions that scales of residuals are taken from: they set units, conditioning does the rest."""
+"""Number of sessions that determine the residual scales. The scales only set units; conditioning does the rest."""
 MOVING = (Kind.VELOCITY, Kind.ANGULAR_VELOCITY, Kind.PILOT_PRESSURE, Kind.FLOW)
 LEVELS = (Kind.PRESSURE, Kind.TEMPERATURE, Kind.POSITION, Kind.ANGLE, Kind.RATIO, Kind.CURRENT, Kind.VOLTAGE)
 MAX_POINT = 24
-"""Channels of an operating point; of more, those that vary most between blocks are taken."""
+"""Maximum number of channels of an operating point. If there are more, the channels with the largest variation are
+used.
+"""
 MIN_TICKS = 10
 """Minimum length of a block in samples. Spreads of fewer samples are meaningless."""
 

@@ -19,7 +19,7 @@ from edp.storage.seals import HASH, content_digest, digest_of_bytes
 
 Arrays = Mapping[str, NDArray[Any]]
 ARRAY_BYTES = 512 * 2**20
-"""Maximum size of a file of arrays; a day of traces takes a tenth of it."""
+"""Maximum size of an array file in bytes. The traces of a day take a tenth of it."""
 ARRAYS = "arrays_blake2b"
 
 

@@ -25,16 +25,18 @@ ARRAYS = {
     "level": ArrayRule(("level",), np.int64, low=0, high="inputs"),
     "drivers": ArrayRule(("drivers", "residuals", 2), np.int64, low=-1, high="inputs"),
 }
-"""Of its file."""
+"""Arrays of the summaries in the monitor file, with their rules."""
 SUMMARIES = ("mean", "spread", "gain", "lag", "peak")
-"""Summaries of each residual and block, in this order, followed by one for each driver."""
+"""Summaries of each residual per block, in this order. One more for each driver follows."""
 MAX_DRIVERS = 8
 NEAR_ZERO = 0.05
-"""Variance in healthy units that is added below `gain` and `lag`: a channel in steady state tells neither."""
+"""Variance in healthy units added to the denominators of `gain` and `lag`, because a channel in steady state determines
+neither.
+"""
 BLOCKS_AT_ONCE = 32
-"""Side by side: their sums stay in the processor's cache."""
+"""Number of blocks processed together, small enough that their sums stay in the processor's cache."""
 MAX_BLOCK = 1_000_000
-"""Ticks of a block."""
+"""Maximum number of samples in a block."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +57,12 @@ class BlockSummaries:
     A block in which more than half of the ticks of a residual are missing gives NaN for it.
 
     Attributes:
-        block: ticks of a block.
-        scale: one over the healthy width of each residual, shape (residuals,): a controller multiplies faster than it
-            divides.
+        block: number of samples per block.
+        scale: inverse healthy width of each residual, shape (residuals,), because a controller multiplies faster than
+            it divides.
         channel: place of the channel that each residual evaluates among the raw inputs, shape (residuals,).
         centre: centre of each raw input, shape (inputs,).
-        spread: one over the healthy deviation of each, above zero.
+        spread: inverse healthy standard deviation of each input, above zero.
         change: D, healthy variance of d of the channel of each residual, shape (residuals,).
         moving: places of inputs whose mean size is part of the operating point.
         level: places of inputs whose mean is part of the operating point.

@@ -244,9 +244,10 @@ def scale_watches(specs: Sequence[WatchSpec], watches: Sequence[Watch], sessions
 ROWS_AT_ONCE = 64
 """Number of rows of a view at a time, so that their sums stay in the processor's cache."""
 MIN_ROWS = 16
-"""Minimum number of averages for a covariance. A diagonal is added to represent what they do not determine."""
+"""Minimum number of averages for a covariance. A diagonal term is added for undetermined directions."""
 MIN_GROSS = 3.0
-"""Healthy deviations: a summary that never strayed further is not gross before that."""
+"""Minimum threshold of a gross deviation, in healthy standard deviations."""
 EAGER = 3
-"""Rank of the healthy session's statistic, from the largest, by which watches are scaled: near the limit, where tails
-differ."""
+"""Rank of the session statistic that scales a watch, counted from the largest, so that the watches agree near the alarm
+limit.
+"""

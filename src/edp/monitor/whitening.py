@@ -12,7 +12,7 @@ from edp.errors import DataError
 
 Array = NDArray[np.float64]
 MIN_SHARE = 1e-9
-"""Fraction of the largest variance below which a direction is rounding of linearly dependent residuals."""
+"""Fraction of the largest variance below which a direction is rounding error of linearly dependent residuals."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,24 +26,25 @@ except ImportError:  # not POSIX
     resource = None  # type: ignore[assignment]
 
 START_BYTES = 512 << 20
-"""Memory for any file: libraries and the pools that they begin with."""
+"""Memory for any file, bytes: libraries and the initial size of their memory pools."""
 COPIES = 16
-"""A cell of text may take two bytes and becomes eight, which libraries hold twice while they build a column."""
+"""Memory factor of text. A cell of two bytes becomes a value of eight, of which libraries hold two copies."""
 RESERVED_BYTES = 4 << 30
-"""Address space beyond memory: arenas of threads and pools of allocators are reserved, and mostly never used."""
+"""Address space in addition to memory, bytes. Thread arenas and allocator pools reserve it, mostly without using it."""
 START_S = 5.0
-"""Processor time for any request."""
+"""Processor time for any request, s."""
 BYTES_PER_S = 1e6
-"""Assumed reading speed: well below that of a slow computer, since refusing a valid log is worse than a late
-refusal."""
+"""Assumed reading speed, bytes/s. It is below that of a slow computer, because refusing a valid log is worse than a
+late refusal.
+"""
 WORK_PER_S = 2e6
 VALUES_PER_S = 1e6
 PART_S = 0.01
-"""Time allowance per object of a file. An object of MAT v7.3 takes about 1.3 ms on a busy machine (journal)."""
+"""Processor time per object of a file, s. An object of MAT v7.3 takes about 1.3 ms on a busy machine (journal)."""
 WALL = 12
-"""Longest time by the clock, in allowed processor times: a process may also wait for ever."""
+"""Wall-clock limit as a multiple of the allowed processor time, because a process may wait forever."""
 MAX_S = 1e6
-"""Keeps announced sizes of a hostile header within what a timer takes."""
+"""Maximum time limit in seconds, so that sizes in a hostile header stay within the range of a timer."""
 _EXHAUSTED = re.compile(
     r"(?:out of|not enough|insufficient) memory|memory allocation|bad_alloc|malloc|alloc\w* failed|"
     r"(?:cannot|unable to) alloc",

@@ -21,7 +21,7 @@ _REFUSED = (
     "shutil.", "tempfile.", "pickle.", "sqlite3.enable_load_extension", "sqlite3.load_extension", "ftplib.", "http.",
     "imaplib.", "poplib.", "smtplib.", "telnetlib.", "urllib.", "webbrowser.", "winreg.", "resource.prlimit",
 )  # fmt: skip
-"""Events whose name begins so. Compiling and executing code is how libraries are imported, so it is not among them."""
+"""Prefixes of the refused audit events. Compiling and executing code is allowed because imports need it."""
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 _OPENERS = {"open", "sqlite3.connect"}
 _IN_MEMORY = ":memory:"

@@ -35,7 +35,7 @@ _SET_FILTER, _GET_SIZES, _NEW_LISTENER = 1, 3, 8
 _OPEN, _OPENAT = {"x86_64": 2, "aarch64": -1}, {"x86_64": 257, "aarch64": 56}
 _RECEIVE, _SEND, _IS_VALID, _ADD_HANDLE = 0xC0502100, 0xC0182101, 0x40082102, 0x40182103
 _NOTIFICATION = struct.Struct("=QIIiIQ6Q")
-"""Identity, thread, flags, call, architecture, instruction, arguments."""
+"""Kernel notification: identity, thread, flags, system call, architecture, instruction pointer, arguments."""
 _ANSWER, _HANDLE = struct.Struct("=QqiI"), struct.Struct("=QIIII")
 _ASK, _ALLOW = 0x7FC00000, 0x7FFF0000
 _LONGEST_PATH = 4096

@@ -28,7 +28,7 @@ _NAMES = frozenset(
     )
 )  # fmt: skip
 _PREFIXES = ("LC_", "MALLOC_", "MIMALLOC_", "OMP_", "MKL_", "OPENBLAS_", "NUMBA_", "EDP_")
-"""Beginnings of names: languages, allocators, numbers of threads, compiled code, EDP's own settings."""
+"""Prefixes of the inherited variables: languages, allocators, thread counts, compiled code, EDP's own settings."""
 BUILD_NAMES = frozenset(
     (
         "CC", "CXX", "CFLAGS", "CXXFLAGS", "CPPFLAGS", "LDFLAGS", "CPATH", "C_INCLUDE_PATH", "LIBRARY_PATH",

@@ -17,7 +17,7 @@ from pathlib import Path
 
 _CREATE, _ADD, _RESTRICT = 444, 445, 446
 _VERSION = 1
-"""Flag that asks which version (ABI) of Landlock the kernel has."""
+"""Flag to query the Landlock version (ABI) of the kernel."""
 _PATH_BENEATH = 1
 _NO_NEW_PRIVILEGES = 38
 _READ_FILE, _READ_DIR = 1 << 2, 1 << 3
@@ -26,7 +26,7 @@ _FILE_RIGHTS = {1: 13, 2: 14, 3: 15, 5: 16}
 _NET_FROM, _NET_RIGHTS = 4, 2
 """Version and number of the rights to bind and to connect TCP sockets."""
 _SCOPE_FROM, _SCOPES = 6, 3
-"""Abstract sockets and signals of processes outside."""
+"""Version that introduced scopes, and their flags: abstract sockets and signals of outside processes."""
 
 
 def restrict(readable: Iterable[Path]) -> None:

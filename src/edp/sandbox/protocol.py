@@ -23,9 +23,11 @@ HEADER_BYTES = 1 << 28
 """Maximum size of the JSON in a message: names and descriptions of all columns of a log."""
 _LENGTH = struct.Struct("<Q")
 _NUMBERS = re.compile(r"[<>|]?(?:f[248]|[iu][1248]|b1)")
-"""Plain numbers of at most eight bytes: no objects, which would be pickled, and no structures."""
+"""Pattern of the allowed number types, at most eight bytes. Objects, which would be pickled, and structures are
+excluded.
+"""
 _WRITTEN_BYTES = 1 << 24
-"""Written at once: some systems refuse single writes of gigabytes."""
+"""Maximum number of bytes per write. Some systems refuse single writes of gigabytes."""
 Header = Table
 ReadInto = Callable[[memoryview], None]
 Write = Callable[[Any], None]

@@ -27,22 +27,22 @@ from edp.sandbox.environment import reduce_environment
 from edp.sandbox.protocol import Header, packed, reader, receive
 
 PIPE_BYTES = 1 << 20
-"""Wanted size of the answers' pipe: with the usual 64 kB the reader would wait for each of them to be taken."""
+"""Requested size of the results pipe, bytes. With the usual 64 kB the reader would wait for the receiver too often."""
 SMALL_BYTES = 4096
-"""A request that any pipe takes at once."""
+"""Size of a request that fits into every pipe, bytes."""
 SLOW_S = 5.0
-"""Reading time after which the watcher is informed."""
+"""Reading time after which the observer is informed, s."""
 REPORT_S = 1
-"""Minimum time between two reports to the watcher."""
+"""Minimum interval between two reports to the observer, s."""
 # A fork of a process with threads may hang, so the worker's libraries get one each.
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 _SMALL_POOL = {"MIMALLOC_ARENA_RESERVE": "65536"}
-"""Arrow's pool takes a gigabyte at once unless limited (KiB); every file would have to be allowed that."""
+"""Limit of Arrow's memory pool, KiB. Without it, Arrow reserves a gigabyte for every file."""
 _FORKS = hasattr(os, "fork") and hasattr(socket, "send_fds")
 _END_S = 5.0
-"""Time that a worker without a socket gets to end by itself."""
+"""Time for a worker without a socket to end by itself, s."""
 _TRIES = 2
-"""A worker that has been idle may end, or something kill it, in the moment in which it is asked."""
+"""Number of attempts to start a request. An idle worker may end just when a request is sent."""
 Watcher = Callable[[Path, float, int], None]
 _lock = threading.RLock()
 _workers: dict[str, _Worker] = {}

@@ -26,16 +26,15 @@ from edp.sandbox.lockdown import note_libraries
 from edp.sandbox.processes import die_with_parent
 
 IDLE_S = 60.0
-"""Idle time after which the process ends. The next log starts another process."""
+"""Idle time after which the process ends, s. The next log starts another process."""
 END_S = 5.0
-"""Time for a process whose pipes are closed to end, before it is killed."""
+"""Time for a process with closed pipes to end before it is killed, s."""
 KEPT_CODES = 1024
-"""Maximum number of stored exit codes of forks, so that a data set of thousands of logs does not grow the list without
-end."""
+"""Maximum number of stored exit codes of forks, which bounds the list for data sets with thousands of logs."""
 ORDER_BYTES = 1 << 16
-"""Read at once; longer orders come in several segments."""
+"""Number of bytes read at once. Longer orders arrive in several parts."""
 Serve = Callable[[int, int], None]
-"""Serves one log by what it reads from one pipe and writes to another."""
+"""Function that serves one log: it reads orders from the first pipe and writes results to the second."""
 
 
 @dataclass

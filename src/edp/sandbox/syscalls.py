@@ -24,7 +24,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 Numbers = tuple[int | None, int | None]
-"""Number of a call on x86_64 and on aarch64."""
+"""Number of a system call on x86_64 and on aarch64."""
 
 _TRACED: dict[str, Numbers] = {
     # Files that are open or that the `open` rules below let through.
@@ -70,25 +70,29 @@ NOT_READING = (
     | 0o20000000 | 0o10000000
 )  # fmt: skip
 _THREAD = 0x10F00
-"""CLONE_VM, CLONE_FS, CLONE_FILES, CLONE_SIGHAND and CLONE_THREAD."""
+"""Required flags of a new thread: CLONE_VM, CLONE_FS, CLONE_FILES, CLONE_SIGHAND and CLONE_THREAD."""
 _THREAD_OPTIONS = 0x017C0000
-"""Flags that C libraries add: CLONE_SYSVSEM, _SETTLS, _PARENT_SETTID, _CHILD_CLEARTID, _DETACHED and _CHILD_SETTID."""
+"""Optional flags of a new thread: CLONE_SYSVSEM, _SETTLS, _PARENT_SETTID, _CHILD_CLEARTID, _DETACHED, _CHILD_SETTID."""
 _FCNTL = (0, 1, 2, 3, 1030, 1032)
-"""F_DUPFD, F_GETFD, F_SETFD, F_GETFL, F_DUPFD_CLOEXEC, F_GETPIPE_SZ. F_SETOWN and F_SETSIG send signals to others."""
+"""Allowed commands: F_DUPFD, F_GETFD, F_SETFD, F_GETFL, F_DUPFD_CLOEXEC, F_GETPIPE_SZ. The excluded F_SETOWN and
+F_SETSIG send signals to other processes.
+"""
 _F_SETFL, _O_ASYNC = 4, 0o20000
 _IOCTL = (0x5401, 0x802C542A, 0x5413, 0x541B, 0x5421, 0x5450, 0x5451)
-"""TCGETS, TCGETS2, TIOCGWINSZ, FIONREAD, FIONBIO, FIONCLEX, FIOCLEX. TIOCSTI types into a terminal."""
+"""Allowed requests: TCGETS, TCGETS2, TIOCGWINSZ, FIONREAD, FIONBIO, FIONCLEX, FIOCLEX. The excluded TIOCSTI types into
+a terminal.
+"""
 _PRCTL = (15, 16, 0x53564D41)
-"""PR_SET_NAME, PR_GET_NAME, PR_SET_VMA (names of memory areas)."""
+"""Allowed options: PR_SET_NAME, PR_GET_NAME, PR_SET_VMA (names of memory areas)."""
 _SHARED_LOCKS = 1 | 4 | 8
-"""LOCK_SH, LOCK_NB, LOCK_UN."""
+"""Allowed lock operations: LOCK_SH, LOCK_NB, LOCK_UN."""
 _ARCHITECTURES = {"x86_64": (0, 0xC000003E), "aarch64": (1, 0xC00000B7)}
 _LOAD, _EQUAL, _AND, _RETURN = 0x20, 0x15, 0x54, 0x06
 _NUMBER_AT, _ARCHITECTURE_AT, _ARGUMENTS_AT = 0, 4, 16
 _ALLOW, _FAIL, _KILL = 0x7FFF0000, 0x00050000, 0x80000000
 _SET_NO_NEW_PRIVILEGES, _SET_SECCOMP, _MODE_FILTER = 38, 22, 2
 _UNUSED_NUMBER = 1023
-"""Number of a call that no kernel has, which an unfiltered process is refused with ENOSYS."""
+"""System-call number that no kernel uses. Without a filter, the kernel refuses it with ENOSYS."""
 Instruction = tuple[int, int, int, int]
 
 

@@ -28,7 +28,7 @@ _CENTRAL, _LOCAL = b"PK\x01\x02", b"PK\x03\x04"
 _END_BYTES, _LOCATOR_BYTES, _END64_BYTES, _CENTRAL_BYTES, _LOCAL_BYTES = 22, 20, 56, 46, 30
 _LONGEST_COMMENT = 0xFFFF
 _FULL16, _FULL32 = 0xFFFF, 0xFFFFFFFF
-"""Marks of a number that stands in a field of ZIP64 instead."""
+"""Field values of a ZIP record that refer to a 64-bit number in its ZIP64 field."""
 _ENCRYPTED, _SIZES_BEHIND, _PATCHED, _STRONG, _UTF8, _MASKED = 1, 1 << 3, 1 << 5, 1 << 6, 1 << 11, 1 << 13
 _UNIX_TYPE = 16
 _LONGEST_NAME = 1024

@@ -15,7 +15,7 @@ from edp.wording import typed
 
 Arrays = Mapping[str, NDArray[Any]]
 POSITIVE = np.nextafter(0.0, 1.0)
-"""As the lowest value: above 0."""
+"""Smallest positive float, used as the minimum of arrays whose values must be above 0."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ MARKS = {
     "twin.json": "twin",
     "controller.json": "controller",
 }
-"""The file or folder that only one kind of folder has, and the kind, in the order in which they decide."""
+"""File or folder that identifies a type of EDP folder, with the name of the type. The first match decides."""
 
 
 def kind_of(folder: str | Path) -> str | None:

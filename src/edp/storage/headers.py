@@ -12,9 +12,9 @@ from edp.storage.run_kinds import RUN_KINDS
 from edp.storage.seals import HASH, content_digest, digest_of_bytes
 
 ARRAYS_BYTES = 2**30
-"""Most that a file of arrays has; the weights of 250 million parameters."""
+"""Maximum size of an array file in bytes, which is enough for the weights of 250 million parameters."""
 FILES = "files"
-"""Key of the hashes of files beside a JSON file."""
+"""Key in a JSON file of the hashes of the accompanying files."""
 _ENTRY = {"file", HASH}
 
 

@@ -19,9 +19,9 @@ from edp.storage.portable import lock as lock_file
 from edp.storage.writing import storage_error
 
 OURS = re.compile(r"\d{1,10} on [^\n]{1,255} since \d{4}-\d\d-\d\d \d\d:\d\d:\d\d|\x00*")
-"""What a lock file holds: its last holder; nothing, or the zeros of a disk that lost power, before the first one."""
+"""Content of a valid lock file: its last holder, or empty or zero bytes before the first holder."""
 HOLDER_BYTES = 400
-"""Most that it has."""
+"""Maximum number of bytes that are read from a lock file."""
 _OPEN = NO_LINK | QUIETLY
 _ADVICE = "nothing was changed: remove it, if nothing of yours needs it, and try again"
 

@@ -11,9 +11,9 @@ from edp.errors import ConfigError, DataError
 from edp.wording import typed
 
 SHARE = 0.8
-"""Of the memory that is free now, what a log may take."""
+"""Fraction of the free memory that a log may take."""
 UNKNOWN_BYTES = 1 << 62
-"""Stands for memory without a bound that the system tells."""
+"""Value for the available memory if the operating system states no limit, bytes."""
 Listener = Callable[[int, int, int], None]
 _listener: Listener | None = None
 

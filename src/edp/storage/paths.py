@@ -17,9 +17,9 @@ from pathlib import Path
 from edp.errors import StorageError
 
 _ABSENT = (errno.ENOENT, errno.ENOTDIR)
-"""Errors that say that nothing is at a path."""
+"""Error numbers of a path that does not exist."""
 _LONGEST = 200
-"""Characters of a path that a message shows."""
+"""Maximum number of characters of a path in a message."""
 
 
 def status_at(path: str | Path, follow: bool = True) -> os.stat_result | None:

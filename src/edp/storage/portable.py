@@ -10,14 +10,16 @@ import sys
 from typing import IO
 
 BINARY = getattr(os, "O_BINARY", 0)
-"""Windows would turn line ends and stop at a Ctrl-Z without it."""
+"""Flag of `os.open` for binary files. Without it, Windows converts line ends and stops at a Ctrl-Z."""
 QUIETLY = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | getattr(os, "O_CLOEXEC", 0)
-"""Opening waits for nothing, becomes nobody's terminal, and is not inherited; Windows has none of these."""
+"""Flags of `os.open`: do not block, do not become the controlling terminal, do not inherit; 0 on Windows."""
 NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 HELD = (errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK)
-"""With what a system says that another process holds a lock; EDEADLK is what Windows gives up with."""
+"""Error numbers that report a lock of another process. Windows raises EDEADLK after its last attempt."""
 _FAR = 1 << 30
-"""The byte that Windows locks: its locks also forbid reading, and the holder's name at the start is to be read."""
+"""Position of the byte that Windows locks. A Windows lock also forbids reading, and the holder's name must stay
+readable.
+"""
 
 if sys.platform == "win32":  # pragma: no cover - see tests/security/test_portable.py for the same calls
     import msvcrt

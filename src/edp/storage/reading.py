@@ -24,16 +24,16 @@ from edp.storage.seals import unsealed
 Table = dict[str, Any]
 """Table of a TOML file or object of a JSON file whose values nothing has checked yet."""
 JSON_BYTES = 64 * 2**20
-"""Of a JSON file; larger ones are not EDP's own."""
+"""Maximum size of a JSON file in bytes. EDP does not write larger ones."""
 SETTINGS_BYTES = 4 * 2**20
-"""Of a TOML file; reading one of this size takes seconds."""
+"""Maximum size of a TOML file in bytes. Reading a file of this size takes seconds."""
 DEPTH = 60
-"""Of tables and lists in each other; EDP's own files need 10."""
+"""Maximum nesting depth of tables and lists. EDP's own files need 10."""
 DIGITS = 40
-"""Of an integer; the 128 bits of a random generator's state take 39."""
+"""Maximum number of digits of an integer. The 128-bit state of a random generator takes 39."""
 _KEY = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 DEEP_KEY = re.compile(rf"(?:^|[\[{{,])[ \t]*+{_KEY}(?:[ \t]*+\.[ \t]*+{_KEY}){{{DEPTH}}}", re.MULTILINE)
-"""A dotted key deeper than `DEPTH`, on which the standard library's reader spends the third power of its parts."""
+"""Dotted key with more than `DEPTH` parts. The standard library takes cubic time in the number of parts to read it."""
 
 
 def read_bytes(path: str | Path, limit: int, where: str = "", error: type[Exception] = StorageError) -> bytes:

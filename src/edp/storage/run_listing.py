@@ -23,13 +23,13 @@ from edp.storage.seals import unsealed
 from edp.wording import typed
 
 MAX_FOLDERS = 20_000
-"""Folders that are looked into: more is a whole disk."""
+"""Maximum number of searched folders. A larger tree is probably a whole disk."""
 DEEPEST = 6
-"""Levels below the folder."""
+"""Maximum number of folder levels below the searched folder."""
 _BYTES = 8 * 2**20
-"""Of a file of a run; scores of hundreds of recordings take one."""
+"""Maximum size of a run's file in bytes. The scores of hundreds of recordings take 1 MB."""
 _LONGEST = 200
-"""Characters of a text that is listed."""
+"""Maximum number of characters of a text in the listing."""
 MODELS = (BUNDLE, TWIN, CONTROLLER)
 
 
@@ -45,7 +45,7 @@ class ListedRun:
             for a folder that this process has no right to look into.
         when: time of its last state according to its files, otherwise time of its files.
         data: source of its recordings.
-        score: its error on test logs in words; empty where it was not evaluated.
+        score: error on the test logs as text; empty if the run was not evaluated.
     """
 
     folder: Path

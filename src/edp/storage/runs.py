@@ -26,11 +26,11 @@ from edp.storage.writing import TEMPORARY, make_folder, remove_unfinished, write
 IDENTITY, STATUS = "run.json", "status.json"
 FINISHED = "finished"
 ENDED = (FINISHED, "diverged")
-"""States in which a run stays."""
+"""Final states of a run."""
 LEFT = (".lock", "config.toml")
-"""What a run that was killed before it was bound to its folder leaves there."""
+"""Files that remain in the folder of a run whose process was killed before it wrote the identity file."""
 PARTS = "parts"
-"""Folder of a run in which its single trainings stand, where it has several."""
+"""Subfolder for the individual trainings of a run that has several."""
 
 
 def run_key(config: Mapping[str, object], data_digest: str) -> str:

@@ -12,9 +12,9 @@ from collections.abc import Mapping
 from typing import Any
 
 HASH = "blake2b"
-"""Key of the hash over the rest of the object."""
+"""Key of the hash over all other keys of the JSON object."""
 _HASH_OF_LINE = re.compile(rf'(?:, )?"{HASH}": "([0-9a-f]{{32}})"}}\Z')
-"""The hash at the end of a line of JSON."""
+"""Pattern of the hash at the end of a JSON line."""
 MAX_UNSEALED = 100
 _unsealed: dict[str, None] = {}
 

@@ -14,11 +14,11 @@ from typing import IO, Any
 from edp.errors import DataError
 
 _STEP = 1 << 20
-"""Most bytes that are unpacked before they are counted."""
+"""Maximum number of bytes that are unpacked before they are counted."""
 _FEED = 1 << 16
-"""Packed bytes given to the engine at a time."""
+"""Number of packed bytes passed to the decompressor at a time."""
 DEFLATE_RATIO = 1100
-"""Deflate packs no better than 1,032 to 1."""
+"""Maximum ratio of unpacked to packed bytes. The Deflate format reaches at most 1,032."""
 
 
 def measure_unpacked(packing: str, data: bytes | memoryview, limit: int) -> int:

@@ -29,7 +29,7 @@ _OF_THE_SYSTEM = re.compile(
     r"errno = (\d+)|No space left|File too large|Disk quota|Input/output error|Read-only file"
     r"|disk I/O error|disk is full"
 )
-"""What libraries in C write into their own errors where the system refused to write."""
+"""Texts in error messages of C libraries that report an operating-system error during writing."""
 
 
 def system_failure(error: BaseException) -> OSError | None:
@@ -83,13 +83,15 @@ def check_writable(folder: str | Path) -> Path:
 
 
 TEMPORARY = re.compile(r"\..{0,80}\.(?:[0-9a-f]{12}|[a-z0-9_]{8})\.tmp", re.DOTALL)
-"""Names of files and folders that are not finished, also of those of earlier versions."""
+"""Pattern for the names of unfinished files and folders, including the names that earlier versions used."""
 
 
 _cleaned: set[str] = set()
-"""Folders in which this process has looked for what killed processes left."""
+"""Folders that this process has already searched for files of killed processes."""
 LEFT_AFTER_S = 60.0
-"""Age of an unfinished file before another process may remove it: by then its writer holds it, or is gone."""
+"""Minimum age of an unfinished file before another process removes it, s. By then its writer has locked it or has
+ended.
+"""
 
 
 def _remove_left(folder: Path) -> None:

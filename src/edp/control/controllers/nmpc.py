@@ -36,20 +36,22 @@ from edp.wording import typed
 Array = NDArray[np.float64]
 MAX_BLOCKS, MAX_BLOCK_TICKS = 30, 1_000
 STEP_M_S = 0.01
-"""By which a speed is changed to see its effect: far above single precision, far below what bends the valve curves."""
+"""Speed step for finite differences, m/s: far above rounding, and small relative to the curvature of the valve maps."""
 NEAR_LIMIT = 0.1
-"""Share of a range or pressure within which its limit takes part in the program; others cannot be met in a horizon."""
+"""Distance from a limit, as a fraction of the range, within which the limit becomes a constraint of the QP."""
 NO_LIMIT = -1e30
-"""What DAQP takes for no limit."""
+"""Value that DAQP interprets as no lower bound."""
 SOFT = 8
-"""DAQP's mark of a constraint that may be violated at a price."""
+"""Flag of DAQP for a soft constraint."""
 MIN_ANSWER, GOOD_ANSWER = 0.1, 0.5
-"""Shares of a speed that must be there where a plan ends, and that better are: short of them it sees no effect."""
+"""Minimum and sufficient fraction of a speed step that must be visible at the end of the prediction horizon."""
 ATTITUDE_M, LOADED_ATTITUDE_M = 1.0, 2.0
-"""Of most twins, and of those that are told of forces: on lines that were not evaluated 2 held the attitude in loam
-better on grey boxes of M22 and C14, and made both errors of a poor network larger (docs/journal)."""
+"""Weight of the attitude in m per rad, without and with a force model in the twin. On lines that were not evaluated, 2
+held the attitude in loam better on the grey boxes of M22 and C14, and increased both errors of a poor network
+(docs/journal).
+"""
 FAST_TIP_M_S = 0.02
-"""Reference speed above which a tip error has a direction along the path and one across."""
+"""Reference speed above which the tip error is divided into components along and across the path, m/s."""
 
 
 @CONTROLLERS.register("nmpc")
@@ -58,7 +60,7 @@ class PredictiveControl:
     """Model predictive controller. Weights apply to squares: tip errors in m^2, changes of requested speeds in (m/s)^2.
 
     Attributes:
-        blocks: ticks of the blocks of the horizon.
+        blocks: length of each block of the horizon in samples.
         along: weight of the tip error along the path, beside 1 across it.
         attitude_m: length of arm (m) by which an error of the attitude in rad counts like one of the tip; None: 2 with
             a twin that is told of forces against the cylinders, as a grey box is, else 1 (`attitude_with`).

@@ -11,11 +11,11 @@ from edp.errors import ConfigError, DataError
 from edp.storage.archives import ArchiveLimits, ZipReader, printable
 
 MAX_FILE = 1 << 28
-"""Bytes of the file: tools pack solvers and tables of some 100 MB."""
+"""Maximum size of an FMU in bytes. Tools include solvers and tables of about 100 MB."""
 MAX_UNPACKED = 1 << 29
-"""Bytes of all entries: a bomb announces thousands of times its size."""
+"""Maximum unpacked size of all entries in bytes. A ZIP bomb announces thousands of times its size."""
 MAX_XML = 1 << 24
-"""Bytes of ``modelDescription.xml``: some 100,000 variables."""
+"""Maximum size of ``modelDescription.xml`` in bytes, which is enough for 100,000 variables."""
 MOST_ENTRIES = 10_000
 DESCRIPTION = "modelDescription.xml"
 _LIMITS = ArchiveLimits(MAX_FILE, MAX_UNPACKED, MOST_ENTRIES)

@@ -19,11 +19,11 @@ from edp.storage.archives import printable
 
 MAX_VARIABLES = 100_000
 MAX_ELEMENTS = 1_000_000
-"""Each takes some 200 bytes of memory, and four bytes of the file suffice for one."""
+"""Maximum number of XML elements. An element takes about 200 bytes of memory and at least four bytes of the file."""
 DEEPEST = 50
-"""Of elements; those of the standard reach 6, annotations of tools somewhat more."""
+"""Maximum nesting depth of XML elements. The standard needs 6 levels, tool annotations slightly more."""
 IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}")
-"""A name of C: it becomes part of the path of the library."""
+"""Pattern of a C identifier. The model identifier becomes part of the path of the library."""
 REFERENCE = re.compile(r"[0-9]{1,10}")
 BASES = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 
@@ -76,7 +76,7 @@ def read_description(content: bytes, where: str) -> FmuDescription:
     """Read a description.
 
     Args:
-        content: its bytes.
+        content: bytes of the XML file.
         where: the FMU, for messages.
 
     Raises:

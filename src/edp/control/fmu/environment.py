@@ -23,9 +23,9 @@ from edp.wording import setting_text, typed
 Array = NDArray[np.float64]
 Rows = NDArray[np.float32]
 REST_S = 2.0
-"""Rest before the prefix, in which the memory of a twin forgets where a reset left it: at the means of its data."""
+"""Duration of the steady state before the prefix, s. The memory of a twin settles during this time."""
 START_SHARE = 0.02
-"""Share of a stroke by which an FMU may begin elsewhere than asked."""
+"""Maximum difference between the requested and the actual initial stroke of an FMU, as a fraction of the stroke."""
 STEP_SLACK = 1e-6
 
 
@@ -121,7 +121,7 @@ class FmuEnvironment(ModelEnvironment):
         path: the file.
         machine: name or file of the machine whose kinematics, nominal commands and pressures in steady state are used.
         duration_s: length of an episode.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
 
     Raises:
         ConfigError: FMPy is not installed, there is no such file, or it is no excavator, or of another rate.

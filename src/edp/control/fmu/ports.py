@@ -14,9 +14,9 @@ from edp.signals import VOCABULARY, Channel
 from edp.storage.archives import printable
 
 AHEAD = "_ahead_1"
-"""Behind the name of an output one tick after the inputs, as exported twins write it."""
+"""Suffix of the name of an output one sample after the inputs, as in exported twins."""
 START = "_start"
-"""Behind the name of a stroke, for a parameter that holds it at the start."""
+"""Suffix of a stroke's name for the parameter with its initial value."""
 BASES: Mapping[str, Mapping[str, float]] = {
     "Pa": {"kg": 1, "m": -1, "s": -2},
     "m": {"m": 1},
@@ -25,7 +25,7 @@ BASES: Mapping[str, Mapping[str, float]] = {
     "rad": {"rad": 1},
     "rad/s": {"rad": 1, "s": -1},
 }
-"""Exponents of units that may have another name in an FMU, such as N/m2."""
+"""SI base-unit exponents of units that an FMU may spell differently, such as N/m2."""
 
 
 @dataclass(frozen=True, eq=False)

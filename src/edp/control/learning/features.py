@@ -15,11 +15,13 @@ from edp.signals import KINDS, Channel, Kind
 
 Array = NDArray[np.float64]
 SCALES = {Kind.VELOCITY: 0.1, Kind.PRESSURE: 10e6}
-"""SI values that become one: usual speeds of grading, usual pressures. Other kinds: their largest plausible value."""
+"""Scale of a feature by kind of channel, SI units: typical grading speed and pressure. Other kinds use their largest
+plausible value.
+"""
 STROKE_M, TIP_M, ATTITUDE_RAD, SPEED_M_S = 0.02, 0.05, 0.05, 0.2
-"""Errors and reference speeds that become one; errors of a good loop are a tenth of these."""
+"""Scales of errors and reference speeds. The errors of a good control loop are a tenth of these."""
 MOST = 10.0
-"""Features are cut to this; what is ten times as large as usual says no more."""
+"""Limit of the absolute value of a scaled feature."""
 
 
 @dataclass(frozen=True, eq=False)

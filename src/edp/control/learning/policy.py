@@ -20,7 +20,7 @@ from edp.wording import typed
 
 Array = NDArray[np.float64]
 Policy = Callable[[NDArray[np.float32]], Any]
-"""An action, shape (3,), for an observation of `TaskEnvironment`."""
+"""Function that maps an observation of `TaskEnvironment` to an action, shape (3,)."""
 
 
 class PolicyController(Controller):

@@ -20,12 +20,11 @@ from edp.wording import setting_text, typed
 
 PRESSURES = tuple(name for name, channel in TABLE_A1.items() if channel.kind is Kind.PRESSURE)
 OBSERVED = (*VELOCITIES, *STROKES, *PRESSURES)
-"""What both the simulator and a twin of a usual log measure."""
+"""Channels that both the simulator and a twin of a typical log provide."""
 FIRST_SEED = 1_000_000
-"""Of the references that an environment draws by itself; those that evaluate a controller count from 0, as in a
-tuning."""
+"""Smallest seed of the references that an environment draws. The references for evaluation and tuning start at 0."""
 SIMULATOR = ("step_s", "sensor_noise", "hand", "loop_latency", "lost_frames", "sensors")
-"""Settings of `EnvironmentSpec` that a task leaves open: the machine, soil and start are the task's."""
+"""Settings of `EnvironmentSpec` that the user may choose. The task determines the machine, the soil and the start."""
 MOST_TICKS = 1_000_000
 
 
@@ -39,9 +38,9 @@ class LearningSpec:
         machine: name or file of the machine.
         plant: run folder of a twin, or an FMU (`.fmu`), in place of the simulator; or a twin itself.
         trust_fmu: an FMU is native code, which runs with your rights; it is not loaded without this.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         duration_s: longest episode; a longer reference is cut off there.
-        hold: ticks for which an action holds.
+        hold: number of samples for which an action is held.
         observed: measured channels in the observation; strokes are always among what is read.
         preview_s: lead up to which the stroke velocities of the reference are observed, s.
         past_s: time back to which past levers are observed, in addition to the last ones, s.

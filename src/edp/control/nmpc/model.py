@@ -28,7 +28,7 @@ class TwinModel:
     Args:
         twin: commanded by pilot pressures of Table A.1; outputs the strokes and velocities of three cylinders.
         plant: controlled plant.
-        window: ticks over which predictions are compared with what was measured.
+        window: number of samples over which predictions are compared with measurements.
         smoothing: share of an error that the disturbance takes over in a tick; 0: no disturbance.
         load: the fraction for forces against the cylinders, if the twin has a load.
 

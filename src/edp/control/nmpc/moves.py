@@ -12,7 +12,7 @@ from edp.control.valve_map import SIDES, ValveMap
 
 Array = NDArray[np.float64]
 REST_M_S = 0.004
-"""Speeds below which the lever goes through the dead band in a straight line: a jump there would chatter."""
+"""Speed below which the lever crosses the dead band on a straight line, m/s. A jump would cause chatter."""
 
 
 class SpeedToLever:
@@ -72,7 +72,7 @@ class Moves:
     """Horizon in blocks of samples with constant requested speeds.
 
     Args:
-        blocks: ticks of each block.
+        blocks: length of each block in samples.
 
     Attributes:
         ticks: length of the horizon.

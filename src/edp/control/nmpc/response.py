@@ -12,11 +12,11 @@ from edp.control.plant import STROKES
 
 Array = NDArray[np.float64]
 SPEED_M_S = 0.1
-"""That is asked for: clear of the dead bands, far below what the pumps can give."""
+"""Requested speed of the step response, m/s: outside the dead bands and far below the pump limits."""
 SETTLED_S, MEAN_S = 1.0, 0.2
-"""After which a speed counts as reached, and the time before over which it is averaged."""
+"""Time after which a speed counts as reached, and length of the averaging window before it, s."""
 MIN_OF_ASKED = 0.2
-"""Of what was asked for: a twin that reaches less has no output whose time could be told."""
+"""Minimum fraction of the requested speed that the twin must reach. Otherwise its response time cannot be measured."""
 
 
 def response(model: TwinModel, measured: Array, valves: SpeedToLever, slew: Array) -> Array | None:

@@ -13,7 +13,7 @@ from edp.sim.physics import pose
 
 Array = NDArray[np.float64]
 NODES = 4001
-"""Of a table: linear between nodes, poses are within a few micrometres, where strokes are measured to tenths of mm."""
+"""Number of nodes of the table. Linear interpolation errors are a few micrometres; strokes are measured to 0.1 mm."""
 
 
 class TipTable:

@@ -20,11 +20,11 @@ from edp.wording import setting_text, typed
 
 Array = NDArray[np.float64]
 TRIES = 200
-"""Draws of a task's numbers before it is refused: at 1 % that fit, 87 % of the seeds find one."""
+"""Maximum number of random draws of a task. If 1 % of the draws are valid, 87 % of the seeds succeed."""
 SPEED_RESERVE = 0.8
-"""Share of a cylinder's free-air top speed that a reference may ask for: flow is shared where three move at once."""
+"""Maximum reference speed as a fraction of a cylinder's free-air top speed, because moving cylinders share the flow."""
 SPEED_M_S = (0.3, 0.5)
-"""Of the tip, where a task's speed is drawn: usual for grading."""
+"""Range of the tip speed for tasks that draw it, m/s: typical for grading."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class TaskSpec(ABC):
         ramp_s: time to speed up and to slow down, s.
         lead_s: rest before the start, not evaluated.
         hold_s: rest after the end, evaluated.
-        margin: share of the stroke at either end that a reference leaves free.
+        margin: fraction of the stroke at either end that a reference leaves free.
         material: soil; empty for free air.
         limits: limits of the loop.
     """
@@ -127,7 +127,7 @@ def check_order(what: str, **ranges: tuple[float, float]) -> None:
 
 
 TASKS: Registry[type[TaskSpec]] = Registry("task")
-"""Specs by name: one file and one registration each."""
+"""Registry of the task settings by name. Each task has a file and a registration."""
 
 
 def draw_task(spec: TaskSpec, geometry: TipGeometry, rate_hz: float, seed: int) -> ControlTask:
@@ -136,7 +136,7 @@ def draw_task(spec: TaskSpec, geometry: TipGeometry, rate_hz: float, seed: int) 
     Args:
         spec: options of a registered task.
         geometry: geometry of the machine.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         seed: random seed; equal seeds give equal tasks.
 
     Raises:

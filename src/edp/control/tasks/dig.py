@@ -13,11 +13,11 @@ from edp.control.tasks.base import TASKS, TaskSpec, check_order
 from edp.settings.bounds import above, check_bounds
 
 ENTRY_DEG, CLOSING_DEG, CURLED_DEG, OPEN_DEG = (-120.0, -95.0), (20.0, 45.0), (-200.0, -185.0), (-120.0, -80.0)
-"""Attitudes: entering, turned while dragging, closed, dumping; straight down is -90 deg."""
+"""Bucket attitude at entry, rotation while dragging, closed and dumping attitude, deg. Straight down is -90 deg."""
 ABOVE_M, LIFT_M, DUMP_M = 0.4, (1.2, 2.0), (2.0, 3.0)
-"""Above the ground: the tip before penetrating, the bucket's pin after lifting and at dumping."""
+"""Heights above the ground, m: tip before penetration, bucket pin after lifting, bucket pin while dumping."""
 ENTRY_REACH, DUMP_REACH = (0.55, 0.8), (0.5, 0.7)
-"""Distance of entry and of the pin at dumping from the boom foot, as shares of the machine's reach."""
+"""Distances from the boom foot as fractions of the reach: tip at entry, and bucket pin while dumping."""
 
 
 @TASKS.register("dig")

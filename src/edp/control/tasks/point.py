@@ -13,9 +13,9 @@ from edp.control.tasks.time_law import duration_s, timed
 from edp.settings.bounds import check_bounds, integer
 
 STEP = 0.4
-"""Largest share of a stroke from point to point: a few seconds each."""
+"""Maximum distance between two points as a fraction of the stroke. A move takes a few seconds."""
 POINTS = (0.15, 0.85)
-"""Strokes (shares) of which points are drawn."""
+"""Range of the random points, as fractions of the stroke."""
 
 
 @TASKS.register("point")

@@ -12,7 +12,9 @@ from edp.registry import Registry
 Array = NDArray[np.float64]
 
 LAWS: Registry[Callable[[Array], Array]] = Registry("time law")
-"""Share of a ramp's way at a share of its time, shape (...); 0 to 0.5, since the mean speed of a ramp is half."""
+"""Registry of the time laws of a ramp: completed fraction of the ramp's length, shape (...), as a function of the
+elapsed fraction of its duration. Values go from 0 to 0.5, since the mean speed of a ramp is half.
+"""
 
 
 @LAWS.register("trapezoid")
@@ -31,7 +33,7 @@ def progress(time_s: Array, length_s: float, ramp_s: float, law: str) -> Array:
     """Share of the way done, 0 to 1, with a ramp at either end.
 
     Args:
-        time_s: since the start, any shape.
+        time_s: time since the start in s, any shape.
         length_s: duration of the whole path, s.
         ramp_s: time to speed up, and to slow down, s; at most half of `length_s`.
         law: name in `LAWS`.
@@ -58,7 +60,7 @@ def timed(
     Args:
         points: shape (legs + 1, values).
         seconds: length of each leg.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         ramp_s: see `progress`.
         law: time law, see `progress`.
         lead_s: rest at the first point, not evaluated.

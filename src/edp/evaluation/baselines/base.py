@@ -34,9 +34,9 @@ class Baseline(ABC):
     """
 
     label: ClassVar[str]
-    """Name in tables and pictures."""
+    """Name in tables and figures."""
     effort: ClassVar[int] = 2
-    """Relative fitting time; 0 for none. The evaluation begins with the fastest baseline."""
+    """Relative fitting time; 0 without fitting. The evaluation starts with the fastest baseline."""
 
     def __init__(self, task: BaselineTask) -> None:
         self.task = task

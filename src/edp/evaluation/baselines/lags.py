@@ -14,7 +14,7 @@ from edp.evaluation.baselines.base import BaselineTask
 from edp.recording import FloatArray
 
 LAGS = (0, 1, 2, 4, 8, 16, 32)
-"""Ticks back at which inputs are read: dense where a 100 Hz plant changes, sparse further back."""
+"""Lags in samples at which inputs are read, dense at small lags where a 100 Hz plant changes quickly."""
 
 # Blocks bound the memory of the lag table, several times as wide as the inputs.
 BLOCK_ROWS = 16_384

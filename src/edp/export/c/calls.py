@@ -16,9 +16,9 @@ from edp.ir.layers import runs as neighbours
 from edp.ir.w8a16.layers import QGather
 
 WORK = {Number.FLOAT: "work", Number.INT16: "work16", Number.INT32: "work32"}
-"""Work memories."""
+"""Names of the work memories by number format."""
 MAX_COPIES = 8
-"""Runs of neighbouring columns up to which copies are written; beyond, a table of columns."""
+"""Maximum number of contiguous column ranges for which copies are written. For more ranges a column table is used."""
 
 
 class Calls:
@@ -236,7 +236,7 @@ CALLS: dict[type[Layer], Write] = {
     memory.Feed: _feed,
     memory.PrefixCorrection: _prefix,
 }
-"""By kind of layer."""
+"""Writer functions by layer class."""
 
 
 def structs(layer: Layer) -> list[Code]:

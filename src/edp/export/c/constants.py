@@ -24,7 +24,7 @@ TYPES = {
     "uint8": "uint8_t",
     "uint16": "uint16_t",
 }
-"""C types of constants."""
+"""C types of the constants by array data type."""
 NUMBER_BYTES = {"float": 4, "int8_t": 1, "uint8_t": 1, "int16_t": 2, "uint16_t": 2, "int32_t": 4, "uint32_t": 4}
 STRUCTS = {
     "edp_table": (1, 2),
@@ -37,7 +37,7 @@ STRUCTS = {
     "edp_adapt_law": (10, 14),
     "edp_hydraulics": (16, 15),
 }
-"""Pointers, and numbers of 4 bytes behind them, of the runtime's structs."""
+"""Number of pointers, and number of 4-byte values after them, in the structs of the runtime."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,9 @@ class DataModel:
 
 
 CORTEX_M = DataModel(pointer=4, boundary=4)
-"""32-bit Arm cores: GCC lets every constant begin on a word (``DATA_ALIGNMENT`` of its Arm back end; not with -Os)."""
+"""32-bit Arm cores. GCC aligns every constant to a word (``DATA_ALIGNMENT`` of its Arm back end; not with -Os)."""
 DESKTOP = DataModel(pointer=8, boundary=1)
-"""64-bit computers, without the gaps between constants, which are the compiler's affair there."""
+"""64-bit computers, without gaps between constants, since their alignment depends on the compiler."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from edp.ir.w8a16 import arithmetic as fixed
 from edp.ir.w8a16 import layers as quantised
 
 FILES = ("edp_integer.h", "edp_integer.c", "edp_integer_memory.c")
-"""Of the runtime, with the tables of `tables_header`."""
+"""Runtime files of integer networks. The tables of `tables_header` are added to them."""
 
 
 def _quantise(calls: Calls, x: quantised.Quantise) -> list[str]:
@@ -117,7 +117,7 @@ INTEGER_CALLS: dict[type[Layer], Write] = {
     quantised.QTrailingMean: _mean,
     quantised.QAttentionPool: _pool,
 }
-"""By kind of integer layer."""
+"""Writer functions by class of integer layer."""
 CALLS |= INTEGER_CALLS
 
 

@@ -12,7 +12,7 @@ from edp.ir.layers import GroupedDense
 
 # Sixteen rows: measured on a Cortex-M4F, 165,833 instead of 193,784 instructions a tick (docs/journal).
 PANEL = 16
-"""Rows that a product computes side by side: `EDP_PANEL` of the runtime."""
+"""Number of rows that a matrix product computes in parallel: `EDP_PANEL` of the runtime."""
 
 
 def laid(layer: Layer, name: str, values: NDArray[Any]) -> NDArray[Any]:

@@ -28,7 +28,7 @@ RUNTIME = ("edp_runtime.h", "edp_runtime.c", "edp_memory.c")
 HYDRAULICS = ("edp_hydraulics.h", "edp_linkage.h", "edp_hydraulics.c", "edp_linkage.c")
 DOUBLE_BYTES = 8
 MAX_STACK = 2**18
-"""Bytes: a quarter of the smallest stack that threads of desktop systems have (1 MiB, Windows)."""
+"""Maximum stack size in bytes: a quarter of the smallest default thread stack of desktop systems (1 MiB, Windows)."""
 CLIPPED = Code("    uint32_t clipped;  /* numbers beyond the range of their format, chosen on training data */\n")
 PLANT = (
     " *",
@@ -37,7 +37,7 @@ PLANT = (
     " * a value that nobody reads must be finite, such as 0. Start with {ticks} measured ticks, which form its memory;",
     " * without any it rests at the means of its training data. The state has no pointers: its copy is a saved state.",
 )
-"""Lines of the header of a plant model."""
+"""Header lines of a plant model."""
 COST = """\
  * COST PER TICK. {macs} multiply-accumulates; the number of operations is the same at every tick, up to {hold}
  * times that in {name}_missed. Constants {flash} bytes on a 32-bit
@@ -47,7 +47,7 @@ EQUATIONS_COST = """\
  * an iteration of all stages has {macs} multiply-accumulates for linear equations alone, and a stage may need
  * EDP_MOST_ITERATIONS of them; up to {hold} times that in {name}_missed. Constants {flash} bytes on a
  * 32-bit controller, state {ram} bytes, and {stack} bytes of stack in which a tick works."""
-"""Lines of the header on what a tick costs, of networks and of grey boxes."""
+"""Header lines on the computing time per sample, for networks with equations and for grey boxes."""
 STATES = {Number.FLOAT: "float", Number.INT16: "int16_t", Number.INT32: "int32_t"}
 FILLS = {Number.FLOAT: "edp_fill(0.0f, ", Number.INT16: "edp_q_zero16(", Number.INT32: "edp_q_fill32(0, "}
 COPIES = {Number.FLOAT: "edp_copy", Number.INT16: "edp_q_copy16", Number.INT32: "edp_q_copy32"}

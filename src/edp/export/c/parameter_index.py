@@ -12,7 +12,7 @@ from edp.networks.twin.grey import parameter_index
 HEADER = "edp_parameter_index.h"
 TIED = "\N{NO-BREAK SPACE}"
 PYTHON_ONLY = re.compile(r"BY_\w+|OWN|NONE")
-"""Names of derivatives, which C does not compute."""
+"""Pattern for the names of derivatives that only Python computes."""
 
 
 def index_header() -> str:

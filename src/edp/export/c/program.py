@@ -16,14 +16,14 @@ from importlib import resources
 FIXED = ("edp_valid", "edp_all_finite", "edp_copy", "edp_fill", "edp_crc")
 """Functions that every model calls."""
 IN_REGISTERS = 4
-"""Arguments of a call that are handed over in registers; those behind them go over the stack."""
+"""Number of arguments of a call that are passed in registers. The remaining arguments are passed on the stack."""
 CALL = re.compile(r"\b(edp_\w+)\(([^()]*)\)")
 FLOAT = re.compile(r"-?[0-9.][0-9.e+-]*f")
 # A linear fit; docs/journal has its error, 1.3 % at most over 187 networks.
 OWN, EACH_CALL, ON_STACK, WIDE = 593.0, 14.6, 5.4, 9.7
-"""Bytes of Thumb-2 code (GCC 12, -O2): of every model, a call, an argument on the stack, a number above 255."""
+"""Bytes of Thumb-2 code (GCC 12, -O2): constant part, per call, per stack argument, per number above 255."""
 MAX_COPIED = 64
-"""Bytes of a struct that the compiler copies itself; larger ones are copied by ``memcpy``."""
+"""Maximum size in bytes of a struct that the compiler copies inline. Larger structs are copied by ``memcpy``."""
 
 
 def features(statements: Iterable[str]) -> tuple[int, int, int]:

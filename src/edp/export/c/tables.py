@@ -15,7 +15,7 @@ from edp.export.escape import Code
 from edp.export.hashes import little_endian
 
 MAX_PLACES = 2**16 - 1
-"""Tables of places are 16 bits wide."""
+"""Maximum index in a table of indices, whose entries have 16 bits."""
 DOUBLE_TABLE = "typedef struct {\n    const double *values;\n    uint32_t count;\n} double_table;"
 
 

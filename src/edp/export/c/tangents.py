@@ -14,7 +14,7 @@ from edp.ir.base import INPUT
 from edp.ir.layers import BinaryOperation
 
 FILES = ("edp_tangent.h", "edp_tangent.c", "edp_tangent_memory.c")
-"""Of the runtime."""
+"""Runtime files for derivatives."""
 
 
 class Tangents:
@@ -294,7 +294,7 @@ TANGENTS: dict[type[Layer], Write] = {
     memory.Feed: _feed,
     memory.PrefixCorrection: _prefix,
 }
-"""By kind of layer."""
+"""Writer functions of the derivatives by layer class."""
 
 
 def differentiable(graph: Graph) -> bool:

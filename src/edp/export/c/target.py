@@ -25,7 +25,9 @@ mex matrix tmwtypes simstruc cg_sfun rtwtypes windows
 _OWN = "in out s work work16 work32 main host_test fuzz example_task fmu_model simulink stub_run stub_main driver"
 _CMAKE = "all clean depend edit_cache help install package package_source preinstall rebuild_cache test"
 RESERVED = C_WORDS | MATLAB_WORDS | frozenset(re.findall(r"\w+", f"{_HEADERS} {_OWN} {_CMAKE}"))
-"""Names that a model cannot have: keywords, headers that ``NAME.h`` would hide, words of its files, CMake's targets."""
+"""Names that a model must not have: language keywords, headers that ``NAME.h`` would hide, identifiers of the files,
+CMake targets.
+"""
 
 
 @TARGETS.register("c")

@@ -20,7 +20,7 @@ STAGE_RATIO = (1.0 - GAMMA) / GAMMA
 EXTRAPOLATION = 1.0
 """Maximum extrapolation of a joint angle, in widths of the last knot interval."""
 NEWTON = {"abstolStep": 1e-9, "max_iter": 60, "error_on_fail": False}
-"""Settings of Newton's method; the tolerance (MPa, m/s) is far below the rounding of single precision."""
+"""Settings of Newton's method. The tolerance (MPa, m/s) is far below the rounding errors of single precision."""
 MAX_RESIDUAL = 1e-6
 """Maximum residual of a solution, MPa and Gg m/s."""
 DAMPED_STEPS, MIN_DAMPING = 40, 0.125

@@ -21,11 +21,11 @@ import casadi as ca
 import numpy as np
 
 LARGEST = 3e38
-"""Inputs beyond, or NaN, make the results NaN."""
+"""Largest valid input. If an input is larger or NaN, all results are NaN."""
 EXTERNAL = "_external"
 
 Held = dict[str, Any]
-"""What a layer remembers, by slot: columns, and rings with a column for each tick, the oldest first."""
+"""State of a layer by slot: columns, or ring buffers with one column per sample, the oldest first."""
 
 
 class Network:
@@ -34,7 +34,7 @@ class Network:
     Attributes:
         about: content of ``NAME.json``.
         inputs, targets: names, in the order of ``u`` and of the predictions.
-        rate_hz: ticks a second.
+        rate_hz: sampling rate in Hz.
         start: the state after a reset, ``(state,)``.
         step: ``(x, u) -> (x_next, prediction[, lower, upper])``, columns; of a prediction horizons are slowest.
 
@@ -399,4 +399,4 @@ LAYERS: dict[str, Callable[..., Any]] = {
     "PrefixCorrection": _prefix,
     "HydraulicTick": lambda p, *x: import_module("edp_hydraulics").write_tick(p, *x),
 }
-"""By kind of layer."""
+"""Functions of the layers by class name."""

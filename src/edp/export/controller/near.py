@@ -19,7 +19,7 @@ from edp.networks.twin.greybox import GreyTwin
 
 RUNTIME = ("edp_near.h", "edp_near.c")
 WITHIN = "edp_hydraulics.c"
-"""A file that `edp_near.c` includes, so that no program compiles it by itself."""
+"""File that includes `edp_near.c`, so that the build does not compile `edp_near.c` separately."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class NearModel:
 
     Attributes:
         name: C prefix.
-        model: its layers, for their constants.
+        model: layer graph of the model, for its constants.
         plant: the twin.
         twin: the grey box.
         machine: its layer.

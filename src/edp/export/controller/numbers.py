@@ -13,7 +13,7 @@ from edp.export.controller.parts import AXES, ControllerParts, PlanParts, Side
 
 SIDES = ("out", "back")
 ROUNDED = 2.0**-23
-"""Last place of a lever in single precision."""
+"""Unit in the last place of a lever command in single precision."""
 
 
 def constants_of_controller(parts: ControllerParts, near: bool = False) -> ConstantTables:

@@ -39,7 +39,7 @@ class PlanParts:
 
     Attributes:
         plant: the twin as a bundle.
-        blocks: ticks of each block of the horizon.
+        blocks: length of each block of the horizon in samples.
         pilots: the twin's commands, in its order.
         lever_shape: full pressure (Pa), dead zone of levers, demand at which conflux begins.
         ports: answer of the twin that each measured value is.
@@ -130,7 +130,7 @@ class ControllerParts:
         limits_low: lower limits of valid inputs, shape (input,). Values outside the limits count as missing.
         limits_high: upper limits of valid inputs, shape (input,).
         stroke_inputs: inputs that are the strokes.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         angles: joint angles (rad) at evenly spaced strokes, shape (nodes, 3).
         full_m: full strokes, shape (3,).
         lengths_m: lengths of the links, m, shape (3,).
@@ -139,7 +139,7 @@ class ControllerParts:
         slew: most that a lever moves in a tick, shape (3,).
         sides: speeds (m/s) and levers of the valve map, by axis, extending and retracting.
         gains: gains of the PI loop: proportional, integral, rest (m/s), maximum sum (m/s).
-        lead: ticks by which the PI loop reads the reference's speed ahead.
+        lead: number of samples by which the PI loop reads the reference's speed in advance.
         plan: plan of a predictive controller; None for a PI loop alone.
         golden: data of a self-test; None without one.
     """

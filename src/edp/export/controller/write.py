@@ -30,9 +30,11 @@ TEMPLATES = "controller/templates"
 OWN = ("edp_control.h", "edp_control.c")
 PROGRAM = ("edp_qp.h", "edp_qp.c")
 LONGEST_NAME = 20
-"""Of a controller: names of its model and functions are made from it."""
+"""Maximum number of characters of a controller's name. Names of its model and functions are derived from it."""
 TOLERANCE = 2e-3
-"""Of a lever of the self-test, a share of full: single precision against double at a tick from the same memory."""
+"""Tolerance of a lever command in the self-test, as a fraction of full travel: single compared with double precision
+for one sample from equal memory.
+"""
 PlanModel = LaneModel | NearModel
 INCLUDES = ("edp_control.h", "edp_runtime.h")
 

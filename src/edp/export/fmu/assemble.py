@@ -19,12 +19,12 @@ OWN: Mapping[int, tuple[str, ...]] = {
     2: ("edp_fmi2.h", "edp_fmi2.c"),
     3: ("edp_fmi3.h", "edp_fmi3.c", "edp_fmi3_absent.c"),
 }
-"""Files of the plumbing by version of FMI."""
+"""Source files of the FMI interface by FMI version."""
 VERSIONS = {"2": (2,), "3": (3,), "both": (2, 3)}
 BINARIES = {"both": tuple(PLATFORMS), **{name: (name,) for name in PLATFORMS}, "none": ()}
 # The earliest date that a ZIP file can hold.
 DATE = (1980, 1, 1, 0, 0, 0)
-"""Of every file in an FMU, so that the same network gives the same bytes."""
+"""Date of every file in an FMU. A fixed date gives identical bytes for identical networks."""
 
 
 def check_choice(version: str, binaries: str) -> None:

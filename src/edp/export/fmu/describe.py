@@ -12,7 +12,7 @@ from edp.export.fmu.units import BASES, shown, units_of
 
 # 500 ticks are 5 s at 100 Hz: several windows, and done at once.
 EXPERIMENT_TICKS = 500
-"""Length of the simulation that is proposed to an importer."""
+"""Number of samples of the default experiment."""
 CATEGORIES = {
     "logStatusWarning": "bad or missing inputs, ticks left out",
     "logStatusError": "calls that are refused, with the reason",
@@ -31,7 +31,7 @@ class About:
         name: name of the model and its binaries.
         token: content address of sources and interface, in the form of a GUID.
         title: the network in a line.
-        rate_hz: ticks a second.
+        rate_hz: sampling rate in Hz.
         listed: variables in the order of their value references.
         derivatives: whether directional derivatives are provided.
         facts: further properties by name.

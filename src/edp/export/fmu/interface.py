@@ -48,7 +48,7 @@ OWN = (
     Variable("held", "local", "ticks fed with the last accepted inputs since the reset", "whole"),
     Variable("restarts", "local", "times the memory was cleared since the reset", "whole"),
 )
-"""Behind inputs and predictions, in the order of ``edp_fmu.h``."""
+"""Additional outputs after the inputs and predictions, in the order of ``edp_fmu.h``."""
 
 
 def variables(model: Model) -> list[Variable]:

@@ -23,7 +23,7 @@ BASES: Mapping[str, Mapping[str, int]] = {
     "A": {"A": 1},
     "s": {"s": 1},
 }
-"""Exponents by unit: of every kind of channel, and of time."""
+"""SI base-unit exponents of each unit, for all kinds of channels and for time."""
 
 
 @dataclass(frozen=True)

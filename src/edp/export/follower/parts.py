@@ -13,9 +13,11 @@ from edp.networks.twin.greybox import GreyTwin
 
 Array = NDArray[np.float32]
 GOLDEN_TICKS = 160
-"""Of the self-test: the observer settles, and a few segments teach."""
+"""Number of samples of the self-test: the observer settles, and a few segments adapt the model."""
 WORN = 0.2
-"""Logarithm by which the groups of the self-test's machine differ from those of the grey box, up and down by turns."""
+"""Log factor, with alternating sign, by which the self-test's machine differs from the grey box in each parameter
+group.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +46,7 @@ class FollowerParts:
         twin: the grey box of the machine as it was.
         spec: settings of the parameter adaptation.
         targets: names of the predicted channels, velocities of the twin.
-        horizons: ticks ahead.
+        horizons: prediction horizons in samples.
         limit: largest correction ``(horizon, target)``, SI units.
     """
 

@@ -40,12 +40,13 @@ from edp.training.bundle import Bundle
 
 OWN = ("edp_follow.h", "edp_follow.c")
 LONGEST_NAME = 20
-"""Of a follower: names of its functions are made from it."""
+"""Maximum number of characters of a follower's name. Names of its functions are derived from it."""
 UNKNOWN_C = 1e6
-"""Stands for a temperature that is not known: no thermometer is within reach of it."""
+"""Value of an unknown temperature, far outside the range of thermometers."""
 FORECAST, FACTOR = 5e-3, 2e-2
-"""By which the self-test lets forecasts, as a share of the velocities' spread, and factors differ from Python's: states
-are kept in single precision, and Newton's method ends where its last change is small."""
+"""Tolerances of the self-test relative to Python: forecasts as a fraction of the velocities' standard deviation, and
+factors. States are in single precision, and Newton's method stops at a small step.
+"""
 
 
 @dataclass(frozen=True, eq=False)

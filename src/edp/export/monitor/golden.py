@@ -11,13 +11,13 @@ from edp.export.monitor.parts import MonitorParts
 from edp.monitor.chain import MonitorChain
 
 JUDGED_BLOCKS = 80
-"""Blocks of the self-test behind those that are not evaluated; in the second half residuals are shifted."""
+"""Number of evaluated blocks of the self-test, after the settling blocks. In the second half residuals are shifted."""
 MOST_TICKS = 200_000
-"""Of the self-test; longer blocks are fewer."""
+"""Maximum number of samples of the self-test. With longer blocks it has fewer blocks."""
 SHIFT = 2.0
-"""Scales by which they are shifted."""
+"""Shift of the residuals in the self-test, in units of their scale."""
 MISSING = 32
-"""One number in so many is missing, at a quarter of the ticks."""
+"""Inverse fraction of missing values in the self-test, in a quarter of the samples."""
 SEED = 1
 Rows = NDArray[np.float32]
 

@@ -63,7 +63,7 @@ class TwinPart:
         middle: substitute for each input that was never received, shape (reads,).
         groups: answers that are evaluated together, by their place.
         prefix: ticks at which all is measured.
-        period: ticks from one measured tick of a group to the next.
+        period: number of samples between two measured samples of a group.
     """
 
     bundle: Bundle
@@ -81,9 +81,9 @@ DETECTORS = {
     "glr": "EDP_GLR",
     "separate_cusums": "EDP_SEPARATE_CUSUMS",
 }
-"""Detectors in C, by their names."""
+"""C names of the detectors."""
 PIECE, ROW = 8, 32
-"""Directions of a detector, and summaries, that one part of the work on a block takes; in C `EDP_PIECE`, `EDP_ROW`."""
+"""Number of detector directions, and of summaries, per computing step of a block; in C `EDP_PIECE` and `EDP_ROW`."""
 
 
 def pieces(count: int, size: int) -> list[int]:
@@ -189,7 +189,7 @@ class MonitorParts:
         digest: content address.
         promise: a sentence on false alarms.
         inputs: measured channels, in the order in which they are given.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         residuals: names.
         reads: inputs that each residual depends on.
         columns: place of each input among `inputs`, by its name in the monitor.

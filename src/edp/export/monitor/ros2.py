@@ -23,7 +23,7 @@ MODULES = {
     "watch.py": "watch.py",
     "watch_node.py": "node.py",
 }
-"""Modules of the package, by their names here."""
+"""Modules of the ROS 2 package and their source files."""
 
 
 def write_monitor_ros2(parts: MonitorParts, name: str, folder: Path) -> list[Path]:

@@ -19,9 +19,9 @@ from edp.monitor.residuals.flow_curves import BACK, CAVITY, EMPTY, KNOTS, RELIEF
 from edp.training.bundle import Bundle
 
 NO_PLACE = 0xFFFF
-"""A command that is not there."""
+"""Index of a missing command."""
 DOUBTFUL = 1
-"""Place of the relief, among `RELIEFS`, beyond which a balance of flow is uncertain."""
+"""Index in `RELIEFS` of the pressure above which a flow balance is uncertain."""
 
 
 class SourceCode(ABC):
@@ -35,9 +35,9 @@ class SourceCode(ABC):
     """
 
     model: Model | None = None
-    """Its network; None without one."""
+    """Network of the source; None without a network."""
     template: str
-    """Name of the template of its function."""
+    """Name of the template of the source's function."""
 
     def __init__(self, own: str, reads: Sequence[int], middle: NDArray[np.float32], residuals: int) -> None:
         self.own, self.reads, self.middle, self.residuals = own, tuple(reads), middle, residuals

@@ -37,9 +37,9 @@ from edp.networks.input_range import HOLD_TICKS
 
 OWN = ("edp_chain.h", "edp_chain.c")
 LONGEST_NAME = 20
-"""Of a monitor: names of its networks and functions are made from it."""
+"""Maximum number of characters of a monitor's name. Names of its networks and functions are derived from it."""
 NO_INPUT = 0xFFFF
-"""Stands for a driver without a second input: `EDP_NO_INPUT`."""
+"""Index of the second input of a driver without one: `EDP_NO_INPUT`."""
 MAX_MEMORY = 2**31 - 1
 
 

@@ -17,9 +17,9 @@ from edp.ir import Layer, Slot, memory
 from edp.ir.memory import UNSEEN
 
 Held = Mapping[str, str]
-"""Values of a layer's slots."""
+"""Names of the state values of a layer, by slot."""
 Step = Callable[..., tuple[str, dict[str, str]]]
-"""(nodes, layer, held, inputs ...) to the layer's value and its next states."""
+"""Function (nodes, layer, state, inputs ...) that returns the layer's value and its next state."""
 
 
 def shape_of(slot: Slot) -> tuple[int, ...]:
@@ -219,4 +219,4 @@ STEPS: dict[type[Layer], Step] = {
     memory.WindowAttention: _window_attention,
     memory.Feedback: _feedback,
 }
-"""By kind of layer; the correction of a prefix and the feedback edge reach into other layers and are apart."""
+"""Step functions by layer class. Prefix correction and feedback depend on other layers and are handled separately."""

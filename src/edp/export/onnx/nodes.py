@@ -14,16 +14,16 @@ from edp import __version__
 from edp.errors import ExportError
 
 OPSETS = {9: 4, 11: 6, 13: 7, 17: 8, 21: 10}
-"""IR version by opset: the one that was current when the opset came out, so that readers of that time take the file."""
+"""IR version by opset: the version at the release of the opset, so that contemporary readers accept the file."""
 DEFAULT_OPSET = 13
 _NAMES = """
 Add Clip Concat Conv Cos Div Erf Exp GRU Gather Gemm Identity LSTM Log Max Min Mul ReduceMean Relu Reshape Sigmoid Sign
 Sin Softmax Softplus Split Sqrt Sub Tanh Transpose
 """
 OPTIONAL = ("LSTM", "GRU")
-"""Operators whose outputs may be left out."""
+"""Operators with optional outputs."""
 ALLOWED = frozenset(_NAMES.split())
-"""Operators that are written: long-lived ones with a plain meaning, whose indices and shapes are constants."""
+"""Operators used in exports: stable operators with constant indices and shapes."""
 
 
 def library() -> ModuleType:

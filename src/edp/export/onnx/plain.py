@@ -14,10 +14,12 @@ from edp.ir import Layer, layers
 from edp.ir.layers import BinaryOperation, Function, runs
 
 MAX_PIECES = 12
-"""Runs of neighbouring columns up to which numbers are moved by splitting and joining; beyond, by a 0/1 matrix."""
+"""Maximum number of contiguous column ranges that are selected by Split and Concat. For more ranges a 0/1 matrix is
+used.
+"""
 
 Plain = Callable[[Nodes, Any, int, Sequence[str], Sequence[int]], str]
-"""(nodes, layer, ticks, values, their widths) to the layer's value."""
+"""Function (nodes, layer, ticks, values, widths of the values) that returns the layer's value."""
 
 
 def activate(nodes: Nodes, function: Function, x: str) -> str:
@@ -62,7 +64,7 @@ BINARY_OPERATORS = {
     BinaryOperation.MINIMUM: "Min",
     BinaryOperation.MAXIMUM: "Max",
 }
-"""ONNX's; `Nodes.less` writes a difference."""
+"""ONNX operators of binary operations. `Nodes.less` writes a difference."""
 
 
 def combine(nodes: Nodes, operation: BinaryOperation, a: str, b: str) -> str:
@@ -203,4 +205,4 @@ PLAIN: dict[type[Layer], Plain] = {
     layers.LayerNorm: _norm,
     layers.RowAttention: _row_attention,
 }
-"""By kind of layer."""
+"""Writer functions by layer class, for layers without memory."""

@@ -16,13 +16,13 @@ from edp.ir import Array, Graph, Layer, memory
 from edp.ir.base import INPUT
 
 INPUTS = "inputs"
-"""The graph's input of raw numbers, SI units."""
+"""Name of the graph's input with raw values in SI units."""
 SPOILT = "spoilt"
-"""The state that is 0 until an input was not finite, and NaN from then on."""
+"""Name of the state that is 0 until an input is not finite, and NaN afterwards."""
 LAST = "_next"
-"""What the name of a state ends with where it comes out."""
+"""Suffix of a state's output name."""
 KINDS: frozenset[type[Layer]] = frozenset({*PLAIN, *STEPS, memory.Feed, memory.PrefixCorrection})
-"""Kinds of layers with a form in ONNX; the last two reach into other layers."""
+"""Layer classes that ONNX export supports. The last two depend on other layers."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from edp.ir.memory import UNSEEN
 
 TRAILING = (memory.TrailingMean, memory.AttentionPool, memory.WindowAttention)
 CHANNELS_FIRST = (BinaryOperation.ADD, BinaryOperation.MULTIPLY)
-"""Operations that are written for channels first, as convolutions are, where an input is."""
+"""Operations that keep the channels-first layout of convolutions if an input has this layout."""
 
 
 def rows_before(layer: Layer, rows: int, ticks: int) -> int:
@@ -242,7 +242,7 @@ WINDOWS = {
     memory.AttentionPool: "attention_pool",
     memory.WindowAttention: "window_attention",
 }
-"""Layers with memory that are written over the whole window, by kind: methods of `Window`."""
+"""Methods of `Window` for layers with memory, by layer class."""
 
 
 def _reorder_gates(array: np.ndarray, order: Sequence[int]) -> np.ndarray:

@@ -27,7 +27,7 @@ JOINTS = {
     Kind.ANGLE: "position",
 }
 FREE = "constant:0"
-"""Source of a flag of a plant: its port reads the last answer."""
+"""Source of a plant's flag: its input port uses the last prediction."""
 PRESSURES = (Kind.PRESSURE, Kind.PILOT_PRESSURE)
 
 

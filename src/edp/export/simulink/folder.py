@@ -29,12 +29,12 @@ RULES = {
     "present_value": "inside: nothing is to be added to the results",
 }
 STATUS = ("ok", "warming", "held", "restarted", "not_reset")
-"""What a tick has done, by number."""
+"""Names of a sample's status, by number."""
 FIRST = {
     True: Code("form = 'native';"),
     False: Code("forms = {'sfun', 'octave'};\n    form = forms{1 + (exist('OCTAVE_VERSION', 'builtin') > 0)};"),
 }
-"""The form that is compared if none is asked for: with plain MATLAB code, without."""
+"""Form that is compared by default, depending on whether plain MATLAB code is available."""
 C_FILES = ("sfun.c", "call.h", "call.c")
 MATLAB_FILES = ("load", "names", "rows", "octave", "build", "bus", "simulate", "golden")
 NATIVE_FILES = ("step", "reset", "stream")
@@ -56,7 +56,7 @@ ABOUT = {
     "onnx.m": ("imports the window and predicts with it", "Deep Learning Toolbox"),
     "octave.m": ("runs the S-function in GNU Octave", "Octave, mkoctfile"),
 }
-"""Files of the table in the README: what each is, and what it needs."""
+"""Description and requirements of each file in the README table."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,9 +20,9 @@ from edp.storage.reading import Table
 
 # 47 characters, a part behind them and a number stay within MATLAB's 63.
 LONGEST_LAYER = 47
-"""Characters of a layer's part of it; names of constants and slots come behind."""
+"""Maximum number of characters of the layer's part of a name. Suffixes of constants and slots follow."""
 MAX_PIECES = 8
-"""Runs of neighbouring columns up to which they are written as ranges; beyond, as a constant."""
+"""Maximum number of contiguous column ranges that are written as ranges. For more ranges a constant is used."""
 FUNCTIONS = {
     Function.RELU: "max({x}, 0)",
     Function.SIGMOID: "sigmoid({x})",
@@ -36,7 +36,7 @@ FUNCTIONS = {
     Function.LOG: "log(max({x}, realmin('single')))",
     Function.POSITIVE: "positive({x})",
 }
-"""Element-wise functions by name."""
+"""MATLAB expressions of the element-wise functions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,4 +289,4 @@ WRITERS: dict[type[Layer], Write] = {
     memory.Feed: _feed,
     memory.PrefixCorrection: _prefix,
 }
-"""By kind of layer."""
+"""Writer functions by layer class."""

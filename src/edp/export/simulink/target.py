@@ -19,7 +19,7 @@ from edp.export.simulink.folder import Folder
 from edp.training.bundle import Bundle
 
 LONGEST_NAME = 20
-"""MATLAB's names have 63 characters; those of files here are longer than the network's."""
+"""Maximum number of characters of a network's name. MATLAB allows 63, and file names have suffixes."""
 STUBS = ("simstruc.h", "cg_sfun.h", "simulink.c", "stub_run.h", "stub_main.c")
 
 

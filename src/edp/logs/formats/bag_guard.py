@@ -24,11 +24,11 @@ from edp.storage.reading import Table
 from edp.storage.unpacking import open_zstd, unpack_to
 
 _LONGEST_METADATA = 4 << 20
-"""Bytes of a bag's metadata.yaml; a topic takes some 500."""
+"""Maximum size of a bag's metadata.yaml in bytes. A topic takes about 500."""
 _LONGEST_DEFINITION = 1 << 20
-"""Characters of a message definition, with those of all types in it."""
+"""Maximum number of characters of a message definition, including the definitions of all its types."""
 _PLAIN_TABLES = ("messages", "topics", "schema", "message_definitions", "metadata")
-"""Tables of a bag, whose columns are looked at."""
+"""Tables of a bag whose columns are checked."""
 
 
 @dataclass

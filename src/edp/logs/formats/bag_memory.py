@@ -10,9 +10,9 @@ from edp.errors import DataError
 from edp.storage.memory import check_memory
 
 _COPIES = 3
-"""A growing buffer is copied into one twice as large."""
+"""Memory factor of a growing buffer, which is copied into a buffer twice as large."""
 _STEP = 1 << 24
-"""Bytes between two checks of the memory that is left."""
+"""Number of bytes between two checks of the remaining memory."""
 
 
 class Size(NamedTuple):

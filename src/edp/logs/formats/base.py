@@ -18,7 +18,7 @@ from edp.signals import TABLE_A1, TIME_UNITS, VOCABULARY, Kind, SignalMap
 Column = NDArray[np.float64]
 
 PIECE_ROWS = 1 << 16
-"""Rows that a table reads at a time: what bounds the memory that a log of any length takes."""
+"""Number of rows that a table reads at a time, which bounds the memory for a log of any length."""
 
 
 class ColumnTable(Protocol):
@@ -42,13 +42,13 @@ def load_column(table: ColumnTable, name: str, samples: int) -> Column:
 
 
 TORN_LINE = "torn_line"
-"""Fact of a text file: the number of its last line, which was never finished and is left out."""
+"""Metadata key of a text file: number of its incomplete last line, which is omitted."""
 EXPERIMENTS = "experiments"
-"""Fact of a MAT file that was read whole: the names of experiments that stand beside each other in one variable."""
+"""Metadata key of a MAT file that was read completely: names of parallel experiments in one variable."""
 NAMES_AGAIN = "names_again_line"
-"""Fact of a text file: the first line within its table that repeats the names above it; all such are left out."""
+"""Metadata key of a text file: number of the first line that repeats the column names. All such lines are omitted."""
 BEHIND_TABLE = "behind_table_line"
-"""Fact of a text file: the first of the lines behind its table, which are left out."""
+"""Metadata key of a text file: number of the first line after the table. The lines from there on are omitted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,9 +148,9 @@ class RawLog:
 
 
 LONGEST_NAME = 256
-"""Characters of a column's name; a full path of a Simulink signal has some hundred."""
+"""Maximum number of characters of a column name. A full path of a Simulink signal has some hundred."""
 MAX_COLUMNS = 65_536
-"""Columns of a log; a large Simulink model logs some thousand."""
+"""Maximum number of columns of a log. A large Simulink model logs some thousand."""
 
 
 def check_names(path: Path, names: Iterable[str]) -> None:
@@ -175,7 +175,7 @@ def check_names(path: Path, names: Iterable[str]) -> None:
 
 TRUTH_PLACES = ("with", "apart", "without")
 TRUTH = "truth"
-"""Variable of a MAT file, and middle part of a file's name, that hold the truth."""
+"""Variable name in a MAT file, and middle part of a file name, for noise-free values."""
 
 
 @dataclass(frozen=True)

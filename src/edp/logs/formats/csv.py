@@ -41,18 +41,18 @@ from edp.signals import TIME_UNITS, UNITS, SignalMap
 _HEAD_BYTES = (1 << 18, 1 << 22, 1 << 26)
 """Sizes of the examined head of a file. Longer comments or headers need the larger ones."""
 _MAX_CELLS_LOOKED = 200_000
-"""Cells in which the layout is looked for; wide tables need fewer rows."""
+"""Maximum number of cells examined to detect the layout. Wide tables need fewer rows."""
 _DELIMITERS = (",", ";", "\t", "|")
-"""Delimiters in the order in which a tie is decided."""
+"""Supported delimiters. If several fit equally well, the first one is used."""
 _BLANKS = " "
-"""Delimiter of columns that any number of blanks parts; only where no other one makes columns."""
+"""Delimiter of columns separated by any number of blanks, used if no other delimiter gives columns."""
 _NAME_UNIT = re.compile(r"^(?P<name>.*?)\s*(?:\[(?P<square>[^\]]*)\]|\((?P<round>[^)]*)\))$")
 _BRACKETS = re.compile(r"[\[(]([^\])]{1,12})[\])]")
 NAME_BY_PLACE = re.compile(r"column_\d+")
-"""Name of a column of a file that names none."""
+"""Pattern of the generated column names for a file without names."""
 _STATED = re.compile(r'sep=([^\w\s"]|\t)', re.IGNORECASE)
 _ROWS_LOOKED = 200
-"""Rows in which the layout is looked for."""
+"""Number of rows examined to detect the layout."""
 _BLOCK_ROWS = 65536
 """Rows written at a time, so that no second copy of the recording is made."""
 

@@ -26,11 +26,11 @@ from edp.logs.units import normalise_unit
 _NAMES, _UNITS, _PATHS, _VALUES = "trace_names", "trace_units", "path", "trace_values"
 _MAX_HEAD_ROWS = 200
 _LONGEST_HEAD = 1 << 26
-"""Characters of the rows above the numbers at most."""
+"""Maximum number of characters above the numeric rows."""
 _SAMPLE_ROWS = 20
-"""Rows of numbers by which the decimal sign is found."""
+"""Number of numeric rows examined to detect the decimal sign."""
 _PORT = re.compile(r"(In|Out|Value)\d*")
-"""Names of ports, which say nothing of the signal."""
+"""Pattern of port names, which do not describe the signal."""
 
 
 @dataclass(frozen=True)

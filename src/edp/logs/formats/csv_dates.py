@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 _GERMAN = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(?:[ T]+(\d.*))?")
-"""``31.12.2025 13:00:00``; a date with slashes and without AM or PM may mean day or month first and is not read."""
+"""``31.12.2025 13:00:00``. Dates with slashes and without AM or PM are rejected because day and month are ambiguous."""
 _CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d{1,9})\d*)?)?")
 _AMERICAN = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})[ T]+(\d.*\d) ?([AP])M", re.IGNORECASE)
-"""``06/29/2022 04:05:36.674 PM``: who writes AM and PM writes the month first."""
+"""``06/29/2022 04:05:36.674 PM``. With AM or PM, the month comes first."""
 _YEAR_FIRST = re.compile(r"(\d{4})[/.-](\d{1,2})[/.-](\d{1,2})(?:[ T]+(\d.*))?")
-"""``2025/1/31 13:00:00.5``: who writes the year first writes the day last."""
+"""``2025/1/31 13:00:00.5``. If the year comes first, the day comes last."""
 _MIDNIGHT = "1970-01-01"
-"""Date for times of day without a date, of which only differences count."""
+"""Date assigned to times of day without a date. Only time differences are used."""
 
 
 def dates_of(cells: Sequence[str | None]) -> NDArray[np.datetime64]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 _LACKING = frozenset(b"\x81\x8d\x8f\x90\x9d")
-"""Bytes without a letter in cp1252."""
+"""Byte values that cp1252 does not define."""
 
 
 def encoding_of(head: bytes) -> str:

@@ -11,15 +11,17 @@ from typing import IO, Any
 _PIECE_BYTES = 1 << 20
 """Size of the text examined or passed on at a time."""
 _TAIL_BYTES = 1 << 16
-"""End of a file in which its last lines are looked for."""
+"""Number of bytes at the end of a file in which its last lines are searched."""
 MAX_LAST_LINES = 10
-"""Lines that may stand behind the table."""
+"""Maximum number of lines after the table."""
 _MIN_ROWS = 2
-"""Rows that a table has at least where lines stand behind it."""
+"""Minimum number of table rows in a file with lines after the table."""
 _ONE_BYTE_LINE_ENDS = ("utf-8", "utf-8-sig", "latin-1", "cp1252", "ascii")
-"""Encodings in which a line ends with the byte that ends it in ASCII."""
+"""Encodings in which a line ends with the ASCII byte for a line end."""
 MARK = "\x1c"
-"""Begins the line, of a cell too many, that stands for one passed over: the parser counts no empty lines."""
+"""First character of a substitute for a skipped line. The substitute has an extra cell, because the parser does not
+count empty lines.
+"""
 _NUMBER = re.compile(rb"\s*[-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?\s*")
 _CONTROL = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 

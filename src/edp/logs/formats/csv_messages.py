@@ -15,7 +15,7 @@ from edp.logs.formats.base import Column, RawSignal, load_column
 from edp.logs.formats.csv_table import CsvTable
 
 _SPARSE, _SPARSE_ROWS = 0.5, 1000
-"""Largest share of rows that a column of messages fills, and rows after which a table is known to hold none."""
+"""Maximum fraction of rows filled by a sparse column, and number of rows after which sparse columns are ruled out."""
 
 
 def message_columns(table: CsvTable) -> set[int]:

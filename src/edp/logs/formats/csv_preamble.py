@@ -12,13 +12,13 @@ _SAME_WIDTH = 0.8
 _NUMBERS = 0.8
 """Minimum fraction of numbers among the filled cells of a numeric column."""
 _MAX_HEADER_ROWS = 4
-"""Names, units and descriptions: what stands between the names and the numbers at most."""
+"""Maximum number of header rows from the names to the numbers: names, units and descriptions."""
 _MAX_REMARKS = 2
-"""Columns of remarks that are named behind those of numbers."""
+"""Maximum number of named remark columns after the numeric columns."""
 _WORDS = 3
-"""Words of a cell from which a row describes channels instead of naming them."""
+"""Minimum number of words in a cell of a row with descriptions instead of names."""
 _NAME = re.compile(r"[^\s]{1,48}(?: [^\s]+)?")
-"""A cell that may be a name: one word, or two as in ``speed [mm/s]``."""
+"""Pattern of a possible name: one word, or two as in ``speed [mm/s]``."""
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ _NAME_KEY, _UNIT_KEY = "Name", "Unit"
 _MAX_HEAD_LINES = 60
 _END = "EOF"
 _WIDEST = 6
-"""Bytes of memory a byte of text: numbers of eight bytes, and those of the parser beside them."""
+"""Memory in bytes per byte of text: eight-byte numbers and the parser's own copies."""
 _SHARE = 0.5
 """Maximum fraction of free memory for a file."""
 

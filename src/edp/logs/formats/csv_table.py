@@ -21,19 +21,21 @@ from edp.logs.formats.csv_leftovers import MARK, Leftovers, PassedText, TableTex
 from edp.storage.memory import free_bytes
 
 WHOLE_BYTES = 1 << 30
-"""Files up to this size are parsed once and kept; longer ones are parsed once to check them, then once a reading."""
+"""Maximum size of a file that is parsed once and stored. Longer files are parsed once for checking and once per
+reading.
+"""
 _WHOLE_SHARE = 0.25
 """Maximum fraction of free memory for a file in memory."""
 _WIDEST = 4
-"""Bytes of memory a byte of text: a digit and a delimiter become a number of eight."""
+"""Memory in bytes per byte of text: a digit and a delimiter become an eight-byte number."""
 _TRIES = 8
-"""Parses that end at text in a column of numbers; after the second, the columns are looked at all at once."""
+"""Maximum number of parses stopped by text in a numeric column. After the second, all columns are examined at once."""
 NULLS = ["", "NaN", "nan", "NAN", "NA", "N/A", "#N/A", "null", "NULL", "-nan", "-nan(ind)", "1.#QNAN"]
 """Spellings of a missing value, those of Excel, pandas, MATLAB and C runtimes among them."""
 _SQUEEZED_BYTES = 1 << 20
 """Size of the text in which runs of blanks are reduced at a time."""
 _LONGEST_LINE = 1 << 26
-"""Characters of a line before the table at most."""
+"""Maximum number of characters of a line before the table."""
 _BLOCK_BYTES = 1 << 24
 """Size of the text parsed at a time."""
 
@@ -64,7 +66,7 @@ def is_number(cell: str, decimal: str = ".") -> bool:
 
 
 _ON, _OFF = ("true", "on", "yes", "ein", "wahr"), ("false", "off", "no", "aus", "falsch")
-"""Words for the states of a switch, in small letters."""
+"""Lower-case words for the states of a switch."""
 _PREFIXES = {"": 1.0, "p": 1e-12, "n": 1e-9, "u": 1e-6, "µ": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6, "G": 1e9}
 _WITH_PREFIX = r"^(?P<number>[-+]?[0-9]+(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?)(?P<prefix>[pnuµmkMG]?)$"
 _REMARKS, _FEW_REMARKS = 0.001, 10

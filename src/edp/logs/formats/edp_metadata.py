@@ -39,11 +39,11 @@ class EdpMetadata:
 
 
 LONGEST_FACTS = 1 << 24
-"""Characters; a thousand channels take 150,000."""
+"""Maximum number of characters of the metadata. A thousand channels take 150,000."""
 LONGEST_TEXT = 4096
-"""Characters of a name, a source or a description."""
+"""Maximum number of characters of a name, a source or a description."""
 DEEPEST = 32
-"""Lists and tables within one another; EDP's own data have four."""
+"""Maximum nesting depth of lists and tables. EDP's own data have four levels."""
 KNOWN = frozenset({"name", "rate_hz", "source", "meta", "channels", "digest", "truth", "truth_digest"})
 
 

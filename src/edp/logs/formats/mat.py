@@ -33,9 +33,9 @@ from edp.recording import Recording
 from edp.signals import SignalMap
 
 _MAX_NAMED = 100
-"""Experiments of a file that are looked through for one that is named nearly so."""
+"""Maximum number of experiment names compared with a misspelt name."""
 _VERSIONS = {"v5": "v7", "v7.3": "v7.3"}
-"""Our names and the library's: its v7 is v5 with packed variables."""
+"""Name of each MAT version in the reading library. Its v7 is v5 with compressed variables."""
 
 
 class MatFormat:

@@ -16,15 +16,15 @@ from edp.storage.memory import check_memory
 _MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _CHUNK, _CHUNK_INDEX, _STATISTICS = 0x02, 0x03, 0x04, 0x06, 0x08, 0x0B
 RATIO = 1100
-"""A packed part may hold so many times its size: deflate reaches 1,032, messages of machines some 10."""
+"""Maximum ratio of unpacked to packed size. Deflate reaches 1,032; machine messages reach about 10."""
 SPARE = 1 << 20
-"""And so many bytes beyond that."""
+"""Additional unpacked size in bytes that is always allowed."""
 _LONGEST = {_SCHEMA: 1 << 20, _CHANNEL: 1 << 16}
-"""Bytes of a definition of messages, and of a topic with its settings."""
+"""Maximum size in bytes of a message definition, and of a topic with its settings."""
 _SMALLEST_MESSAGE = 31
-"""Bytes of the shortest record of a message: prefix 9, channel 2, sequence 4, both times 16."""
+"""Minimum size of a message record in bytes: prefix 9, channel 2, sequence 4, both times 16."""
 _PREFIX = 9
-"""Bytes before the content of a record."""
+"""Number of bytes before the content of a record."""
 
 
 def check_records(path: Path | MemoryFile) -> None:

@@ -31,17 +31,17 @@ from edp.storage.unpacking import unpack_to
 
 MAGIC_BYTES = 8
 ROS = ("ros1", "ros2")
-"""Profiles whose messages `rosbag` reads."""
+"""Profiles whose messages are read by `rosbag`."""
 JSON = "json"
 LONGEST_MESSAGE = 1 << 18
-"""Bytes of a message; a row of a thousand channels takes some 40,000."""
+"""Maximum size of a message in bytes. A row of a thousand channels takes about 40,000."""
 MAX_PATHS, MAX_TOPICS = 4096, 1024
-"""Numbers of a topic's messages, and topics of a file."""
+"""Maximum number of values per message of a topic, and maximum number of topics in a file."""
 LONGEST_TOPIC = 1024
 CHECKED = 1 << 24
-"""Numbers between two looks at the memory that is left."""
+"""Number of values between two checks of the remaining memory."""
 LONGEST_LIST = 256
-"""Elements of a list that become columns; a longer one is an image or a cloud of points."""
+"""Maximum length of a list that becomes columns. Longer lists are images or point clouds."""
 _HEADER, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x01, 0x04, 0x05, 0x06, 0x0F
 _PREFIX = struct.Struct("<BQ")
 _HEAD = struct.Struct("<HIQQ")

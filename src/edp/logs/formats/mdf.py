@@ -33,15 +33,15 @@ from edp.storage.unpacking import unpack_to
 _MAGIC = (b"MDF     ", b"UnFinMF ")
 _FACTS = "edp_info.json"
 _FACTS_BYTES = 1 << 24
-"""A thousand channels take 150 kB."""
+"""Maximum size of the metadata in bytes. A thousand channels take 150 kB."""
 _PIECE_BYTES = 1 << 25
 """Size of the records read at a time, so that wide groups take larger steps than `PIECE_ROWS`."""
 _NUMBERS = range(6)
-"""Data types of integers and floats; above are texts, bytes, dates and pictures."""
+"""Data types of integers and floats. Higher numbers are texts, bytes, dates and pictures."""
 _PLAIN_TYPES = (0, 2, 3, 6)
-"""Channel types: fixed length, master, virtual master, virtual."""
+"""Supported channel types: fixed length, master, virtual master, virtual."""
 _TIME = 1
-"""Kind of synchronisation of a master channel that counts seconds; others count angles, metres or records."""
+"""Synchronisation type of a master channel in seconds. Other types are angle, distance and record index."""
 
 
 class MdfFormat:

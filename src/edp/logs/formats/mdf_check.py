@@ -17,27 +17,27 @@ from edp.storage.memory import check_memory
 from edp.storage.unpacking import DEFLATE_RATIO, measure_unpacked
 
 _HEAD = 24
-"""Bytes of a block before its links: id 4, reserved 4, length 8, count of links 8."""
+"""Size of a block's header before its links, bytes: id 4, reserved 4, length 8, number of links 8."""
 _FIRST = 64
 """Position of the header block, after the identification of the file."""
 _MAX_BLOCK = 1 << 31
-"""Maximum size of an unpacked block; larger data are lists of blocks."""
+"""Maximum size of an unpacked block in bytes. Larger data are stored as lists of blocks."""
 _COPIES = 3
-"""A packed block is in memory as it was unpacked, transposed and as columns."""
+"""Number of copies of a packed block in memory: unpacked, transposed, and as columns."""
 _DEEPEST_CONVERSION = 8
-"""Conversions within one another that are walked; `mdf_conversion.DEEPEST` bounds those that are applied."""
+"""Maximum nesting depth of checked conversions. `mdf_conversion.DEEPEST` limits applied conversions."""
 _MAX_ENTRIES = 2_000_000
-"""Entries of all conversions that the library would load, each table within a table counted as often as it does."""
+"""Maximum number of entries of all conversions, counted as often as the library loads them."""
 _MAX_TEXT = 1 << 26
-"""Bytes of text that blocks may share in any file."""
+"""Maximum size in bytes of the texts that blocks share, in any file."""
 _TEXT_RATIO = 8
-"""Bytes of text that blocks may share, beyond `_MAX_TEXT`, for each byte of the file."""
+"""Additional size of shared texts per byte of the file, beyond `_MAX_TEXT`."""
 _PACKINGS = ("zlib", "zlib", "lz4", "lz4", "zstd", "zstd")
-"""Compression by type of a packed block; every second one is transposed."""
+"""Compression by type of a packed block. The data of every second type are transposed."""
 _DATA = {b"##DT", b"##DV", b"##DZ", b"##DL", b"##HL", b"##LD", b"##SD", b"##RD", b"##DI", b"##RV", b"##RI"}
 _NAMED = {b"##CN", b"##CG", b"##CC", b"##SI", b"##AT", b"##EV", b"##CH", b"##FH", b"##DG", b"##HD", b"##CA"}
 _PACKED_HEAD = 24
-"""Type of the block within, way of packing, parameter, sizes unpacked and packed."""
+"""Size in bytes of a packed block's header: inner type, compression, parameter, unpacked and packed size."""
 # The links that make the tree: each of their targets belongs to one block. `None`: all of them.
 _TREE: dict[bytes, tuple[int, ...] | None] = {
     b"##HD": (0, 1, 2, 3, 4),

@@ -17,9 +17,9 @@ from edp.logs.formats.mdf_formula import Formula, FormulaError
 
 _NONE, _LINEAR, _RATIONAL, _FORMULA, _INTERPOLATED, _NEAREST, _RANGES, _VALUE_TEXTS, _RANGE_TEXTS = range(9)
 _TEXTS_ONLY = (9, 10, 11)
-"""Texts to values, texts to texts and bit fields: none changes a number."""
+"""Conversion types that do not change numbers: text to value, text to text, bit field."""
 DEEPEST = 4
-"""Conversions within tables of conversions; ASAM's examples have one."""
+"""Maximum nesting depth of conversions. ASAM's examples have one level."""
 _SHOWN = 80
 
 

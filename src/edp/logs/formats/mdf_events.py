@@ -11,12 +11,12 @@ from xml.sax.saxutils import escape
 from edp.errors import DataError
 
 LONGEST_TEXT = 2_000
-"""Characters of a name or comment; more is cut."""
+"""Maximum number of characters of a name or comment. Longer texts are cut."""
 MAX_EVENTS = 100_000
 """Maximum number of events in a file: a segment takes two blocks of about 150 bytes and its texts."""
 _NS = 10**9
 _MARKER, _RECORDED_AFTERWARDS = 6, 1
-"""Type of an event, and the flag of events that were found in what had been recorded."""
+"""Event type of a marker, and flag of events that were added after the recording."""
 _BEGIN, _END = 1, 2
 _SECONDS, _BY_TOOL = 1, 2
 

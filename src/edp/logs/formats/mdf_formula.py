@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 Values = NDArray[np.float64]
 
 LONGEST = 4096
-"""Characters of a formula; those of calibration tools have some dozens."""
+"""Maximum number of characters of a formula. Calibration tools write a few dozen."""
 DEEPEST = 32
-"""Parentheses, functions and signs within one another: what bounds the stack of the parser."""
+"""Maximum nesting depth of parentheses, functions and signs, which bounds the stack of the parser."""
 MAX_TOKENS = 512
-"""Numbers, names and signs of a formula: each is at most one pass over the values."""
+"""Maximum number of tokens of a formula. Each token takes at most one pass over the values."""
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)|(?P<name>[A-Za-z_][A-Za-z_0-9]*)"
     # Two stars before one: a power would otherwise be read as two products.

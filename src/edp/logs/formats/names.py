@@ -59,7 +59,7 @@ def only(
 
 
 SHOWN = 80
-"""Characters of a name in a message."""
+"""Maximum number of characters of a name in a message."""
 
 
 def quote_name(name: str) -> str:

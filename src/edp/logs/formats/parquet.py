@@ -42,15 +42,15 @@ from edp.storage.memory import check_memory
 _MAGIC = b"PAR1"
 _KEY = b"edp_recording"
 _GROUP_ROWS = 1 << 17
-"""Rows of a group: what a reader takes at a time, 22 min at 100 Hz."""
+"""Number of rows per row group: 22 min at 100 Hz."""
 _LARGEST_LIST = 256
-"""Longer lists are pictures and spectra, not signals."""
+"""Maximum length of a list that becomes columns. Longer lists are pictures and spectra."""
 RATIO = 1100
-"""Bytes of values that a byte of the file may mean, as in the other formats."""
+"""Maximum ratio of value bytes to file bytes, as in the other formats."""
 SPARE = 1 << 28
-"""And so many beyond that: columns of one value throughout are usual, an hour at 1 kHz takes 29 MB."""
+"""Additional value bytes that are always allowed. Constant columns compress well: an hour at 1 kHz takes 29 MB."""
 _COPIES = 2
-"""A column is in memory in segments and in one."""
+"""Number of copies of a column in memory: in segments and contiguous."""
 
 
 class ParquetFormat:

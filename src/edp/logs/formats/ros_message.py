@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from edp.errors import DataError
 
 LARGEST_ARRAY = 256
-"""Longer lists are pictures, point clouds and the like; their numbers are no signals."""
+"""Maximum length of a list that becomes columns. Longer lists are pictures or point clouds."""
 _DTYPES = {
     "bool": "u1",
     "byte": "u1",
@@ -38,9 +38,9 @@ _DTYPES = {
 }
 _BASE, _NAME, _ARRAY, _SEQUENCE = 1, 2, 3, 4
 _DEEPEST = 32
-"""Types within one another; those of ROS have some six."""
+"""Maximum nesting depth of types. ROS types have about six levels."""
 _MAX_STEPS = 100_000
-"""Fields of one message, each element of a list counted; only lists of lists and of messages can have so many."""
+"""Maximum number of fields of a message, including list elements. Only nested lists can have more."""
 
 
 class LongMessageError(DataError):

@@ -31,9 +31,9 @@ from edp.signals import VOCABULARY, SignalMap
 from edp.storage.paths import is_file_at, is_folder_at
 
 KEPT_BYTES = 1 << 29
-"""Wanted columns up to this size are read in one go through the file; beyond, each topic in segments."""
+"""Maximum size of columns read in one pass through the file. Larger selections are read per topic in segments."""
 _STAMP = ("header.stamp.sec", "header.stamp.nanosec")
-"""Both parts of a header's time, as the library names them for ROS 1 and ROS 2."""
+"""Field names of both parts of a header's time, as the library uses them for ROS 1 and ROS 2."""
 _LOG_TIME, _HEADER_TIME = "log_time", "header.stamp"
 
 

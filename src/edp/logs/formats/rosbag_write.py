@@ -20,7 +20,7 @@ _TOPIC = "/edp/recording"
 _TYPE = "edp_msgs/msg/Sample"
 _TEXT = "std_msgs/msg/String"
 _BLOCK_ROWS = 1 << 13
-"""Messages serialised at a time."""
+"""Number of messages serialised at a time."""
 
 
 def write_bag(recording: Recording, path: Path, container: str) -> None:

@@ -11,26 +11,27 @@ from edp.logs.formats.base import Column
 from edp.logs.proposal.columns import LogColumn
 
 RELATED = 24
-"""Columns that are compared in pairs: the work grows with the square."""
+"""Maximum number of columns compared in pairs, because the work grows with the square."""
 _ALIKE = 0.97
-"""Correlation from which one column is a change, a copy or a reference of another; chance and common motion reach
-0.9 on logs of a machine that repeats one cycle."""
+"""Minimum correlation for a change, a copy or a reference of another column. Common motion in a repeated cycle reaches
+0.9.
+"""
 _ROUNDED_ALIKE = 0.999
 """Minimum correlation of copies that were rounded separately."""
 _MANY_COUNTS = 50
-"""Last digits that the range of a rounded copy spans at least."""
+"""Minimum range of a rounded copy, in units of its last digit."""
 _LAGS = 25
-"""Samples by which a reference may lead what follows it."""
+"""Maximum lead of a reference in samples."""
 _HOLDS = 0.9
-"""Fraction of equal neighbours above which a column moves in steps."""
+"""Fraction of equal neighbours above which a column counts as piecewise constant."""
 _FEW = 12
-"""Distinct values of a label at most."""
+"""Maximum number of distinct values of a label."""
 _SLOW = 2e-3
-"""Changes a row of a label at most: operators switch seldom."""
+"""Maximum number of changes per row of a label, because operators switch rarely."""
 _REMARKS_FILL, _REMARKS_SPAN = 0.1, 0.2
-"""Largest share of rows with a number, and of rows from the first to the last of them, of a list beside a table."""
+"""Maximum fraction of filled rows, and of rows between the first and the last filled row, of a list next to a table."""
 _SPANS = (1, 4, 16)
-"""Rows over which a change is compared with a velocity: noise hides it over one, motion over many."""
+"""Numbers of rows over which changes are compared with a velocity. Noise dominates short spans, motion long spans."""
 
 
 _MIN_STEPS, _MAX_LOST = 50, 5
@@ -42,19 +43,19 @@ class Behaviour:
     """Statistics of one numeric column.
 
     Attributes:
-        filled: share of rows that hold a number.
+        filled: fraction of rows that contain a number.
         low: smallest value.
         high: largest value.
-        constant: one value throughout.
+        constant: whether all values are equal.
         whole: integers only.
         levels: distinct values.
-        holds: share of rows that repeat the row before.
+        holds: fraction of rows that repeat the previous row.
         rises: no row is below the one before.
         climbs: every row is above the one before.
         step: median of the steps that are not zero, 0 where there are none.
         even: nearly all steps have one size.
         steady: nearly all steps are between half and twice their median, as those of a clock that waits for others.
-        spanned: share of rows between the first and the last one that hold a number.
+        spanned: fraction of rows between the first and the last row with a number.
         restarts: rows at which an even rise begins again.
         coarse: many levels, but hardly a step of more than one: a slow signal that its sensor rounds.
         falls: rows below the one before.

@@ -21,12 +21,12 @@ _PRINTED, _MANY_STAMPS = 0.995, 50
 """Maximum fraction of rows that repeat the previous stamp, and minimum number of different stamps: whole seconds of
 some minutes at 100 Hz."""
 _FASTEST_HZ = 200.0
-"""Rates above are brought down to one of `_PLAIN_HZ`: a machine moves slower, and a tick more costs on a controller."""
+"""Sample rate in Hz above which a rate from `_PLAIN_HZ` is proposed. Machine motion is slower than such rates."""
 _PLAIN_HZ = (100.0, 200.0, 500.0, 1000.0, 2000.0)
 _MAX_RESTARTS = 5
-"""Falls of uneven stamps, each the restart of a logger."""
+"""Maximum number of backward steps of uneven time stamps. Each is a restart of the logger."""
 _MIN_ROWS = 1500
-"""Rows that a log should keep: from some 700 nothing can be set apart for tests and validation."""
+"""Minimum number of rows after resampling. With about 700, no test and validation data can be separated."""
 
 
 @dataclass(frozen=True)

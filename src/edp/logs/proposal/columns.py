@@ -27,25 +27,25 @@ beginning."""
 _HEAD_BYTES = 1 << 20
 """Size of the examined part of a text when comparing columns with other files."""
 MAX_COLUMNS = 400
-"""Columns that are looked at; the others are left out and counted."""
+"""Maximum number of examined columns. Further columns are omitted and counted."""
 _ROWS = 30_000
-"""Rows of the first piece, which tells time and relations; five minutes at 100 Hz."""
+"""Number of rows of the first segment, which determines time and relations: five minutes at 100 Hz."""
 _LATER_ROWS = 10_000
-"""Rows of a piece from the middle and of one from the end: a machine may rest when a log begins."""
+"""Number of rows of the segments from the middle and the end, since a machine may rest at the start of a log."""
 _VALUES = 12_000_000
-"""Numbers kept of all columns together, 96 MB."""
+"""Maximum number of stored values of all columns together (96 MB)."""
 _PROBE_ROWS = 1000
-"""Rows by which a column of text is told from one of numbers."""
+"""Number of rows used to distinguish text columns from numeric columns."""
 _MAX_TEXTS = 20
-"""Columns of text that are tried as time."""
+"""Maximum number of text columns tried as time."""
 _COVERED = 0.9
 """Minimum fraction of the longest span that signals with their own times cover. A single message is not a signal."""
 _SLOWEST = 200.0
-"""Steps of the fastest signal that one of a slower lasts at most."""
+"""Maximum ratio between the sample counts of the fastest and a slower signal."""
 _HELD_VALUES = 4 * _VALUES
-"""Numbers held at the times of the fastest signal at most; of longer logs columns of one length are looked at."""
+"""Maximum number of values after holding slow signals at the fastest rate. Longer logs use columns of one length."""
 _OF_THE_LOGGER = ("/rosout", "rosout", "/diagnostics", "/parameter_events", "/events/")
-"""Beginnings of names of what programs of ROS report about themselves."""
+"""Name prefixes of topics in which ROS programs report their own state."""
 _TIME_WORDS = ("time", "zeit", "stamp", "date", "datum", "uhr")
 
 
@@ -59,7 +59,7 @@ class LogColumn:
         samples: rows that the file has.
         unit: unit stated in the file.
         kind: kind stated in the file (EDP's own formats).
-        own_time: it has time stamps of its own, as signals of MDF and bags do.
+        own_time: whether the column has separate time stamps, as signals of MDF files and bags do.
         clock: time in these columns; None if they were not examined.
     """
 

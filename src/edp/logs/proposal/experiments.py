@@ -11,9 +11,9 @@ from edp.logs.proposal.groups import LogGroup, fits, some_of
 
 TRAINING_WORDS = ("est", "train", "id", "training", "identification")
 TEST_WORDS = ("val", "test", "validation")
-"""Names of variables by which an author parted experiments."""
+"""Words in variable names that mark a test or validation experiment."""
 MAX_EXPERIMENTS = 2000
-"""Experiments of a group of files: each is a recording in a data-set file."""
+"""Maximum number of experiments in a group of files. Each becomes a recording in the data-set file."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from edp.progress import SILENT, Progress
 
 _One = TypeVar("_One")
 MAX_LOGS = 12
-"""Logs that are looked at of a group of files: the first ones, the last ones and some between."""
+"""Maximum number of examined logs per group of files: first, last and some between them."""
 _ALIKE = 0.7
 """Minimum fraction of common columns of two logs in one group."""
 

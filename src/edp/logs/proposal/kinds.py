@@ -13,7 +13,7 @@ from edp.signals import KINDS, TIME_UNITS, UNITS, VOCABULARY, Kind
 BOUND = 0.6
 """Confidence below which a channel is mapped as numbers without a unit."""
 SURE_NUMBERS = 0.85
-"""Confidence that numbers are to be taken as they are."""
+"""Confidence of the proposal to use values without a unit."""
 _PRESSURES = (Kind.PRESSURE, Kind.PILOT_PRESSURE)
 _RATES = {
     Kind.POSITION: Kind.VELOCITY,
@@ -27,11 +27,11 @@ _TURNING = {
     Kind.VELOCITY: Kind.ANGULAR_VELOCITY,
     Kind.ANGULAR_VELOCITY: Kind.ANGULAR_VELOCITY,
 }
-"""Kinds of a joint's motion by the kinds of linear motion."""
+"""Kind of rotary motion that corresponds to each kind of linear motion."""
 _NEAR = 0.1
 """Relative tolerance between the ratio of a change and that of two units."""
 _SHORT_UNITS = ("t", "g")
-"""Letters that mean something else as often: time or tonnes, grams or gravity."""
+"""Ambiguous unit letters: time or tonnes, grams or gravity."""
 
 
 @dataclass(frozen=True)

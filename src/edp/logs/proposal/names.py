@@ -9,7 +9,7 @@ from edp.logs.units import normalise_unit
 from edp.signals import UNIT_ENDINGS, UNIT_TAILS, UNITS, Kind
 
 _LONGEST = 200
-"""Characters of a name that are looked at."""
+"""Maximum number of examined characters of a name."""
 _PARTS = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 _UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss"})
 
@@ -33,9 +33,11 @@ KIND_WORDS: Mapping[str, Kind] = {
     }.items()
     for word in words.split()
 }
-"""Words that name a kind; the first of a name counts, in this order. ``current`` is not among them: it may mean now."""
+"""Words that indicate a kind. The first match in a name counts. ``current`` is excluded because it may mean the
+present.
+"""
 _LONG = 4
-"""Letters from which a word also counts within a compound, as in ``Kolbendruck``."""
+"""Minimum length of a word that is also found within a compound, as in ``Kolbendruck``."""
 ROLE_WORDS: Mapping[str, str] = {
     word: role
     for role, words in {
@@ -52,7 +54,7 @@ ROLE_WORDS: Mapping[str, str] = {
 }
 _PARTS_OF_SETS = frozenset(["est", "val", "train", "test", "id"])
 _GLUED = re.compile(r"(pos|vel|acc|ang)(a|act|d|des|r|ref|m|meas|cmd)")
-"""A kind and a role in one word, as programs of robots write them."""
+"""Pattern of a kind and a role in one word, as in robot programs."""
 _GLUED_ROLES = {
     role: named
     for named, roles in {"measured": "a act m meas", "reference": "d des r ref", "command": "cmd"}.items()
@@ -61,7 +63,7 @@ _GLUED_ROLES = {
 _HYDRAULIC = frozenset(
     ("cyl", "cylinder", "zylinder", "pump", "pumpe", "port", "chamber", "kammer", "rod", "head", "piston", "supply")
 )
-"""Words beside which a single P at the end of a name is a pressure."""
+"""Words that make a single P at the end of a name mean pressure."""
 _TURNS, _SPEEDS = frozenset(("ang", "angular")), frozenset(("vel", "velocity", "speed"))
 _ERRORS = frozenset(["error", "err", "deviation", "abweichung", "regelabweichung", "residual", "residuum"])
 _COUNTERS = frozenset(
@@ -89,7 +91,7 @@ _SAMPLE_TIMES = frozenset(
 _JOINTS = frozenset(("joint", "joints", "gelenk", "achse", "elbow", "shoulder", "wrist", "knee", "hip", "ankle"))
 _TAG = re.compile(r"([PTF])([SIT])(\d{1,3})")
 _TAGS: Mapping[str, Kind] = {"P": Kind.PRESSURE, "T": Kind.TEMPERATURE, "F": Kind.FLOW}
-"""First letters of instrument tags (ISA-5.1), with sensor, indicator or transmitter behind: PS1, TT12."""
+"""Kinds by the first letter of an instrument tag (ISA-5.1), as in PS1 or TT12."""
 
 
 def words_of(name: str) -> tuple[str, ...]:

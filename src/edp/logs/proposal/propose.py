@@ -28,21 +28,21 @@ from edp.signals import TABLE_A1, VOCABULARY, ChannelMap, Kind, SignalMap
 from edp.wording import percent, typed
 
 SURE = 0.85
-"""Confidence from which nothing needs to be checked."""
+"""Confidence above which a proposal needs no check."""
 MAPPED_ROLES = ("reference", "command", "measured", "label")
-"""Roles of columns that become channels; time, counters, constants and text do not."""
+"""Roles of columns that become channels. Time, counters, constants and texts do not."""
 _COMMANDS = (Kind.PILOT_PRESSURE, Kind.CURRENT, Kind.VOLTAGE, Kind.RATIO)
 _MEASURED = tuple(kind for kind in Kind if kind not in (*_COMMANDS, Kind.GENERIC))
 """Kinds that show what a machine does, however they move; names and what follows them tell their references."""
 _FOLLOWED = (Kind.PRESSURE, Kind.TEMPERATURE, Kind.FLOW)
-"""Kinds that are references by their names only."""
+"""Kinds that count as references only because of their name."""
 _NUMBERS = re.compile(r"\d+")
 _MIN_SWITCHES = 3
-"""Changes at the rate of a label that a log is long enough for, before a command without them is one."""
+"""Minimum expected number of label changes in a log before a command without changes counts as a command."""
 _PLAIN_NAME = re.compile(r"\w[\w .\-/()%]{0,63}")
 _MAX_CHANNELS = 200
 _MAX_FALLS = 5
-"""Restarts of a logger within a log, at which stamps of its messages fall."""
+"""Maximum number of logger restarts within a log, at which time stamps fall."""
 _SWITCHED_HZ = {"command": 0.01, "": 0.05, "label": 1.0}
 """Changes a second below which a column of a few whole values is a label, by what its name says: a working machine
 opens valves more often than every 100 s."""
@@ -53,7 +53,7 @@ class ColumnGuess:
     """Proposed meaning of a column.
 
     Attributes:
-        column: its name in the file.
+        column: name of the column in the file.
         channel: name of the channel; empty where it becomes none.
         role: ``time``, ``counter``, ``constant``, ``text``, ``remark``, or one of `MAPPED_ROLES`.
         kind: kind and unit.
@@ -138,7 +138,7 @@ def propose_map(look: LogLook, common: Collection[str] | None = None, beside: Se
 
 _NO_KIND = KindGuess(Kind.GENERIC, "1", 1.0, "")
 _EMPTY = "empty"
-"""Why a column is a constant: no row holds a number."""
+"""Reason for a constant column: all rows are empty."""
 
 
 def _where_they_move(behaviours: dict[str, Behaviour], beside: Sequence[LogLook]) -> dict[str, Behaviour]:

@@ -16,16 +16,17 @@ from edp.storage.paths import files_below, is_file_at, is_folder_at
 from edp.wording import percent, setting_text, typed
 
 _MIN_COLUMNS = 20
-"""Columns without names from which a row may hold samples of one signal."""
+"""Minimum number of unnamed columns for rows that may hold samples of one signal."""
 _ALIKE, _MOST = 0.97, 0.9
-"""Correlation of neighbours that continue each other, and share of the neighbours that do."""
+"""Minimum correlation of neighbouring columns that continue each other, and minimum fraction of such neighbours."""
 
 _SLOWER, _LOST, _FEW = 4.0, 0.25, 0.1
-"""A rate is this many times the motion that it shows well; share of faster motion from which a person is told, and
-that a better rate leaves. Eight samples a period would be plenty, two are lost between samples."""
+"""Required ratio of sample rate to motion frequency; fraction of faster motion above which the user is warned; maximum
+fraction at the proposed rate. Eight samples per period are ample; with two, motion between samples is lost.
+"""
 _MIN_ROWS = 500
 _MAX_TEXTS = 8
-"""Text files beside logs of other endings that are tried."""
+"""Maximum number of text files examined next to logs with other file endings."""
 _RATES_HZ = (200.0, 500.0, 1000.0, 2000.0, 5000.0)
 
 

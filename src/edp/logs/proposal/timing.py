@@ -16,9 +16,9 @@ from edp.signals import TIME_UNITS
 from edp.wording import typed
 
 _ONE_RATE = 1.0005
-"""Ratio of rates up to which logs count as one; reading allows a thousandth."""
+"""Maximum ratio of rates that count as equal. The reader allows a deviation of a thousandth."""
 _LONG_S, _LONG_STEPS = 1.0, 20.0
-"""A gap longer than both is a break in the session: held values would be motion that never was."""
+"""Gap length in s and in steps above which a session is divided, because holding values would falsify the motion."""
 _MAX_KEPT = 0.8
 """Minimum fraction of the rows on one side of a break, above which the rest is cut off."""
 

@@ -18,9 +18,9 @@ from edp.signals import KINDS, UNITS, Channel, Kind
 from edp.wording import typed
 
 SEVERITIES = ("error", "warning", "note")
-"""Worst first."""
+"""Severities of findings, the worst first."""
 _STUCK_SECONDS = 1.0
-"""Shortest stay that is reported of a channel that may rest, and its least number of samples below."""
+"""Minimum reported duration of a constant value in a channel that may rest, s."""
 _STUCK_SAMPLES = 50
 _FROZEN_SECONDS = 0.5
 """Maximum constant time of a channel whose last digit always changes."""
@@ -30,7 +30,7 @@ _CLIPPED_SAMPLES = 3
 _CLIPPED_SHARE = 1e-3
 """Minimum fraction of the time at that end."""
 _NOISY_RATIO = 2.0
-"""Deviation over noise floor below which a channel is mostly noise."""
+"""Ratio of standard deviation to noise floor below which a channel is mostly noise."""
 _FEW_LEVELS = 64
 """Maximum number of levels of a coarse channel."""
 _COARSE_STEP = 0.1

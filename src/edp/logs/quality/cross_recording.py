@@ -18,7 +18,7 @@ from edp.signals import UNITS, Kind
 from edp.wording import typed
 
 _MIN_RATIO = 9.0
-"""Units nearer than this cannot be told from a recording that is merely livelier."""
+"""Minimum ratio of two units. Smaller ratios may be caused by a difference in motion."""
 _NEAR_DECADES = 0.35
 """Tolerance of size and noise relative to the ratio of two units, in decades: a factor of 2.2."""
 

@@ -35,11 +35,11 @@ _LEFT_OUT = {
 """Descriptions of lines in a text file that are not rows, by type."""
 _LENIENT = Repair(nan="keep", gaps="keep", duplicates="last", falling="sort")
 _MAX_NAMES = 2000
-"""Columns that are compared with the vocabulary: each costs half a millisecond."""
+"""Maximum number of column names compared with the vocabulary. A comparison takes half a millisecond."""
 _MISSPELT = 0.85
-"""Likeness (`difflib`) of a name to one of the vocabulary from which it is a slip: a letter in eight."""
+"""Minimum similarity (`difflib`) of a name to the vocabulary for a spelling error: one letter in eight."""
 _LONGEST_MISS = 64
-"""Characters of a name that is compared: the time grows with the product of both lengths."""
+"""Maximum number of characters of a compared name. The time grows with the product of both lengths."""
 
 
 def inspect_log(path: str | Path, signal_map: SignalMap | None = None) -> QualityReport:

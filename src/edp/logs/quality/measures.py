@@ -15,20 +15,20 @@ from edp.logs.repair import runs
 Values = NDArray[np.float32]
 
 MAX_UNIQUE = 500_000
-"""Samples looked at for a lattice; a longer channel is thinned evenly."""
+"""Maximum number of samples examined for quantisation. Longer channels are thinned evenly."""
 _ON_LATTICE = 0.05
-"""Largest distance from a multiple of the step, in steps."""
+"""Maximum distance from a multiple of the quantisation step, in steps."""
 _SHARE_ON_LATTICE = 0.99
 _BLOCK = 128
-"""Samples over which noise is measured: long against its scatter, short against motion."""
+"""Number of samples over which noise is measured: large for its statistics, short relative to motion."""
 # Of the third difference of white noise: its gain, and the deviation of its mean square over a block, as
 # sum(rho^2) over its autocorrelation -15/20, 6/20, -1/20 says.
 _GAIN = 20.0
 _SPREAD = (2.0 * (1.0 + 2.0 * (0.75**2 + 0.3**2 + 0.05**2)) / _BLOCK) ** 0.5
 _QUARTILE = 0.6745
-"""Distance of the quartiles of the standard normal distribution from its mean."""
+"""Upper quartile of the standard normal distribution."""
 _HELD = 10
-"""Equal samples in a row from which a stay is a hold, not a chance of the last digit."""
+"""Number of equal consecutive samples from which a constant value is not a coincidence."""
 _BUSY_REPEATS = 0.05
 _BUSY_HELD = 0.2
 _BUSY_NOISE = 2e-4
@@ -46,8 +46,8 @@ class Measures:
         noise: deviation of the white part in steady state, 0 for a state of up to three levels.
         every: samples between new values; 1 where each sample is new.
         busy: sensor noise moves the last digit all the time, so that equal samples in a row mean something.
-        at_low: share of the samples at the minimum.
-        at_high: share of the samples at the maximum.
+        at_low: fraction of the samples at the minimum.
+        at_high: fraction of the samples at the maximum.
         end_run: longest stay at an end of the range, in samples.
         spikes: single samples far off both neighbours.
         first_spike: the first of them, -1 where there is none.

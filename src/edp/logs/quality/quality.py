@@ -22,7 +22,7 @@ from edp.settings.results import json_value
 from edp.signals import KINDS
 
 VERDICTS = {"error": "unusable", "warning": "check", "note": "good"}
-"""Verdict on a channel or a recording by its worst finding; without a finding it is good."""
+"""Verdict on a channel or recording by its worst finding. Without a finding the verdict is good."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class ChannelFacts:
         snr_db: deviation over noise in decibels, None without noise.
         new_hz: rate of new values, Hz.
         stuck_s: longest time at exactly one value between the ends of the range.
-        at_ends: share of the samples at the minimum or maximum.
+        at_ends: fraction of the samples at the minimum or maximum.
         verdict: ``good``, ``check`` or ``unusable``.
     """
 

@@ -17,27 +17,27 @@ from edp.logs.quality.sketches import Floats, Sketch
 from edp.wording import number
 
 WINDOW = 128
-"""Blocks of a fingerprint, 12.8 s."""
+"""Number of samples of a fingerprint: 12.8 s."""
 _HOP = 32
 """Distance of the windows that are searched in, less or more one by turns: at even and at odd blocks. Windows at even
 blocks are searched for, so any lag, even or odd, meets one in 64 blocks."""
 _STEP = 2
 _COEFFICIENTS = 12
-"""Cosines of a fingerprint: up to 0.47 Hz."""
+"""Number of cosine coefficients of a fingerprint: up to 0.47 Hz."""
 _NEAR = 0.15
-"""Distance of two fingerprints of length one that still agree: a correlation of 0.989."""
+"""Maximum distance of two matching unit fingerprints: a correlation of 0.989."""
 _NEIGHBOURS = 4
 _MOVES = 0.1
-"""Deviation of a window, in those of the channel, from which it moves."""
+"""Minimum standard deviation of a moving window, relative to the channel."""
 _CHANNELS = 3
 _OWN, _OWN_UNNAMED = 2, 16
 _SAME = 0.98
-"""Correlation of a window in both recordings."""
+"""Minimum correlation of a window in both recordings."""
 _MIN_WINDOWS = 2
 _MIN_VOTES = 3
-"""Fingerprints that must agree on a lag before it is checked."""
+"""Minimum number of fingerprints with a common lag before the lag is checked."""
 _HOPELESS = 0.8
-"""Correlation below which no fraction of a block makes two windows the same."""
+"""Correlation below which a shift by a fraction of a sample cannot make two windows equal."""
 _MIN_SHARE = 0.5
 """Minimum fraction of the channels moving in a window that must agree. Steps of two sessions look alike in one channel
 or another (correlations of 0.99 on a bench with two machines), but not in most of them."""
@@ -45,10 +45,10 @@ _MIN_UNBROKEN = 2 / 3
 """Minimum fraction of the windows in motion between the first and the last agreeing one that must agree. Within one
 session all agree except for noise; of two similar sessions about half did."""
 _SHIFTS = (0.0, -0.25, 0.25, -0.5, 0.5)
-"""Fractions of a block: two recordings began at different moments between the ticks of 10 Hz."""
+"""Shifts in fractions of a sample, because two recordings start at different times between samples of 10 Hz."""
 
 Labels = NDArray[np.int64]
-"""Recording and block of fingerprints, shape ``(fingerprint, 2)``; or votes, see `_votes`."""
+"""Recording and sample of fingerprints, shape ``(fingerprint, 2)``; or votes, see `_votes`."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from edp.logs.quality.columns import columns
 from edp.recording import Recording
 
 SKETCH_HZ = 10.0
-"""Rate of a sketch: fast enough for moves of a machine, and any logger reaches it."""
+"""Sample rate of a sketch in Hz: sufficient for machine movements and available from any logger."""
 MOST_BYTES = 256 * 2**20
 """Maximum size of the sketches of a data set: 40 hours of 45 channels."""
 HASHED_ROWS = 65_536

@@ -69,15 +69,15 @@ from edp.storage.paths import (
 )
 
 KEY_SCHEMA = 1
-"""Version of what `StoredLog.key` covers."""
+"""Version of the content of `StoredLog.key`."""
 PART_SAMPLES = 1 << 16
-"""Of a log that are in memory at a time."""
+"""Number of samples of a log that are in memory at a time."""
 BATCH_LOG_BYTES = 128 * 2**20
-"""Of the logs of a batch, about: what a process that is killed loses."""
+"""Approximate size of the logs in a batch, bytes. A killed process loses at most one batch."""
 BATCHES = 64
-"""About, of small data sets: some for each worker, so that none waits for the last one for long."""
+"""Approximate minimum number of batches of a small data set, so that workers finish at similar times."""
 MAX_FILES = 400
-"""Files of rows of one build, about: each is open while the store is, and systems allow some thousand."""
+"""Approximate maximum number of row files per build. Each is open while the store is open."""
 
 
 @dataclass(frozen=True)
@@ -147,8 +147,8 @@ def build_store(
     """Read logs into a store. Unchanged logs are reused; changed logs are read again.
 
     Args:
-        logs: in any order.
-        folder: of the store; a new one, an unfinished one, or one to add logs to.
+        logs: logs in any order.
+        folder: folder of the store: a new one, an unfinished one, or an existing one to which logs are added.
         workers: who reads the logs; nodes see logs and store under the same paths.
         progress: receiver of the progress; its units are logs.
 

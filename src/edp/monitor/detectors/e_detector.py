@@ -17,7 +17,7 @@ from edp.monitor.detectors.base import DETECTORS, Array, Bools, Detector, Detect
 from edp.settings.bounds import above, check_bounds, check_count
 
 MOST = 600.0
-"""Logarithm at which a member stays: its power is still a number."""
+"""Maximum logarithm of an e-value, which keeps its exponential finite."""
 
 
 class _EDetector(Detector):

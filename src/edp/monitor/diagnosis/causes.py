@@ -11,7 +11,7 @@ from edp.errors import DataError
 
 AtFault = Literal["sensor", "machine", "none"]
 NONE_OF_THESE = "none"
-"""Kind of the cause that is no fault of the dictionary."""
+"""Type of a cause that is not in the fault dictionary."""
 LONGEST_TEXT = 300
 MAX_SIZES = 32
 

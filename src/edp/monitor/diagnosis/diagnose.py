@@ -17,9 +17,9 @@ from edp.monitor.diagnosis.signatures import Dictionary
 
 Array = NDArray[np.float64]
 AFTER_S = 60.0
-"""Time after an alarm whose rows name its cause where a log has them: a change at once is alarmed within a block."""
+"""Time after an alarm whose blocks are used to find the cause, s. An abrupt change raises an alarm within one block."""
 MAX_ROWS = 180
-"""Blocks that name a cause: of a longer segment the last ones, and no onset."""
+"""Maximum number of blocks for a diagnosis. A longer segment is reduced to its last blocks, without an onset."""
 
 
 def diagnosed(alarm: MonitorAlarm, dictionary: Dictionary, rows: Array, start: datetime | None = None) -> MonitorAlarm:

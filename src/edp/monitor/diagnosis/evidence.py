@@ -12,14 +12,14 @@ from edp.errors import DataError, count_of
 
 Array = NDArray[np.float64]
 SHORT, LONG = 8, 40
-"""Blocks of the windows over which the scatter of means is measured."""
+"""Window lengths in blocks at which the variance of window means is measured."""
 SHRUNK = 0.2
-"""Weight of the identity in the correlations, because there are fewer healthy sessions than summaries."""
+"""Weight of the identity matrix in the correlations, because healthy sessions are fewer than summaries."""
 MIN_VARIANCE = 1e-6
-"""Variance of a feature, in units of healthy blocks, below which the feature is constant."""
+"""Variance of a feature, relative to healthy blocks, below which the feature counts as constant."""
 MIN_SESSIONS = 4
 ONSET = 6
-"""Blocks from the onset on that are looked at apart: a step of a sensor shows in them only."""
+"""Number of blocks after the onset that form separate features. A sensor step is visible only in them."""
 
 
 def features(rows: Array) -> Array:

@@ -20,13 +20,13 @@ Array = NDArray[np.float64]
 CHANGING = (0.1, 0.3, 1.0)
 TEMPERATURES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 WINDOW = 40
-"""Healthy blocks under a signature of a left-out session: what an alarm has after some half a minute."""
+"""Number of healthy blocks added to the signature of a left-out session: about half a minute after an alarm."""
 MIN_CHANGE = 3.0
-"""Size of a signature, in healthy standard deviations of such a mean, below which it would not have been found."""
+"""Minimum size of a signature in healthy standard deviations of a window mean. Smaller ones would raise no alarm."""
 UNUSUAL = 0.98
-"""Fraction of left-out sessions that some fault must explain."""
+"""Fraction of the left-out fault sessions that the dictionary must explain."""
 MAX_JUDGED = 240
-"""Left-out sessions that numbers are chosen on."""
+"""Maximum number of left-out sessions for the choice of the parameters."""
 
 
 @dataclass(frozen=True, eq=False)

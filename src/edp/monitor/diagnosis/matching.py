@@ -17,20 +17,21 @@ from edp.monitor.diagnosis.signatures import Dictionary
 
 Array = NDArray[np.float64]
 Seen = tuple[Array, Array]
-"""Directions of a mean, and their healthy variance."""
+"""Mean features projected on the directions of the evidence, and their healthy variance."""
 GRID = 12
-"""Sizes of a fault that are tried, evenly spread in their logarithm from the smallest of its ladder on."""
+"""Number of fault sizes tried, with logarithmic spacing from the smallest simulated size."""
 BEYOND = 1.3
-"""Largest size that is tried in small steps, over the largest of the ladder."""
+"""Upper end of that grid relative to the largest simulated size."""
 FURTHER = (2.0, 4.0, 8.0)
-"""Sizes beyond the ladder that are tried, over its largest: signatures go on as they changed towards it, and what is at
-its clip stays there."""
+"""Larger fault sizes that are tried, relative to the largest simulated size. Signatures are extrapolated to them, and
+clipped features stay at their clip.
+"""
 MAX_STRANGE = 0.5
-"""Probability of none of the ladders' faults, above which sizes beyond them are tried."""
+"""Probability of an unknown fault above which larger fault sizes are tried."""
 MAX_SHARE = 100.0
 """Maximum size of faults measured in percent."""
 MIN_SIZE = 0.5
-"""Smallest size that is tried, over the smallest of the ladder."""
+"""Smallest fault size that is tried, relative to the smallest simulated size."""
 MAX_CAUSES = 8
 
 

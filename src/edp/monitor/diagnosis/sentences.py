@@ -12,7 +12,7 @@ from edp.wording import number
 UNKNOWN = "something changed that no fault of the dictionary explains"
 UNNAMED = "the machine or a sensor behaves otherwise than on the healthy sessions"
 SURE = 0.5
-"""Probability from which on a cause is stated; below it, it is a guess."""
+"""Probability above which a cause is stated. Below it, the cause is called a guess."""
 
 
 def size_text(size: float, unit: str) -> str:

@@ -9,9 +9,11 @@ from edp.monitor.diagnosis.causes import NONE_OF_THESE, Cause
 
 Severity = Literal["note", "warning", "stop"]
 SMALL, LARGE = 0.34, 0.67
-"""Grades on the ladder of a kind: the first of four sizes is a note, the upper ones may be a reason to stop."""
+"""Boundaries of the severity grades, as positions among the simulated sizes. The first of four sizes is a note; the
+upper ones may be a reason to stop.
+"""
 ENOUGH = 0.5
-"""Probability of grave causes from which on a machine should stop."""
+"""Total probability of severe causes above which the machine should stop."""
 
 
 def severity(causes: Sequence[Cause]) -> Severity:

@@ -13,11 +13,11 @@ from edp.settings.bounds import SHARE, check_bounds, check_texts
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 APART = 0.25
-"""Largest share of wrong answers of a test between two faults that can be told apart; a coin has 0.5."""
+"""Maximum error rate of a test between two faults that count as distinguishable. Guessing has 0.5."""
 MAX_PAIRS = 400
 LONGEST_NAME = 300
 MIN_SESSIONS = 3
-"""Minimum number of sessions of each of two faults for a statement on their confusion."""
+"""Minimum number of sessions per fault for a statement on the confusion of two faults."""
 
 
 @dataclass(frozen=True)

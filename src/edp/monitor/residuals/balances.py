@@ -36,19 +36,19 @@ ARRAYS = {
     "gains": ArrayRule(("residuals",)),
     "memories_s": ArrayRule(("residuals",)),
 }
-"""Of its file."""
+"""Arrays of the source in the monitor file, with their rules."""
 RATE_OF = {
     Kind.POSITION: Kind.VELOCITY,
     Kind.ANGLE: Kind.ANGULAR_VELOCITY,
     Kind.VELOCITY: Kind.ACCELERATION,
 }
-"""Kind of the rate of change, by kind."""
+"""Kind of the time derivative of each kind of channel."""
 SLOW = (Kind.TEMPERATURE,)
-"""Kinds that cannot jump: their rate counts as zero."""
+"""Kinds that change slowly. Their rate of change is assumed to be zero."""
 MATCH_S = 0.5
-"""Time over which changes are compared to find which rate belongs to which level."""
+"""Interval over which changes are compared to match a rate channel with a level channel, s."""
 MAX_ROWS = 200_000
-"""Maximum number of rows for that comparison: half an hour at 100 Hz."""
+"""Maximum number of rows for this comparison: half an hour at 100 Hz."""
 
 
 class Balances(ResidualSource):
@@ -64,7 +64,7 @@ class Balances(ResidualSource):
         pairs: places of level and rate among the inputs, one a residual, shape (residuals, 2).
         gains: gain of each rate.
         memories_s: memory of each residual, s.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         middle: mean of each input on healthy sessions.
         units: SI unit of each residual.
     """

@@ -21,11 +21,11 @@ from edp.training.twin_bundle import TwinBundle
 
 Rows = NDArray[np.float32]
 MAX_RESIDUALS = 512
-"""Maximum number of residuals of a source. A machine with more channels is monitored in parts."""
+"""Maximum number of residuals per source. Machines with more channels must be monitored in parts."""
 MIDDLE = ArrayRule(("inputs",), np.float32)
-"""Substitutes for absent channels, an array of each source."""
+"""Array rule for the substitutes of missing channels, which each source has."""
 SISTERS = 11
-"""Seeds of drawn machines are apart from all others."""
+"""Seed component that separates randomly drawn machines from other random draws."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class FitMaterial:
         train: healthy sessions, all with `channels` at `rate_hz`.
         validation: further ones, for the choice among fits.
         channels: monitored channels, in the order of the monitor's inputs.
-        rate_hz: ticks per second.
+        rate_hz: sampling rate in Hz.
         predictors: look-ahead networks of this machine.
         twins: plant models of this machine.
         groups: names of channels that are evaluated together; empty where names and kinds are to tell.
@@ -100,7 +100,7 @@ class ResidualSource(ABC):
     there stands in, so that it never spoils the memory.
 
     Attributes:
-        names: one a residual, such as ``virtual:CylVels_1``.
+        names: name of each residual, such as ``virtual:CylVels_1``.
         judged: channels whose fault shows as a bias of each residual.
         reads: all inputs that each residual depends on, those that are evaluated among them.
         units: SI unit of each residual.

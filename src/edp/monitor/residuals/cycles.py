@@ -35,14 +35,16 @@ ARRAYS = {
     "template": ArrayRule(("ticks", "inputs"), np.float32),
     "width": ArrayRule(("ticks", "inputs"), np.float32, low=POSITIVE),
 }
-"""Of its file."""
+"""Arrays of the source in the monitor file, with their rules."""
 PREFIX = "cycle:"
 MIN_CYCLES = 3
-"""Fewer tell no scatter."""
+"""Minimum number of cycles. Fewer cycles do not show the scatter."""
 MOST_TICKS = 1_000_000
-"""Maximum length of a cycle."""
+"""Maximum length of a cycle in samples."""
 UNEVEN = 0.01
-"""Maximum deviation of a cycle from a whole number of samples; after a hundred cycles it is one sample."""
+"""Maximum deviation of a cycle from a whole number of samples. A deviation of 0.01 becomes one sample after a hundred
+cycles.
+"""
 NARROWEST = 1e-3
 """Minimum scatter at a position of the cycle, relative to the total variation of the channel."""
 

@@ -15,26 +15,28 @@ from scipy.signal import cont2discrete, lfilter
 Array = NDArray[np.float64]
 Singles = NDArray[np.float32]
 DAMPING = 0.95
-"""Damping of both stages: pilots and spools of valves hardly oscillate."""
+"""Damping ratio of both valve stages. Pilots and spools hardly oscillate."""
 KNOTS = np.array([0.04, 0.08, 0.11, 0.14, 0.17, 0.21, 0.26, 0.33, 0.42, 0.54, 0.7, 0.85, 1.0], np.float32)
-"""Shares of travel between which an opening is a straight line, nothing at the first one: close where it begins."""
+"""Knots of the piecewise-linear opening curves, as fractions of spool travel. The opening is zero at the first knot,
+and knots are dense where flow begins.
+"""
 MEGA = np.float32(1e-6)
 SMOOTH = np.float32(0.01)
-"""MPa^2: below 1 bar an orifice turns laminar, so that its root has a finite slope."""
+"""Smoothing of the orifice equation in MPa^2. Flow becomes laminar below 1 bar, so the root has a finite slope."""
 RELIEFS = np.array([25.0, 30.0, 33.0, 36.0, 38.0], np.float32)
-"""MPa: beyond these pressures flow through a port relief may grow."""
+"""Pressures in MPa above which the flow through a port relief valve may rise."""
 CAVITY = np.float32(0.1)
-"""MPa that are added where free air makes oil soft: the pressure of the atmosphere."""
+"""Pressure in MPa added in the oil-stiffness term for free air: atmospheric pressure."""
 EMPTY = np.float32(0.8)
-"""MPa below which a chamber may be drawn empty."""
+"""Chamber pressure in MPa below which cavitation is possible."""
 BEGUN = 0.01
-"""Fraction of its largest opening above which a path counts as open."""
+"""Fraction of its largest opening above which a flow path counts as open."""
 DOUBTS = 8
-"""Terms of the width; see `doubts_of`."""
+"""Number of terms of the uncertainty; see `doubts_of`."""
 LINES = 9 + len(RELIEFS)
-"""Terms without a spool; see `lines_of`."""
+"""Number of terms that do not depend on a spool; see `lines_of`."""
 BACK = 2
-"""Ticks by which a balance lags: the rate of a pressure at a tick needs two ticks on either side."""
+"""Delay of a balance in samples. The pressure rate at a sample needs two samples on either side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +46,7 @@ class SpoolModel:
     Attributes:
         extend: place of the command that extends, among the inputs, shape (spools,).
         retract: index of the command that retracts; -1 if one signed channel commands both directions.
-        gain: one over the full command, shape (spools,).
+        gain: inverse of the full command of each spool, shape (spools,).
         dead: dead time in ticks, shape (spools,).
         stages: b1, b2, a1, a2 of each stage, shape (spools, 2, 4).
         play: half width, as a share of travel, shape (spools,).
@@ -168,7 +170,7 @@ class ChamberPlaces:
 
     Attributes:
         velocity: index of the velocity of its cylinder.
-        own: its pressure.
+        own: index of the chamber's pressure.
         other: index of the pressure of the opposite chamber.
         stroke: -1 where there is none.
         supplies: pressures of the pumps.

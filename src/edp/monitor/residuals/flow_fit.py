@@ -28,29 +28,32 @@ from edp.monitor.residuals.flow_curves import (
 from edp.signals import Kind
 
 Curves = tuple[Singles, Singles, Singles, Singles]
-"""Values, slopes, lines and doubts of a chamber."""
+"""Values and slopes of the opening curves, linear terms and uncertainty terms of a chamber."""
 Fitted = tuple[ChamberPlaces, Singles, Singles, Singles, Singles]
 START = (0.045, 7.0, 0.01)
-"""Dead time in s, Hz and play of a usual electrohydraulic valve, from which the search begins."""
+"""Initial values of the search: dead time in s, natural frequency in Hz and backlash of a typical electrohydraulic
+valve.
+"""
 SECOND_LATER = 0.015
-"""s by which the spool of the second pump begins later in that start."""
+"""Additional dead time of the second pump's spool in the initial values, s."""
 LEAST, MOST = (0.0, 1.0, 0.0), (0.4, 40.0, 0.2)
-"""Bounds of the search; frequencies end at a third of the rate, too."""
+"""Lower and upper bounds of the search. Frequencies are also limited to a third of the sample rate."""
 SEARCHED_TICKS, SEARCHED_ROWS = 120_000, 16_000
-"""Numbers of samples and of compared rows in the search: evenly spaced rows of twenty minutes at 100 Hz."""
+"""Maximum numbers of samples and of compared rows in the search: evenly spaced rows of twenty minutes at 100 Hz."""
 RIDGE = 1e-6
 GROSS = 8.0
-"""Median sizes beyond which a tick does not count in the second round: at end stops nothing of this holds."""
+"""Residual, relative to the median size, above which a sample is left out of the second round. At end stops the flow
+model is invalid.
+"""
 CUSHION = 0.06
-"""Length of a cushion as a share of the stroke that was seen."""
+"""Length of an end-stop cushion as a fraction of the observed stroke."""
 OIL = "OilTemperature"
 COVERED = (0.01, 0.99)
-"""Quantiles of a session's temperature: a thermometer has single values that are wrong."""
+"""Quantiles that define the temperature range of a session. They exclude single wrong readings."""
 BEYOND_K = 5.0
-"""Kelvin beyond the learned temperatures within which balances still hold."""
+"""Margin in K around the training temperatures within which balances are still valid."""
 MIN_TANK = 0.005
-"""Fraction of all pressures below which the pressure of the return line is estimated, to which an emptied chamber
-falls."""
+"""Quantile of all pressures that estimates the return-line pressure, the lowest pressure of an emptied chamber."""
 
 
 def fit_chambers(
@@ -190,7 +193,7 @@ def _stretch(sessions: Sequence[Singles], axis: Axis, names: Sequence[str]) -> l
 
 
 Part = tuple[list[tuple[Singles, Singles]], list[Singles], Singles, Singles, Singles]
-"""Paths, lines, velocity, rows and rates."""
+"""Flow paths as (spool travel, drive) pairs, linear terms, velocity, measured rows, and their rates of change."""
 
 
 def _terms(

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from edp.signals import EXTRA_CHANNELS, FAULT_CHANNELS, GROUND_CHANNELS, MOTOR_CHANNELS, TABLE_A1, Channel, Kind
 
 SENSED = ("PumpPressure_1", "PumpPressure_2", "CylStroke_1", "CylStroke_2", "CylStroke_3", "OilTemperature")
-"""Channels of `EXTRA_CHANNELS` for which a machine may have sensors. Only a simulation knows the others."""
+"""Channels of `EXTRA_CHANNELS` for which a real machine may have sensors. The others exist only in simulation."""
 MOTION = (Kind.VELOCITY, Kind.ACCELERATION, Kind.POSITION)
 TURNING = (Kind.ANGULAR_VELOCITY, Kind.ANGLE)
 MAX_SINGLE = 24
-"""Channels up to which each is a group of its own; beyond them kinds are."""
+"""Maximum number of channels for one group per channel. With more channels, each kind is a group."""
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from edp.signals import Channel, Kind
 from edp.training.bundle import Bundle
 
 SMALLEST_WIDTH = 1e-9
-"""Minimum width of an interval, in SI units. A closed interval is not a scale."""
+"""Minimum width of an interval, in SI units, because a width of zero cannot scale residuals."""
 
 
 class LookAhead(ResidualSource):
@@ -181,7 +181,7 @@ class LookAheadSpec(CommitteeOptions, ResidualSpec):
 
 
 AHEAD = (Kind.VELOCITY, Kind.ANGULAR_VELOCITY, Kind.PRESSURE, Kind.FLOW, Kind.FORCE)
-"""Kinds that dynamics tell ahead; accelerations are mostly noise, positions follow from velocities."""
+"""Kinds that the network predicts. Accelerations are mostly noise, and positions follow from velocities."""
 MAX_TARGETS = 64
 MINUTES_SHARE = 0.2
-"""Fraction of the time of all fits for the look-ahead network."""
+"""Fraction of the fitting time that the look-ahead network may take."""

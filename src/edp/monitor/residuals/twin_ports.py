@@ -25,7 +25,7 @@ from edp.settings.bounds import above, check_bounds
 from edp.training.twin_bundle import TwinBundle
 
 MAX_PERIOD = 10_000_000
-"""Ticks between two measured ones."""
+"""Maximum number of samples between two measured samples."""
 
 
 class TwinPorts(ResidualSource):

@@ -26,9 +26,9 @@ Array = NDArray[np.float64]
 JOINTS = ("boom", "arm", "bucket")
 FRAMES_PER_S = 25.0
 LONGEST_S = 600.0
-"""Longest segment on one page; longer ones would make it slow to open."""
+"""Maximum duration of a segment on one page, s. Longer segments would make the page slow to open."""
 OUTSIDE = 0.03
-"""How far (m) beyond its stops a stroke may be logged: stops give way, and sensors err."""
+"""Tolerance in m for logged strokes outside the end stops, because stops are elastic and sensors have errors."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,10 +13,10 @@ Points = NDArray[np.float64]
 Colour = tuple[int, int, int]
 # Pillow draws hard edges; the mean of 2 x 2 samples is as smooth as a film of this size needs.
 FINE = 2
-"""Samples per pixel and direction."""
+"""Number of samples per pixel in each direction."""
 # Capitals of Pillow's default font are 0.7 of its size high.
 FONT_PER_CELL = 7
-"""Font size in pixels for each unit of a label's size, whose capitals are five pixels high."""
+"""Font size in pixels per unit of a label's size. Capitals are five pixels high."""
 
 
 class Image:

@@ -17,12 +17,12 @@ INK, SOFT, RULE, FRAME = "#26303a", "#66717d", "#e4e8ec", "#c4cbd2"
 BLUE, GREY, DROPPED = "#0b57d0", "#3c4650", "#b4bcc5"
 MUTED = ("#c9892f", "#5a9c8c", "#a97da0", "#8b929a", "#a5a04a", "#b9705c")
 SHADES = (*MUTED, GREY)
-"""Colours of series that are equals: the network's blue is not among them."""
+"""Colours of equivalent series. The blue of the network is excluded."""
 LINES = (BLUE, *SHADES)
 DASHES: tuple[Dash, ...] = ("solid", "dash", "dot", "dashdot")
 SEQUENTIAL = ("#f7fafe", "#b7d0f7", "#6d9fec", "#2567d3", "#062c74")
 DIVERGING = ("#7a4a06", "#d79a3c", "#ffffff", "#6d9fec", "#062c74")
-"""Negative in the muted orange of the house, positive in its blue; equal steps look equally strong."""
+"""Diverging colour scale: orange for negative values, blue for positive values, with perceptually equal steps."""
 ROUND_TICKS = tuple((float(step * 10**power), f"{step * 10 ** (power % 3)}{unit}")
                     for power, unit in zip(range(1, 10), ("", "", "k", "k", "k", "M", "M", "M", "G"))
                     for step in (1, 2, 5))  # fmt: skip
@@ -31,7 +31,7 @@ ROUND_TICKS = tuple((float(step * 10**power), f"{step * 10 ** (power % 3)}{unit}
 Dash = Literal["solid", "dash", "dot", "dashdot"]
 Symbol = Literal["", "circle", "ring", "diamond", "square", "triangle", "x", "cross", "star", "tick", "dash"]
 SYMBOLS: tuple[Symbol, ...] = ("diamond", "square", "triangle", "x", "cross", "star")
-"""Symbols of series that are equals: colour is never the only difference."""
+"""Symbols of equivalent series, so that they do not differ in colour only."""
 Values = Sequence[float | None] | NDArray[np.floating]
 Positions = Sequence[float | None] | Sequence[str] | NDArray[np.floating] | NDArray[np.integer]
 

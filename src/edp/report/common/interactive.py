@@ -46,7 +46,7 @@ LEGENDS = {
     "none": {},
 }
 Trace = dict[str, object]
-"""A trace in plotly's words."""
+"""Trace of a figure as in plotly's JSON."""
 _FIELD = re.compile(r"\{(x|y|z|label)(?::([^{}]*?)(g?))?\}")
 
 

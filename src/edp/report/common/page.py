@@ -17,7 +17,7 @@ from edp.table import Table
 from edp.wording import unbroken
 
 DRAWING = ("figure_axes.js", "figure_marks.js", "figures.js")
-"""Draw the figures of a page from plotly's description of each; plotly has 4.8 MB and takes a second to start."""
+"""Scripts that draw figures from their plotly description. Plotly itself has 4.8 MB and takes a second to load."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Subsection:
 
 
 Part = str | Markup | Paragraph | Points | Terms | Fold | Subsection | Table | Chart
-"""Plain text explains what follows, `Markup` is HTML of its own."""
+"""Part of a page. Plain text explains the next part; `Markup` is HTML."""
 
 
 @dataclass(frozen=True)
@@ -88,10 +88,10 @@ class Section:
     """A section of a page.
 
     Attributes:
-        name: its address on the page.
-        title: its heading.
-        parts: one below the other. None, tables and lists without rows, and sections, folds and groups with nothing but
-            explaining text are left out.
+        name: anchor of the section on the page.
+        title: heading of the section.
+        parts: parts of the section, from top to bottom. The page omits None, tables and lists without rows, and
+            sections, folds and groups that contain only explaining text.
         link: short title in the navigation; the title if empty.
     """
 

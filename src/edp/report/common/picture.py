@@ -43,9 +43,9 @@ __all__ = ["BLUE", "DROPPED", "INK", "NOT_XML", "draw_png", "file_name", "write_
 DPI = 150
 FORMATS = ("svg", "png")
 NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-"""Characters that XML 1.0 does not have, not even escaped; a channel's name may hold them."""
+"""Pattern of characters that XML 1.0 forbids even as escapes. Channel names may contain them."""
 POINTS = 0.66
-"""Points of a picture for a pixel of a page: 9 points of text stand beside lines that suit 13 pixels."""
+"""Points of a picture per pixel of a page: 9-point text fits lines designed for 13 pixels."""
 MOST_TICKS = 8
 DASHES = {"solid": "-", "dash": "--", "dot": ":", "dashdot": "-."}
 STEPS = {"": "default", "after": "steps-post", "middle": "steps-mid"}

@@ -27,7 +27,7 @@ from edp.report.run.figures import log_ticks
 from edp.wording import figure, short_labels
 
 MAX_ROWS = 40
-"""Recordings that have a row of dots."""
+"""Maximum number of recordings with their own row of dots."""
 
 
 def compare_charts(comparison: Comparison) -> list[Chart]:

@@ -11,7 +11,7 @@ from edp.table import Column, Table, Value, chance, figures
 from edp.wording import count_text, number, percent
 
 SHOWN_ERRORS = 4
-"""Tables of errors that are shown from the beginning."""
+"""Number of error tables that are expanded initially."""
 
 
 def build_compare_page(comparison: Comparison, title: str = "") -> Page:

@@ -18,12 +18,12 @@ from edp.stats.resampled import paired_t
 from edp.wording import figure, listed, number, percent
 
 FEWEST = 3
-"""Common recordings from which an interval over recordings is given: two leave one degree of freedom."""
+"""Minimum number of common recordings for an interval over recordings. Two recordings leave one degree of freedom."""
 BLOCK_S = 10.0
-"""Length of a block: movements of an excavator take 2 to 5 s, so errors of neighbouring blocks hardly go together."""
+"""Length of a block in s. Excavator movements take 2 to 5 s, so neighbouring blocks have nearly uncorrelated errors."""
 FEWEST_BLOCKS = 6
 NAMED = 3
-"""Runs that the headline names."""
+"""Maximum number of runs in the headline."""
 Array = NDArray[np.floating]
 
 

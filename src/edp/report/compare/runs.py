@@ -23,7 +23,7 @@ from edp.storage.runs import describe_unfinished
 from edp.wording import figure, unit_text
 
 MAX_RUNS = 12
-"""Beside each other: more lines than that nobody tells apart."""
+"""Maximum number of compared runs. More lines are not distinguishable in a chart."""
 MEAN = "mean over outputs"
 LOOK_AHEAD, FREE = "looks ahead", "runs free"
 HEADER = "twin/twin.json"

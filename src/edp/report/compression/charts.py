@@ -28,7 +28,7 @@ STAGES: tuple[tuple[str, str, Symbol, float, str], ...] = (
     ("before", "MAE in float32", "ring", 13, GREY),
     ("scores", "MAE in its format", "circle", 7, BLUE),
 )
-"""Key of the scores, name, symbol, its size and its colour."""
+"""Stages of a compression: key in the scores, name, symbol, symbol size and colour."""
 
 
 def profile_chart(facts: CompressionResult) -> Chart:

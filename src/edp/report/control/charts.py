@@ -25,7 +25,7 @@ Array = NDArray[np.floating]
 LOOP = "loop"
 DIGITS = 5
 MAX_DRAWN = 1_500
-"""Points of a line: more than a page's width resolves."""
+"""Maximum number of points of a line, above the resolution of a page."""
 AXES = ("Boom", "Arm", "Bucket")
 
 

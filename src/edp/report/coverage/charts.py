@@ -27,10 +27,10 @@ from edp.report.common.chart import (
 from edp.wording import figure, label_by_name
 
 MAX_AXIS = 22
-"""Characters of a name beside a panel, three of which stand in a row."""
+"""Maximum number of characters of an axis name. Three panels form a row."""
 TINT = "#eef4fe"
 SCALE = (TINT, "#b7d0f7", "#6d9fec", "#2567d3", "#062c74")
-"""One hue from the page's tint to dark: more samples, more ink; empty cells stay white."""
+"""Colour scale of one hue from light to dark. Darker cells have more samples; empty cells are white."""
 GROUPS = {
     "command": "joint_command",
     "head pressure": "joint_head",
@@ -38,7 +38,7 @@ GROUPS = {
     "velocities": "joint_velocities",
 }
 DECADES = 4
-"""Decades of a scale of shares: below the fourth a cell is as good as empty."""
+"""Number of decades of the colour scale for fractions. Cells below them are practically empty."""
 
 
 def coverage_charts(coverage: Coverage) -> list[Chart]:

@@ -11,7 +11,7 @@ from edp.table import Column, Table
 from edp.wording import MISSING, count_text, figure, number, percent
 
 SHOWN_CHANNELS = 400
-"""Rows of the table of channels; the rest is in the JSON."""
+"""Maximum number of rows of the channel table. The JSON file lists all channels."""
 
 
 def quality_section(quality: DataQuality) -> Section:

@@ -14,15 +14,15 @@ from edp.wording import figure, number, percent
 
 WORST = 10
 SURE_T = 4.0
-"""Welch's t from which a drift is told: by chance one machine in 30,000, where blocks are independent."""
+"""Minimum Welch t for a drift. By chance, one machine in 30,000 exceeds it if blocks are independent."""
 DRIFTS = 1.15
-"""Ratio of the error of both halves from which a drift is worth a word."""
+"""Minimum ratio of the errors of both halves for a reported drift."""
 FAR = 4.0
-"""Robust deviations from the fleet's median from which an input is told as unusual."""
+"""Distance from the fleet's median, in robust standard deviations, above which an input is reported as unusual."""
 LARGER = 1.3
-"""Times the fleet's median from which an error or a speed is told as large."""
+"""Multiple of the fleet's median above which an error or a speed is reported as large."""
 NORMAL = 1.4826
-"""Of the median absolute deviation to a standard deviation."""
+"""Ratio of the standard deviation to the median absolute deviation of a normal distribution."""
 
 
 @dataclass(frozen=True)

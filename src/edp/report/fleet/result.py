@@ -94,7 +94,7 @@ class ReportedMachine:
     """A machine of a fleet report.
 
     Attributes:
-        machine: its name.
+        machine: name of the machine.
         minutes: duration of its recordings.
         errors: None if it could not be evaluated.
         failed: why it could not.

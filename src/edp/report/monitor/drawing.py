@@ -20,19 +20,21 @@ from edp.wording import label_by_name, number
 FloatArray = NDArray[np.float32]
 WIDTH = 960
 LEFT, RIGHT = 200, 34
-"""Pixels beside the drawing: names of groups, and half of the last tick's text."""
+"""Margins of the drawing in pixels: group names on the left, half of the last tick label on the right."""
 POINTS, CELLS, OVERVIEW_CELLS = 640, 320, 160
-"""Most points of a line, and cells of a row: finer ones are pooled by their largest value; a page stays small."""
+"""Maximum number of points of a line, cells of a row, and cells of an overview row. Finer data are pooled by their
+maximum, which keeps the page small.
+"""
 PLOT_HEIGHT, ROW, TICKS_ROOM = 170, 17, 26
 MAX_RATIO = 3.0
-"""Statistic over limit where a line is cut off."""
+"""Maximum displayed ratio of a statistic to its limit."""
 LEVELS = (1.5, 2.0, 3.0, 5.0)
-"""Ends of the steps of a group's level, healthy below the first."""
+"""Boundaries between the levels of a group. A group below the first boundary is healthy."""
 SHADES_OF_LEVELS = ("#f1f4f7", "#dbe7fb", "#9dbff5", "#e0a458", "#b3261e")
 MISSING_SHADE = "#ffffff"
 MAX_EVIDENCE = 10
 MAX_ROWS = 120
-"""Recordings of the overview."""
+"""Maximum number of recordings in the overview."""
 MARKS = {"stop": "#b3261e", "warning": "#8f5c10", "note": "#2f7566"}
 TINTS = {"stop": "#f7dcda", "warning": "#f8ead6", "note": "#e0efeb"}
 

@@ -18,14 +18,14 @@ from edp.table import Column, Table, Value, figures
 from edp.wording import MISSING, count_text, label_by_name, listed, number, short_labels
 
 MAX_ALARMS = 40
-"""With evidence each on a page, alarms that say the same as one; all of them stand in the log."""
+"""Maximum number of alarms with evidence on a page. Equal alarms count as one; the log lists all alarms."""
 MAX_CAUSES = 5
 MAX_ENTRIES = 64
 """Maximum number of causes, and of segments of evidence, per alarm."""
 MAX_SILENT = 6
 MAX_REMARKS = 6
 OUTSIDE = "no alarm, but "
-"""Beginning of a remark on residuals outside of their healthy range."""
+"""Beginning of a remark on residuals outside their healthy range."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class AlarmFacts:
     """One alarm.
 
     Attributes:
-        recording: its name.
+        recording: name of the recording.
         raised_s: time of the alarm; `since_s` is the estimated start of the change, s from the start.
         detector: detector of the alarm.
         statistic: statistic that exceeded `limit`.

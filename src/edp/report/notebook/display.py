@@ -14,7 +14,7 @@ from edp.report.common.interactive import plot
 from edp.report.common.picture import draw_png
 
 DPI = 100
-"""Keeps a figure of a notebook below about 100 kB."""
+"""Resolution of notebook figures in dots per inch, which keeps a figure below about 100 kB."""
 PLOTLY = "application/vnd.plotly.v1+json"
 
 

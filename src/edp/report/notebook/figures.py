@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import plotly.graph_objects as go
 
 POINTS = 4000
-"""Of a drawn line; longer ones lose samples, but no peaks."""
+"""Maximum number of points of a line. Longer lines are thinned without loss of peaks."""
 Array = NDArray[np.floating]
 
 

@@ -14,7 +14,7 @@ from edp.table import Table
 from edp.wording import printable
 
 TERMINAL = 80
-"""Characters of a line that every terminal shows."""
+"""Line width in characters that every terminal supports."""
 _GAP = "  "
 _CELL = "padding:2px 10px;text-align:"
 

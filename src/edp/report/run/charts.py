@@ -35,9 +35,9 @@ from edp.signals import display_offset
 from edp.wording import figure, label_by_name, short_labels
 
 MAX_PANELS, MAX_SERIES = 6, 7
-"""Units that have a panel, and signals in one: more lines nobody tells apart."""
+"""Maximum number of panels (one per unit), and of signals per panel. More lines are not distinguishable."""
 POINTS = 1500
-"""Points of a drawn signal."""
+"""Maximum number of points of a signal."""
 DOTS_AT_MOST = 40  # recordings; above that a rank curve, names on hover
 
 

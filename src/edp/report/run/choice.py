@@ -17,7 +17,7 @@ from edp.table import Column, Table
 from edp.wording import MISSING, decimals_for, number, percent
 
 FLOOR, PERSISTENCE = "linear", "persistence"
-"""What a skill is relative to: the candidate whose bundle lies in a folder of this name, or the present value."""
+"""References of a skill score: the candidate whose bundle folder has this name, or the present value."""
 Errors = Mapping[str, Mapping[str, float]]
 """Root-mean-square errors by horizon and target."""
 

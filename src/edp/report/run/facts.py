@@ -29,11 +29,11 @@ from edp.wording import decimals_for, figure, interval, interval_decimals, liste
 NETWORK = "network"
 TRUTH = "truth"
 LOW, HIGH = "network_low", "network_high"
-"""Ends of the network's interval, beside its prediction."""
+"""Names of the interval's lower and upper end in the arrays of a recording."""
 INPUTS = "inputs"
-"""Raw signals of one recording, ``(time, channel)``, SI."""
+"""Name of the raw signals of a recording, shape ``(time, channel)``, SI units."""
 NO_MODELS = frozenset((TRUTH, LOW, HIGH, INPUTS))
-"""What of the arrays kept of a recording is no prediction."""
+"""Names in the arrays of a recording that are not predictions."""
 MAKERS = {
     "config.toml": "edp train",
     "provenance.json": "edp train",

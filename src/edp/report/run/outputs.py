@@ -16,11 +16,11 @@ from edp.storage.paths import is_file_at
 from edp.wording import behind, listed, number, percent
 
 SHOWN = 4
-"""Outputs or logs that a sentence names."""
+"""Maximum number of outputs or logs named in a sentence."""
 NOTED = 2.0
-"""Times that changes differ from those in training before the ratio is what is said of them."""
+"""Ratio between the changes in test and training data from which the ratio is reported."""
 FEW = 3
-"""Test logs below which one odd log decides the figure."""
+"""Minimum number of test logs. With fewer logs, one unusual log determines the result."""
 
 
 def losses_line(scores: ScoresFile) -> str:

@@ -30,7 +30,7 @@ MODELS = (
     "stands where nothing was measured."
 )
 MAX_OPEN = 3
-"""Tables of models that are shown from the beginning."""
+"""Number of model tables that are expanded initially."""
 
 
 def build_report(

@@ -14,9 +14,9 @@ from edp.table import Column, Table
 from edp.wording import number
 
 MIN_LAGS, LAGS_PER_HORIZON, MAX_LAGS = 40, 3, 400
-"""Lags of the correlogram: enough beyond the horizon to see a rhythm, few enough to draw."""
+"""Number of lags of the correlogram: minimum, per horizon sample, maximum. It shows periodicity beyond the horizon."""
 WHITE = 2.576
-"""Standard errors that hold 99 % of the correlations of white noise."""
+"""Half-width of the 99 % interval of white-noise correlations, in standard errors."""
 
 
 def fit_table(facts: Facts) -> Table | None:

@@ -34,11 +34,11 @@ WORDS = {
     "end_stop": "near an end stop",
     "other": "none of these",
 }
-"""How a table calls what `edp.evaluation.by_situation` tells apart."""
+"""Names of the situations of `edp.evaluation.by_situation` in tables."""
 
 FITS, EXCEEDS = "✓ fits", "✗ exceeds"
 _TILES = 3
-"""Outputs that have a tile of their own where they have no common unit."""
+"""Maximum number of outputs with their own tile if they have no common unit."""
 
 
 def comparison_tables(facts: Facts) -> list[Table]:

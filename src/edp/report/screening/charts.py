@@ -48,9 +48,9 @@ if TYPE_CHECKING:
     from edp.data.screening import ScreeningResult
 
 FIGURES_IN_CELLS = 32
-"""Channels up to which a cell is large enough for its value."""
+"""Maximum number of channels for which cells show their value."""
 LARGE = 60
-"""Channels from which hairlines and names take more room than there is."""
+"""Number of channels above which grid lines and names no longer fit."""
 
 
 def screening_charts(screening: ScreeningResult) -> list[Chart]:

@@ -22,7 +22,7 @@ MEASURES = {
     "pearson": "Pearson correlation",
     "kendall": "Kendall rank correlation",
 }
-"""Measures of dependence, the thesis's two figures first."""
+"""Measures of dependence. The two measures shown in the thesis come first."""
 METRICS = {**MEASURES, "lag": "Best lag"}
 UNITS = {"information": "nat", "lag": "samples"}
 MAX_CURVES = 16

@@ -20,7 +20,7 @@ GROUPS = {
     "Physics constraint": ("physics_residual",),
     "Output head": ("deeper_head", "glu_head", "stanh"),
 }
-"""The thesis's order of Table 4.5."""
+"""Groups of modules in the order of the thesis, Table 4.5."""
 OTHER = "Other"
 
 

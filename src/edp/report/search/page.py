@@ -19,7 +19,7 @@ from edp.table import Table
 from edp.wording import escape_markdown, number
 
 MAX_IN_A_LINE = 4
-"""Sentences of a decision that are shown as text; more are a list."""
+"""Maximum number of sentences of a decision that form a paragraph. More sentences form a list."""
 VARIANCE = (
     "Every run of phase 0 in the same order of folds. A line joins the seeds of a run, a bar is the arm's mean: folds "
     "that lie apart are split variance, long lines are seed variance. Where all arms rise and fall together, only "

@@ -42,7 +42,7 @@ class ArmView:
         backbone, features: backbone and features of the arm.
         chosen: whether its feature set goes on.
         scores: score of each run by seed.
-        composite: its spread.
+        composite: spread of the composite score.
         mae: score of the mean absolute error.
     """
 

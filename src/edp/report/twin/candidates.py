@@ -10,7 +10,7 @@ from edp.storage.paths import is_file_at
 from edp.table import Column, Table, Value, figures
 
 MAX_CANDIDATES = 100
-"""Rows that are read; a choice leaves a dozen."""
+"""Maximum number of rows read. A selection has about a dozen candidates."""
 
 
 def read_candidates(folder: str | Path) -> tuple[CandidateRow, ...]:

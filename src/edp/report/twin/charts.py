@@ -32,11 +32,11 @@ from edp.wording import figure, label_by_name
 
 RECORDING, MODEL, COMMAND = "recording", "model", "command"
 MAX_PANELS = 6
-"""Panels of step responses."""
+"""Maximum number of panels of step responses."""
 DIGITS = 4
-"""Significant digits of drawn values: more than a picture shows, a third of the bytes."""
+"""Number of significant digits of plotted values, which is above the resolution of a picture and saves bytes."""
 MAX_DRAWN = 4_000
-"""Points of a line: more than a picture's width resolves."""
+"""Maximum number of points of a line, above the resolution of a picture."""
 KINDS_DRAWN = {
     "velocities": (Kind.VELOCITY, Kind.ANGULAR_VELOCITY),
     "strokes": (Kind.POSITION, Kind.ANGLE),

@@ -40,7 +40,7 @@ from edp.wording import figure, listed, number, percent, short_labels
 
 SITUATIONS = {"end_stops": "at an end stop", "rest": "at rest (idling)", "motion": "in motion"}
 MAX_ROWS = 40
-"""Recordings of a table, the worst first: nobody reads more."""
+"""Maximum number of recordings in a table, the worst first."""
 PLAIN_UNIT = "1"
 
 

@@ -18,7 +18,7 @@ from edp.storage.reading import object_with, parse_json
 
 SCHEMA = 1
 UNREAD = ("cli", "data/screening", "front", "report", "stats", "testing", "workflows")
-"""Folders whose code decides no result of a training."""
+"""Folders whose code does not affect the result of a training."""
 READ = (
     "stats/metrics.py",
     "workflows/compression",
@@ -26,7 +26,7 @@ READ = (
     "workflows/search/smaller.py",
     "workflows/search/trainings.py",
 )
-"""What of them does: scores, and what a search trains."""
+"""Exceptions within `UNREAD`: code for scores and for the trainings of a search, which does affect results."""
 
 
 class TrainingStatus(StrEnum):
@@ -34,17 +34,17 @@ class TrainingStatus(StrEnum):
 
     DONE = "done"
     FAILED = "failed"
-    """An error in the training; the same again would fail again."""
+    """Status of a training that raised an error. A repetition would raise the same error."""
     DIVERGED = "diverged"
-    """A loss or score was not finite; a comparison counts it as the worst, and leaves no pair out."""
+    """Status of a training with a non-finite loss or score. Comparisons count it as the worst result."""
     OOM = "oom"
     TIMEOUT = "timeout"
     LOST = "lost"
-    """Its process was killed again and again; nothing is known of the training itself."""
+    """Status of a training whose process was killed repeatedly. The quality of the training is unknown."""
 
 
 FINAL = frozenset(TrainingStatus) - {TrainingStatus.LOST}
-"""What is not tried again; a lost training is, when the search is started again."""
+"""Statuses of trainings that are never repeated. A lost training is repeated when the search is started again."""
 
 
 def canonical(value: Any) -> str:
@@ -213,9 +213,9 @@ def body_of(data: bytes) -> bytes:
 
 
 PARTS = ("schema", "key", "identity", "status", "result", "message", "measured")
-"""Of a record in its file."""
+"""Keys of a record in its JSON file."""
 RECORD_BYTES = 16 * 2**20
-"""Most that the file of a record has; a result is some hundred numbers."""
+"""Maximum size of a record file in bytes. A typical result has some hundred numbers."""
 START, BEFORE = b'{"checksum":"', b'","record":'
 HEAD = len(START) + 32 + len(BEFORE)
 

@@ -15,7 +15,7 @@ from edp.storage.writing import write_bytes
 SUFFIX = ".state"
 START = b"edp state 1 "
 STATE_BYTES = 4 * 2**30
-"""Most that the file of a state has: weights and optimiser of a network of 300 million parameters."""
+"""Maximum size of a state file in bytes: weights and optimiser state of a network with 300 million parameters."""
 
 
 @dataclass(frozen=True)

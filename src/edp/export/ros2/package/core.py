@@ -18,13 +18,13 @@ from time import perf_counter
 HERE = Path(__file__).resolve().parent
 LIBRARY = "libcore.so"
 LATE_TICKS = 2.0
-"""Ticks after which a pressure is too old to be used."""
+"""Maximum age of a pressure in samples."""
 RATE_TOLERANCE = 0.1
-"""How far the median time between messages may be from a tick, as a share of it."""
+"""Maximum relative difference between the median message interval and the sample interval."""
 RATE_MESSAGES = 11
-"""Messages over which the rate is evaluated."""
+"""Number of messages over which the rate is evaluated."""
 LOOPED_S = 1.0
-"""A step back in time by more than this is another recording, not a late message."""
+"""Backward time step in s above which a new recording is assumed instead of a late message."""
 
 
 class CallStatus(IntEnum):
@@ -188,7 +188,7 @@ class Tick:
         status: status of the C code; None if the message gave no sample.
         valid: the prediction rests on this tick's inputs and on a whole window, at the network's rate.
         why: reason why the result is not valid.
-        missed: ticks that were missed before this one.
+        missed: number of samples that were missed before this sample.
         step_us: time of the C code, microseconds.
     """
 

@@ -13,7 +13,7 @@ from .core import Core
 from .tick_node import TickNode, run
 
 FIELDS = {"velocity": "velocity", "angular_velocity": "velocity", "position": "position", "angle": "position"}
-"""Where a target of a kind goes in a JointState; any other is an effort."""
+"""Field of a JointState message by kind of target. Other kinds use the field effort."""
 
 
 class PredictorNode(TickNode):

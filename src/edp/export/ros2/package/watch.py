@@ -15,9 +15,9 @@ from .core import HERE, Core, Tick
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 """Levels of a DiagnosticStatus."""
 HOLD_S = 60.0
-"""Time after an alarm for which it is reported: a fault that stays raises another."""
+"""Time in s for which an alarm is reported. A persistent fault raises another alarm."""
 SHOWN = 5
-"""Summaries that an alarm names."""
+"""Maximum number of summaries listed per alarm."""
 
 
 class MonitorCore(Core):

@@ -21,11 +21,11 @@ from edp.storage.unpacking import DEFLATE_RATIO, unpack_start
 _HEADER = 128
 _PACKED, _MATRIX = 15, 14
 _COPIES = 2
-"""An array is in memory as it was unpacked and as a column."""
+"""Number of copies of an array in memory: unpacked, and as a column."""
 _UNSTORED_BYTES = 1 << 20
 """Maximum size of an array beyond its stored bytes: HDF5 need not store values that were never written."""
 _MAX_OBJECTS = 1_000_000
-"""Objects of a file; a Simulink log of 1,000 signals has some 30,000."""
+"""Maximum number of objects in a file. A Simulink log of 1,000 signals has about 30,000."""
 _LINKS = {
     h5py.h5l.TYPE_SOFT: "a soft link",
     h5py.h5l.TYPE_EXTERNAL: "a link to another file",

@@ -11,13 +11,15 @@ import numpy as np
 from edp.logs.formats.matlab.library import MatlabOpaque
 
 _ONE = re.compile(r"(?P<variable>.+)\{(?P<number>[1-9][0-9]{0,5})\}")
-"""Name of one experiment: that of its variable and its number, as MATLAB takes one out of a cell."""
+"""Pattern of an experiment's name: variable name and number, as in a MATLAB cell index."""
 _MIN_ROWS, _MIN_FIELDS = 10, 2
-"""Rows that two fields of an experiment have in common at least; an element with one field of numbers is a channel."""
+"""Minimum number of common rows of two fields in an experiment, and minimum number of numeric fields. An element with
+one field is a channel.
+"""
 
 
 _EACH = ("InputData", "OutputData", "Ts", "Tstart", "SamplingInstants")
-"""Facts of an iddata that are cells with an entry an experiment."""
+"""Fields of an iddata object that are cells with one entry per experiment."""
 
 
 def experiment_names(variables: Mapping[str, object]) -> list[str]:

@@ -29,7 +29,7 @@ _TYPES |= {
     f"{sign}int{8 * size}": f"<{letter}{size}" for sign, letter in (("", "i"), ("u", "u")) for size in (1, 2, 4, 8)
 }
 _DEEPEST = 60
-"""Containers within containers; a Dataset has some ten."""
+"""Maximum nesting depth of containers. A Dataset has about ten levels."""
 
 
 def variable_names(path: Path) -> list[str] | None:

@@ -21,9 +21,9 @@ from edp.logs.formats.matlab.variables import INFO, MAGIC, MatVariables, is_v4
 from edp.storage.memory import announce
 
 COPIES = 8
-"""Memory a byte of unpacked variables: the libraries copy them several times."""
+"""Memory in bytes per byte of unpacked variables, because the libraries copy them several times."""
 OBJECT_BYTES = 8192
-"""Memory an HDF5 object in the library: handles, attributes and references."""
+"""Memory in bytes per HDF5 object in the library: handles, attributes and references."""
 
 
 def unpack(path: Path, variable: str | None = None) -> MatVariables:

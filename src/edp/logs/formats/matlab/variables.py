@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 MAGIC = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")
 INFO = "edp_info"
-"""The variable that holds EDP's data."""
+"""Name of the variable with EDP's metadata."""
 
 
 @dataclass
