@@ -106,7 +106,7 @@ def commands_page() -> str:
     parts = [
         "# Commands",
         "",
-        "Generated from the code, like `edp COMMAND --help`. `edp train DATA`, `edp search DATA` and `edp adapt RUN` are "
+        "Generated from the code. `edp train DATA`, `edp search DATA` and `edp adapt RUN` are "
         "the commands `run` of these groups.",
         "",
         "| Panel | Command | Does |",
