@@ -102,9 +102,9 @@ def identify(error: BaseException) -> str:
 
 
 def _find_sources(text: str) -> Iterator[Path]:
-    """Yield the source files with three consecutive words of a message; reading is much faster than parsing."""
+    """Yield the source files with two consecutive words of a message; reading is much faster than parsing."""
     words = text.split()
-    phrases = {" ".join(words[i : i + 3]) for i in range(max(len(words) - 2, 1))}
+    phrases = {" ".join(words[i : i + 2]) for i in range(max(len(words) - 1, 1))}
     for path in sorted(PACKAGE.rglob("*.py")):
         source = _read_text(path)
         if any(phrase in source for phrase in phrases):
