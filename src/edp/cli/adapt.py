@@ -22,7 +22,7 @@ app = typer.Typer(
     cls=RunByDefault,
     no_args_is_help=True,
     rich_markup_mode="markdown",
-    help="Add a correction that adapts on board. `edp adapt RUN --out DIR` is `edp adapt run ...`.",
+    help="Add an online correction to a trained network. `edp adapt RUN` is short for `edp adapt run RUN`.",
 )
 
 

@@ -84,7 +84,7 @@ def doctor(
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Check versions, optional parts, the sandbox, compilers, disk, memory and threads; print missing parts.
+    """Check the installation: versions, optional packages, sandbox, compilers, disk, memory and threads.
 
     Runs none of the programs it looks for. Ends with exit code 3 where something is broken that edp cannot do without.
 

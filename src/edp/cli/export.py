@@ -70,7 +70,7 @@ def export(
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Write a trained network in a form that runs without EDP; it reads and gives SI units.
+    """Export a model to C, FMU, Simulink, ROS 2, ONNX or CasADi, with inputs and outputs in SI units.
 
     Example: `edp export runs/first --format c --out firmware/predictor`
 

@@ -14,7 +14,7 @@ from edp.storage.paths import full_path
 
 app = typer.Typer(
     name="fleet",
-    help="Many machines under one network: which are worst and why, and the network of one of them.",
+    help="Evaluate one network on many machines, and fine-tune it for single machines.",
     no_args_is_help=True,
     rich_markup_mode="markdown",
 )

@@ -32,13 +32,19 @@ class Root(TyperGroup):
 
 
 class RunByDefault(TyperGroup):
-    """A group that also takes data directly: `edp search DATA ...` is `edp search run DATA ...`."""
+    """Group that also takes data directly: `edp search DATA ...` is `edp search run DATA ...`."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Return the named command, or `run`."""
         if args and args[0] not in self.commands:
             args = [RUN, *args]
         return super().resolve_command(ctx, args)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Print the help of the group, followed by the help of `run`, whose options the group takes."""
+        super().format_help(ctx, formatter)
+        run = self.commands[RUN]
+        run.format_help(run.context_class(run, info_name=RUN, parent=ctx), formatter)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse options before the data as options of `run`."""

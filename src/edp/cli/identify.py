@@ -34,7 +34,7 @@ def identify(
     repair: RepairOption = [],  # noqa: B006
     as_json: JsonFlag = False,
 ) -> None:
-    """Make the simulator's excavator yours: a machine file from logs of boom, arm and bucket.
+    """Calibrate the simulator: fit a machine file to logs of boom, arm and bucket.
 
     Valve curves, dead bands, leakage, friction, volumes, pumps, time constants, inertia and gravity are fitted to the
     logs; pins, lengths and bores are those of --machine, and so is what the logs do not tell, which is said number by

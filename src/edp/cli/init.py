@@ -36,7 +36,7 @@ def init(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there already.")] = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Propose which column is what, and what to predict; write a signal map and settings.
+    """Propose a signal map and settings for a folder of logs.
 
     Says how sure it is of each column and what to check. A channel that it is unsure of is taken as numbers without a
     unit. Only bounded parts of the logs are read.

@@ -76,7 +76,7 @@ def live(
     signal_map: MapOption = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Show a machine live in the browser: predictions and what then happened, residuals, alarms, side view.
+    """Show a machine live in the browser: predictions, measurements, residuals, alarms and a side view.
 
     Only who has the printed address sees the page; nothing on it moves a machine. Ctrl-C ends.
 

@@ -37,7 +37,7 @@ ALARM_HEADS = ["", "raised, s", "since, s", "severity", "alarms", ""]
 
 app = typer.Typer(
     name="monitor",
-    help="Watch a machine for faults of it and of its sensors, with a promised rate of false alarms.",
+    help="Detect faults of a machine and its sensors, with a specified false-alarm rate.",
     no_args_is_help=True,
     rich_markup_mode="markdown",
 )

@@ -18,7 +18,7 @@ RegistryArgument = Annotated[Path, typer.Argument(metavar="REGISTRY", help="Fold
 
 app = typer.Typer(
     name="registry",
-    help="Networks and fleets of deltas on disk, each with its lineage: which data, which base, which judge.",
+    help="Store trained networks with their history: data, base network and evaluation.",
     no_args_is_help=True,
     rich_markup_mode="markdown",
 )

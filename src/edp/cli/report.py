@@ -25,7 +25,7 @@ def report(
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Write one offline page: predictions, errors, baselines, footprint, settings; of a twin its free runs.
+    """Write an offline report page of a run: predictions, errors, baselines, footprint and settings.
 
     Example: `edp report runs/first`
     """

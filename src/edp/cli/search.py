@@ -29,7 +29,7 @@ app = typer.Typer(
     cls=RunByDefault,
     no_args_is_help=True,
     rich_markup_mode="markdown",
-    help="Search for the network: phases, tests and a report. `edp search DATA --out DIR` is `edp search run ...`.",
+    help="Search for the best network in tested phases. `edp search DATA` is short for `edp search run DATA`.",
 )
 
 

@@ -77,7 +77,7 @@ def simulate(
     open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Simulate recordings of an excavator: M22 in free air by default, or as a scenario file describes.
+    """Simulate recordings of an excavator, by default machine M22 in free air, or from a scenario file.
 
     Example: `edp simulate data/m22 --duration 90min --recordings 30 --seed 1`
 

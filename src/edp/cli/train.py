@@ -53,7 +53,7 @@ app = typer.Typer(
     cls=RunByDefault,
     no_args_is_help=True,
     rich_markup_mode="markdown",
-    help="Train a model on recordings. `edp train DATA --out RUN` is `edp train run ...`.",
+    help="Train a model on recordings. `edp train DATA` is short for `edp train run DATA`.",
 )
 app.command("finetune")(finetune.finetune)
 app.command("pretrain")(pretrain.pretrain)

@@ -162,7 +162,7 @@ def rollout(
     repair: RepairOption = [],  # noqa: B006
     as_json: JsonFlag = False,
 ) -> None:
-    """Run a twin along a log: measured up to a given time, then on the commands only.
+    """Simulate a plant model along a log: from a given time on, with the commands only.
 
     Prints the error by the time since then. Channels of the written file that end in _twin are the twin's, those
     that end in _twin_low and _twin_high are its intervals.
