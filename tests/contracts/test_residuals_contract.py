@@ -127,7 +127,7 @@ def test_a_bias_of_what_is_judged_shows(source, sessions):
 
 def test_a_source_of_a_sister_reads_and_judges_the_same(source, sessions):
     rows = rows_of(source, sessions[:1])
-    other = source.of_sister(np.random.default_rng(0), 0.02)
+    other = source.adjust_to_sister(np.random.default_rng(0), 0.02)
     assert (other.names, other.reads, other.inputs, other.delay) == (
         source.names,
         source.reads,
@@ -137,14 +137,14 @@ def test_a_source_of_a_sister_reads_and_judges_the_same(source, sessions):
     residuals, _ = other.run(rows, other.initial_state(1))
     assert np.isfinite(residuals).mean() > 0.9
     own, _ = source.run(rows, source.initial_state(1))
-    same, _ = source.of_sister(np.random.default_rng(0), 0.0).run(rows, source.initial_state(1))
+    same, _ = source.adjust_to_sister(np.random.default_rng(0), 0.0).run(rows, source.initial_state(1))
     # Numbers that are taken apart and put together again: to the last digits.
     np.testing.assert_allclose(same, own, atol=1e-3 * np.nanstd(own))
 
 
 def test_parts_give_the_same_source(source, sessions):
     rows = rows_of(source, sessions[:1])
-    again = type(source).of_parts(source.parts())
+    again = type(source).from_parts(source.parts())
     assert (again.names, again.judged, again.reads, again.units, again.inputs) == (
         source.names,
         source.judged,

@@ -228,7 +228,7 @@ def test_a_reward_is_what_its_weights_say():
     position, attitude = np.array([0.0, 0.02, 0.06]), np.array([0.0, -0.01, 0.03])
     travel, violated = np.array([0.0, 0.1, 0.2]), np.array([False, False, True])
     expected = [1.0 + 0.5, 0.5 + 0.25 - 0.2, 0.25 + 0.125 - 0.4 - 3.0]
-    assert weights.of_tick(position, attitude, travel, violated) == pytest.approx(expected)
+    assert weights.compute_reward(position, attitude, travel, violated) == pytest.approx(expected)
 
 
 def test_a_lost_tip_terminates_and_costs_what_was_said(spec):

@@ -12,7 +12,7 @@ import pytest
 import scipy.io
 
 from edp.export.c.model import make_model
-from edp.export.description import as_mat
+from edp.export.description import encode_mat
 from edp.export.escape import matlab_names
 from edp.export.golden import random_inputs, stream, tolerance
 from edp.export.simulink import native as native_file
@@ -35,7 +35,7 @@ def natives(structures, bundle_of, octave, top):
         made = Folder(make_model("arm", bundle), window=False)
         for file, text in made.texts().items():
             (folder / file).write_text(text)
-        (folder / "arm.mat").write_bytes(as_mat({**made.tables(), "inputs": inputs[:TICKS]}))
+        (folder / "arm.mat").write_bytes(encode_mat({**made.tables(), "inputs": inputs[:TICKS]}))
         outputs = stream(bundle.predictor, inputs)
         wanted[structure] = (f"n{number}", outputs[:TICKS], tolerance(bundle.predictor, inputs, outputs))
         lines += [f"addpath('{folder}'); net = arm_load();", "[y, status] = arm_stream(net, net.inputs);"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from edp.export.golden import TRIES, at_thresholds, golden_recording, random_inputs, stream, tolerance
+from edp.export.golden import TRIES, golden_recording, random_inputs, relax_at_thresholds, stream, tolerance
 from edp.workflows.parity.compare import golden_case
 
 TICKS, MET = 60, 40
@@ -32,7 +32,7 @@ def met(bundle_of):
 
 def test_only_ticks_at_a_threshold_are_allowed_a_step(met):
     predictor, inputs = met
-    steps = at_thresholds(predictor, inputs)
+    steps = relax_at_thresholds(predictor, inputs)
     assert steps.shape == (TICKS, len(stream(predictor, inputs)[0]))
     assert steps[MET].max() > 0.0
     assert np.count_nonzero(steps.max(axis=1)) == 1
@@ -73,7 +73,7 @@ def test_where_every_recording_has_one_the_step_is_allowed(met):
 
 def _least(predictor):
     """The draw whose largest step is the smallest, the first one of equals."""
-    steps = [at_thresholds(predictor, random_inputs(predictor, TICKS, seed), 1e-6).max() for seed in range(TRIES)]
+    steps = [relax_at_thresholds(predictor, random_inputs(predictor, TICKS, seed), 1e-6).max() for seed in range(TRIES)]
     return int(np.argmin(steps))
 
 
@@ -81,6 +81,6 @@ def _least(predictor):
 def test_networks_without_trees_have_one_tolerance_for_all_ticks(network, bundle_of):
     bundle = bundle_of(network)
     inputs = random_inputs(bundle.predictor, TICKS, seed=0)
-    assert not at_thresholds(bundle.predictor, inputs).any()
+    assert not relax_at_thresholds(bundle.predictor, inputs).any()
     np.testing.assert_array_equal(golden_recording(bundle.predictor, TICKS)[0], inputs)
     assert golden_case(bundle, TICKS, 0).allowed.ndim == 1

@@ -89,8 +89,8 @@ def test_levers_and_lengths_are_those_of_the_simulator_from_angles_and_from_stro
     shares[:2] = [[0, 0, 0], [1, 1, 1]]
     angles = np.array([kinematics.angles_at(row) for row in shares])
     truth = np.array([[linkage.cylinder(i, row[i], plant) for i in range(3)] for row in angles])
-    from_angles = geometry.at_angles(torch.from_numpy(angles))
-    from_strokes = geometry.at_strokes(torch.from_numpy(shares * axes[:, at.STROKE]))
+    from_angles = geometry.compute_pose_at_angles(torch.from_numpy(angles))
+    from_strokes = geometry.compute_pose_at_strokes(torch.from_numpy(shares * axes[:, at.STROKE]))
     for found in (from_angles, from_strokes):
         np.testing.assert_allclose(found.length.numpy(), truth[..., 0], rtol=0, atol=1e-9)
         np.testing.assert_allclose(found.lever.numpy(), truth[..., 1], rtol=0, atol=1e-9)
@@ -109,7 +109,7 @@ def test_masses_and_torques_are_those_of_the_simulator(machine):
     rng = np.random.default_rng(1)
     limits = pose.joint_limits(axes, plant)
     angles, rates = rng.uniform(limits[:, 0], limits[:, 1], (30, 3)), rng.normal(size=(30, 3))
-    found = geometry.at_angles(torch.from_numpy(angles))
+    found = geometry.compute_pose_at_angles(torch.from_numpy(angles))
     by_cosine, by_sine = geometry.couplings(found)
     own, coupling = geometry.masses(by_cosine)
     bias = geometry.gravity_torque(found) + geometry.coriolis_torque(by_sine, torch.from_numpy(rates))
@@ -192,7 +192,7 @@ def test_the_equation_of_motion_is_the_simulators(truth):
     geometry = Geometry().double()
     geometry.read("M22")
     row = torch.from_numpy(log)
-    found, rate = geometry.at_angles(row[:, at.PSI : at.PSI + 3]), row[:, at.RATE : at.RATE + 3]
+    found, rate = geometry.compute_pose_at_angles(row[:, at.PSI : at.PSI + 3]), row[:, at.RATE : at.RATE + 3]
     drag = np.array(
         [
             [

@@ -18,7 +18,7 @@ from edp.ir.w8a16.balance import balanced
 from edp.ir.w8a16.quantise import halves
 from edp.networks import trees as trees_file
 from edp.networks.trees import Trees
-from edp.training.tree_tables import below_or_equal, complete_tables, stack_tables
+from edp.training.tree_tables import complete_tables, round_down_to_single, stack_tables
 
 SIZES = st.tuples(st.integers(1, 6), st.integers(1, 3), st.integers(1, 5), st.integers(1, 4))
 """Width, outputs, trees, depth."""
@@ -117,13 +117,13 @@ def test_single_precision_compares_as_the_fitted_threshold(threshold, steps):
     x = np.float32(threshold)
     for _ in range(abs(steps)):
         x = np.nextafter(x, np.float32(np.copysign(np.inf, steps)))
-    assert (x > below_or_equal(threshold)) == (float(x) > threshold)
+    assert (x > round_down_to_single(threshold)) == (float(x) > threshold)
 
 
 def test_a_threshold_beyond_single_precision_is_never_exceeded_or_refused():
-    assert below_or_equal(np.inf) == below_or_equal(1e300) == np.float32(NEVER)
+    assert round_down_to_single(np.inf) == round_down_to_single(1e300) == np.float32(NEVER)
     with pytest.raises(ValueError, match="single precision does not hold"):
-        below_or_equal(-1e300)
+        round_down_to_single(-1e300)
 
 
 @pytest.fixture(scope="module")

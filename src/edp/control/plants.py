@@ -90,11 +90,11 @@ def bundle_of(run: str | Path, machine: Machine, rate_hz: float | None = None) -
                 "recordings of this one: edp twin LOGS --start RUN"
             )
     if rate_hz is not None:
-        of_rate(bundle.twin, f"twin '{run}'", rate_hz)
+        check_rate(bundle.twin, f"twin '{run}'", rate_hz)
     return bundle
 
 
-def of_rate(twin: Twin, what: str, rate_hz: float) -> Twin:
+def check_rate(twin: Twin, what: str, rate_hz: float) -> Twin:
     """Return the twin after a check of its sampling rate.
 
     Raises:

@@ -142,7 +142,7 @@ def as_json(content: Mapping[str, object]) -> bytes:
     return (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()
 
 
-def as_mat(variables: Mapping[str, object]) -> bytes:
+def encode_mat(variables: Mapping[str, object]) -> bytes:
     """Return variables as a MAT file (version 5) that is independent of the time of day.
 
     Lists become rows of numbers or cells.

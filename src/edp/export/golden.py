@@ -52,7 +52,7 @@ def tolerance(predictor: Predictor, inputs: Rows, outputs: Rows) -> Rows:
     sigma = predictor.code.width.detach().cpu().double().numpy().ravel()
     widths = np.tile(sigma, outputs.shape[1] // len(sigma))
     # Where PyTorch in single precision is itself far from double precision, no other form can be asked for more.
-    own = np.where(at_thresholds(predictor, inputs) > 0.0, 0.0, np.abs(outputs - exact)).max(axis=0)
+    own = np.where(relax_at_thresholds(predictor, inputs) > 0.0, 0.0, np.abs(outputs - exact)).max(axis=0)
     result: Rows = np.maximum(SHARE * (widths + np.abs(outputs).max(axis=0)), 2.0 * own).astype(np.float32)
     return result
 
@@ -94,7 +94,7 @@ def _compute_with_noise(graph: Graph, inputs: Rows, draw: np.random.Generator | 
     return np.asarray(rows)
 
 
-def at_thresholds(predictor: Predictor, inputs: Rows, near: float = NEAR) -> Rows:
+def relax_at_thresholds(predictor: Predictor, inputs: Rows, near: float = NEAR) -> Rows:
     """Return the additional tolerance at samples where rounding decides the branch of a tree.
 
     Args:
@@ -134,7 +134,7 @@ def golden_recording(predictor: Predictor, ticks: int) -> tuple[Rows, Rows, Rows
     # Fixed seeds: the same network gives the same recording, byte by byte.
     draws = (random_inputs(predictor, ticks, seed) for seed in range(TRIES))
     inputs, steps = min(
-        _take_until_clear((drawn, at_thresholds(predictor, drawn, NEAR_GOLDEN)) for drawn in draws),
+        _take_until_clear((drawn, relax_at_thresholds(predictor, drawn, NEAR_GOLDEN)) for drawn in draws),
         key=lambda draw: float(draw[1].max()),
     )
     outputs = stream(predictor, inputs)

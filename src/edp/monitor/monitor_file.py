@@ -200,7 +200,7 @@ def _sources(entries: Any, arrays: Table, path: Path) -> tuple[ResidualSource, .
             raise ValueError(f"a source has {len(networks)} networks; at most {MAX_NETWORKS} must hold")
         bundles = {name: read_network(path, value) for name, value in networks.items()}
         plain = object_with(entry["plain"], (), "a source")
-        sources.append(spec.source.of_parts(SourceParts(plain, arrays_under(arrays, f"source.{index}."), bundles)))
+        sources.append(spec.source.from_parts(SourceParts(plain, arrays_under(arrays, f"source.{index}."), bundles)))
     return tuple(sources)
 
 

@@ -46,7 +46,7 @@ def power(delta: float, variance: PairedVariance, sessions: int, runs: float, fo
         folds: into which the sessions are dealt.
         alpha: level of the test.
     """
-    error = math.sqrt(variance.of_mean(sessions, runs, sessions / folds))
+    error = math.sqrt(variance.compute_mean_variance(sessions, runs, sessions / folds))
     df = min(float(sessions), runs) - 1.0
     # No variance at all: any difference is seen.
     if error == 0.0:

@@ -142,7 +142,7 @@ class PairedVariance:
     run: float
     cell: float = 0.0
 
-    def of_mean(self, sessions: int, runs: float, cells_per_run: float) -> float:
+    def compute_mean_variance(self, sessions: int, runs: float, cells_per_run: float) -> float:
         """Return the variance of the mean difference: ``sigma_h^2 / R + (run + cell / cells) / n_runs``."""
         return self.session / sessions + (self.run + self.cell / cells_per_run) / runs
 

@@ -70,7 +70,7 @@ def _stack_rows(rows: Sequence[NDArray[_Number]], trees: int, fill: float) -> ND
     return full
 
 
-def below_or_equal(threshold: float) -> np.float32:
+def round_down_to_single(threshold: float) -> np.float32:
     """Return the single-precision number t with ``x > t`` exactly where ``x > threshold``, for all single-precision x.
 
     Raises:
@@ -101,5 +101,5 @@ def _fill(nodes: Any, depth: int, feature: Any, threshold: Any, leaf: Any) -> No
             raise ValueError(f"a tree is deeper than {depth}; grow trees with max_depth = {depth}, or take more")
         if node["is_categorical"]:
             raise ValueError("a tree splits by categories; fit trees on numbers alone")
-        feature[at], threshold[at] = node["feature_idx"], below_or_equal(float(node["num_threshold"]))
+        feature[at], threshold[at] = node["feature_idx"], round_down_to_single(float(node["num_threshold"]))
         waiting += [(int(node["left"]), 2 * at + 1, level + 1), (int(node["right"]), 2 * at + 2, level + 1)]

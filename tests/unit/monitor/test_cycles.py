@@ -54,7 +54,7 @@ def test_each_log_is_a_cycle_by_default():
     source = CyclesSpec().fit(material(*logs))
     assert len(source.template) == TICKS
     # What is longer than its cycle is not compared with the begin of another one.
-    kept = Cycles.of_parts(source.parts())
+    kept = Cycles.from_parts(source.parts())
     rows = log(5).rows(0, TICKS + 3).select(source.inputs)[None]
     begin, state = kept.run(rows[:, :30], kept.initial_state(1))
     end, _ = kept.run(rows[:, 30:], state)
@@ -85,9 +85,9 @@ def test_parts_of_a_file_that_cannot_be_are_refused(source):
         ("template", np.zeros((0, 2)), "shape|ticks"),
     ):
         with pytest.raises(ValueError, match=why):
-            Cycles.of_parts(SourceParts(parts.plain, parts.arrays | {name: values}))
+            Cycles.from_parts(SourceParts(parts.plain, parts.arrays | {name: values}))
     with pytest.raises(ValueError, match="repeats"):
-        Cycles.of_parts(SourceParts({**parts.plain, "repeats": 1}, parts.arrays))
+        Cycles.from_parts(SourceParts({**parts.plain, "repeats": 1}, parts.arrays))
     none = {"template": np.zeros((0, 2)), "width": np.zeros((0, 2))}
     with pytest.raises(ValueError, match="0 ticks"):
-        Cycles.of_parts(SourceParts(parts.plain, parts.arrays | none))
+        Cycles.from_parts(SourceParts(parts.plain, parts.arrays | none))

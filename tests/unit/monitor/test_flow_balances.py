@@ -74,7 +74,7 @@ def test_a_healthy_rest_is_about_its_width_and_a_small_part_of_the_velocity(sour
 def test_ticks_and_chunks_are_one_run_and_a_file_brings_it_back(source):
     rows = session(102, seconds=6.0).select(source.inputs)[None]
     whole, _ = source.run(rows, source.initial_state(1))
-    again = FlowBalances.of_parts(source.parts())
+    again = FlowBalances.from_parts(source.parts())
     state, pieces = again.initial_state(1), []
     for piece in np.split(rows, [1, 2, 3, 50, 333], axis=1):
         out, state = again.run(piece, state)
@@ -110,12 +110,12 @@ def test_sisters_scatter_about_the_machine_by_their_tolerance(source):
     own, _ = source.run(rows, source.initial_state(1))
 
     def apart(tolerance):
-        sisters = [source.of_sister(np.random.default_rng(seed), tolerance) for seed in range(4)]
+        sisters = [source.adjust_to_sister(np.random.default_rng(seed), tolerance) for seed in range(4)]
         return np.mean([np.abs(one.run(rows, one.initial_state(1))[0] - own).mean() for one in sisters])
 
     near, far = apart(0.01), apart(0.03)
     assert 0.0 < near < 0.5 * far
-    assert source.oil == source.of_sister(np.random.default_rng(0), 0.01).oil
+    assert source.oil == source.adjust_to_sister(np.random.default_rng(0), 0.01).oil
 
 
 def test_a_damaged_file_is_refused(source):
@@ -124,16 +124,16 @@ def test_a_damaged_file_is_refused(source):
     for change in ({"velocity": 99}, {"spools": [7]}, {"sign": 2}, {"cushion": 0.0}, {"supplies": [0] * 9}):
         plain = dict(parts.plain) | {"chambers": [entry | change]}
         with pytest.raises(ValueError, match="chamber"):
-            FlowBalances.of_parts(SourceParts(plain, parts.arrays))
+            FlowBalances.from_parts(SourceParts(plain, parts.arrays))
     for name, values in (("spools.dead", [1e9] * 6), ("spools.extend", [99] * 6), ("0.values", [[np.nan]])):
         with pytest.raises(ValueError, match=rf"'{name.split('.')[1]}': got .*, expected"):
-            FlowBalances.of_parts(SourceParts(parts.plain, dict(parts.arrays) | {name: np.array(values)}))
+            FlowBalances.from_parts(SourceParts(parts.plain, dict(parts.arrays) | {name: np.array(values)}))
     with pytest.raises(ValueError, match="rate"):
-        FlowBalances.of_parts(SourceParts(dict(parts.plain) | {"rate_hz": -1.0}, parts.arrays))
+        FlowBalances.from_parts(SourceParts(dict(parts.plain) | {"rate_hz": -1.0}, parts.arrays))
     for change in ({"column": 99}, {"low": float("nan")}, {"low": 90.0, "high": 80.0}):
         oil = parts.plain["oil"] | change
         with pytest.raises(ValueError, match=r"thermometer|temperatures"):
-            FlowBalances.of_parts(SourceParts(dict(parts.plain) | {"oil": oil}, parts.arrays))
+            FlowBalances.from_parts(SourceParts(dict(parts.plain) | {"oil": oil}, parts.arrays))
 
 
 def test_a_machine_without_pressures_has_none():

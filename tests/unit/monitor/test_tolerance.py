@@ -24,7 +24,7 @@ class Stiffness(ResidualSource):
     def __init__(self, factor: float = OWN) -> None:
         self.factor = factor
 
-    def of_sister(self, rng, tolerance):
+    def adjust_to_sister(self, rng, tolerance):
         return Stiffness(self.factor * (1.0 + rng.uniform(-tolerance, tolerance)))
 
     def _start(self, streams):
@@ -38,7 +38,7 @@ class Stiffness(ResidualSource):
         return SourceParts()
 
     @classmethod
-    def of_parts(cls, parts):
+    def from_parts(cls, parts):
         return cls()
 
 

@@ -71,12 +71,12 @@ def test_what_stood_in_for_a_missing_value_does_not_outlast_the_tick(source, ses
 
 def test_files_hold_the_turns_and_earlier_ones_have_none(source):
     parts = source.parts()
-    assert VirtualSensors.of_parts(parts).every == EVERY
+    assert VirtualSensors.from_parts(parts).every == EVERY
     plain = {key: value for key, value in parts.plain.items() if key != "every"}
-    assert VirtualSensors.of_parts(SourceParts(plain, parts.arrays, parts.bundles)).every == 1
+    assert VirtualSensors.from_parts(SourceParts(plain, parts.arrays, parts.bundles)).every == 1
     for every in (0, 1001, 2.5, True, "3"):
         broken = SourceParts({**plain, "every": every}, parts.arrays, parts.bundles)
         with pytest.raises(ValueError, match="an integer of 1 to 1000 must hold"):
-            VirtualSensors.of_parts(broken)
+            VirtualSensors.from_parts(broken)
     with pytest.raises(ConfigError, match="every"):
         VirtualSensorsSpec(every=0)

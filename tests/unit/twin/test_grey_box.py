@@ -166,7 +166,7 @@ def test_free_runs_choose_how_many_stretches_an_opening_curve_has(bench):
     coarse = free.build(machine.channels, machine.scales, arrays)
     bent = machine.with_stretches(10)
     weights = np.where(np.arange(40) % 2, 1.9, 0.1)
-    bent.numbers[bent.table.in_curves] *= weights
+    bent.numbers[bent.table.is_in_curves] *= weights
     told = []
     for series in runs:
         start = series.targets[:1]

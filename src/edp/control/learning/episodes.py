@@ -16,7 +16,7 @@ from edp.control.limits import LoopLimits
 from edp.control.model_batch import TIP
 from edp.control.models import ControlModels
 from edp.control.plant import STROKES, PlantInterface, interface_of
-from edp.control.plants import check_trusted, is_fmu, of_rate, twin_of
+from edp.control.plants import check_rate, check_trusted, is_fmu, twin_of
 from edp.control.tasks import ControlTask, draw_task
 from edp.control.twin_environment import TwinBatch
 from edp.control.valve_map import RUN_S, measure_valve_map
@@ -150,7 +150,7 @@ class TaskEpisodes(EpisodeBatch):
         parts = np.stack([np.ones(self.count), position**2, attitude**2, travel, violated], axis=1)
         self._sums += np.where(judged[:, None], parts, 0.0)
         self._largest = np.where(judged, np.maximum(self._largest, position), self._largest)
-        return np.where(going, self.spec.reward.of_tick(position, attitude, travel, violated), 0.0)
+        return np.where(going, self.spec.reward.compute_reward(position, attitude, travel, violated), 0.0)
 
     def _measure(self) -> Array:
         """Measure the position errors; return the attitude errors (rad), shape (count,)."""
@@ -223,7 +223,7 @@ def plant_batch(spec: LearningSpec, count: int, duration_s: float) -> PlantBatch
             "leave one out"
         )
     if isinstance(spec.plant, Twin):
-        twin = of_rate(spec.plant, "the twin", spec.rate_hz)
+        twin = check_rate(spec.plant, "the twin", spec.rate_hz)
     elif is_fmu(spec.plant):
         check_trusted(spec.plant, spec.trust_fmu)
         return FmuBatch(spec.plant, spec.machine, duration_s, spec.rate_hz, count)

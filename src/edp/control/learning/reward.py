@@ -50,7 +50,9 @@ class RewardWeights:
             lost=span(0.0, 1e6),
         )
 
-    def of_tick(self, position_m: Array, attitude_rad: Array, travel: Array, violated: NDArray[np.bool_]) -> Array:
+    def compute_reward(
+        self, position_m: Array, attitude_rad: Array, travel: Array, violated: NDArray[np.bool_]
+    ) -> Array:
         """Return the reward from position and attitude errors, lever travel and limits, shape (environment,) each."""
         near = 1.0 / (1.0 + position_m / self.position_m)
         upright = self.attitude / (1.0 + np.abs(attitude_rad) / self.attitude_rad)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from edp.errors import ExportError
 from edp.export.base import TARGETS
-from edp.export.description import Description, as_json, as_mat, float_graph, golden
+from edp.export.description import Description, as_json, encode_mat, float_graph, golden
 from edp.export.escape import LONGEST_NAME, visible
 from edp.export.folder import write_export
 from edp.export.onnx.metadata import content, expand_starts, notes
@@ -52,6 +52,6 @@ class OnnxTarget:
             files["window"] = window_model(graph, targets, f"{name}_window", carried, self.opset)
         about = content(described, files, states, self.opset)
         tables = {"edp": expand_starts(about, states), "golden": golden(bundle.predictor, graph.window)}
-        contents = {f"{name}.json": as_json(about), f"{name}.mat": as_mat(tables)}
+        contents = {f"{name}.json": as_json(about), f"{name}.mat": encode_mat(tables)}
         contents |= {f"{name}_{kind}.onnx": data for kind, data in files.items()}
         return write_export(folder, contents)

@@ -10,7 +10,7 @@ from edp.errors import ExportError
 from edp.export.base import TARGETS
 from edp.export.c.model import make_model
 from edp.export.c.target import check_name, core_files
-from edp.export.description import as_json, as_mat, float_graph, golden
+from edp.export.description import as_json, encode_mat, float_graph, golden
 from edp.export.folder import write_export
 from edp.export.onnx.metadata import notes
 from edp.export.onnx.nodes import OPSETS
@@ -55,7 +55,7 @@ class SimulinkTarget:
         written = Folder(model, window)
         files: dict[str, bytes] = {file: text.encode() for file, text in written.texts().items()}
         files[f"{name}.json"] = as_json(written.content())
-        files[f"{name}.mat"] = as_mat({**written.tables(), "golden": golden(bundle.predictor, model.graph.window)})
+        files[f"{name}.mat"] = encode_mat({**written.tables(), "golden": golden(bundle.predictor, model.graph.window)})
         if window:
             graph = float_graph(bundle.predictor, "ONNX")
             targets, carried = len(bundle.task.targets), notes(written.described)

@@ -77,7 +77,7 @@ class _Work:
             gate_constants |= {f"{key}_{side}": values for key, values in made_of.items()}
         return gate_constants
 
-    def as_fixed(self, value: str) -> str:
+    def convert_to_fixed(self, value: str) -> str:
         """Return the name of a value as integers."""
         if value in self.integer_fracs:
             return value
@@ -140,7 +140,7 @@ def quantise(graph: Graph, chosen: Formats, moments: Mapping[str, NDArray[np.flo
                 )
             work.out.append(replace(layer, inputs=tuple(work.to_float(name) for name in layer.inputs)))
             continue
-        inputs = tuple(work.as_fixed(name) for name in layer.inputs)
+        inputs = tuple(work.convert_to_fixed(name) for name in layer.inputs)
         # Inputs are brought into integers first, since a layer's own format depends on theirs.
         done = LOWER[kind](work, layer, [work.integer_fracs[name] for name in inputs])
         work.out.append(replace(done, inputs=inputs))

@@ -126,8 +126,8 @@ class Balances(ResidualSource):
         return SourceParts(plain, arrays)
 
     @classmethod
-    def of_parts(cls, parts: SourceParts) -> Balances:
-        """See `ResidualSource.of_parts`."""
+    def from_parts(cls, parts: SourceParts) -> Balances:
+        """See `ResidualSource.from_parts`."""
         inputs, units = residual_labels(parts.plain)
         arrays, rate_hz = source_arrays(parts, ARRAYS, residuals=len(units)), float(parts.plain["rate_hz"])
         if not 0.0 < rate_hz <= 1e6:

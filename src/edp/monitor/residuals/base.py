@@ -171,7 +171,7 @@ class ResidualSource(ABC):
         filled = np.take_along_axis(padded, newest, axis=1)
         return filled, filled[:, -1].copy()
 
-    def of_sister(self, rng: np.random.Generator, tolerance: float) -> ResidualSource:
+    def adjust_to_sister(self, rng: np.random.Generator, tolerance: float) -> ResidualSource:
         """Return the source adjusted as if for another machine of the series.
 
         Unchanged if it has no machine parameters.
@@ -200,7 +200,7 @@ class ResidualSource(ABC):
 
     @classmethod
     @abstractmethod
-    def of_parts(cls, parts: SourceParts) -> ResidualSource:
+    def from_parts(cls, parts: SourceParts) -> ResidualSource:
         """Create the source from the result of `parts`.
 
         Raises:
@@ -295,7 +295,7 @@ def sisters_of(sources: Sequence[ResidualSource], tolerance: float, number: int)
     if not tolerance:
         return list(sources)
     rng = np.random.default_rng([number, SISTERS])
-    return [source.of_sister(rng, tolerance) for source in sources]
+    return [source.adjust_to_sister(rng, tolerance) for source in sources]
 
 
 def rows_of(recording: Recording, names: Sequence[str]) -> Rows:

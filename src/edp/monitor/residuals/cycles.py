@@ -90,8 +90,8 @@ class Cycles(ResidualSource):
         return SourceParts({"inputs": list(self.inputs), "repeats": self.repeats}, arrays)
 
     @classmethod
-    def of_parts(cls, parts: SourceParts) -> Cycles:
-        """See `ResidualSource.of_parts`."""
+    def from_parts(cls, parts: SourceParts) -> Cycles:
+        """See `ResidualSource.from_parts`."""
         inputs, arrays = texts_of(parts.plain["inputs"], "its inputs"), source_arrays(parts, ARRAYS)
         repeats = parts.plain["repeats"]
         if type(repeats) is not bool:

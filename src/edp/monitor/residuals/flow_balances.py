@@ -86,8 +86,8 @@ class ChamberCurves:
     lines: Singles
     doubts: Singles
 
-    def of_sister(self, rng: np.random.Generator, tolerance: float) -> ChamberCurves:
-        """Return the balance of another machine of the series; see `ResidualSource.of_sister`."""
+    def adjust_to_sister(self, rng: np.random.Generator, tolerance: float) -> ChamberCurves:
+        """Return the balance of another machine of the series; see `ResidualSource.adjust_to_sister`."""
         paths, lines = len(self.values), len(self.lines)
         later, wider = (rng.uniform(-tolerance, tolerance, paths) for _ in range(2))
         values = opening_later(self.values.astype(np.float64), later) * (1.0 + wider[:, None])
@@ -155,10 +155,10 @@ class FlowBalances(ResidualSource):
         self.per_tick = np.float32(rate_hz / 6.0)
         self.oil = oil
 
-    def of_sister(self, rng: np.random.Generator, tolerance: float) -> FlowBalances:
-        """See `ResidualSource.of_sister`."""
-        spools = self.spools.of_sister(rng, tolerance, self.rate_hz)
-        chambers = [chamber.of_sister(rng, tolerance) for chamber in self.chambers]
+    def adjust_to_sister(self, rng: np.random.Generator, tolerance: float) -> FlowBalances:
+        """See `ResidualSource.adjust_to_sister`."""
+        spools = self.spools.adjust_to_sister(rng, tolerance, self.rate_hz)
+        chambers = [chamber.adjust_to_sister(rng, tolerance) for chamber in self.chambers]
         return FlowBalances(self.inputs, self.middle, spools, chambers, self.rate_hz, self.oil)
 
     def unlearned(self, recording: Recording) -> str:
@@ -229,8 +229,8 @@ class FlowBalances(ResidualSource):
         return SourceParts(plain, arrays)
 
     @classmethod
-    def of_parts(cls, parts: SourceParts) -> FlowBalances:
-        """See `ResidualSource.of_parts`."""
+    def from_parts(cls, parts: SourceParts) -> FlowBalances:
+        """See `ResidualSource.from_parts`."""
         inputs, middle = texts_of(parts.plain["inputs"], "its inputs"), source_arrays(parts, {})["middle"]
         rate_hz = float(parts.plain["rate_hz"])
         if not 0.0 < rate_hz <= 1e6:

@@ -59,8 +59,8 @@ class SpoolModel:
     stages: Singles
     play: Singles
 
-    def of_sister(self, rng: np.random.Generator, tolerance: float, rate_hz: float) -> SpoolModel:
-        """Return the spools of another machine of the series; see `ResidualSource.of_sister`."""
+    def adjust_to_sister(self, rng: np.random.Generator, tolerance: float, rate_hz: float) -> SpoolModel:
+        """Return the spools of another machine of the series; see `ResidualSource.adjust_to_sister`."""
         gain, dead, play = (
             values * (1.0 + rng.uniform(-tolerance, tolerance, values.shape))
             for values in (self.gain, self.dead, self.play)

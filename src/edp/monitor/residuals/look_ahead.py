@@ -101,8 +101,8 @@ class LookAhead(ResidualSource):
         return SourceParts({"inputs": list(self.inputs)}, {"middle": self.middle}, dict(self.bundles))
 
     @classmethod
-    def of_parts(cls, parts: SourceParts) -> LookAhead:
-        """See `ResidualSource.of_parts`."""
+    def from_parts(cls, parts: SourceParts) -> LookAhead:
+        """See `ResidualSource.from_parts`."""
         inputs, middle = texts_of(parts.plain["inputs"], "its inputs"), source_arrays(parts, {})["middle"]
         bundles = {}
         for number in sorted(parts.bundles, key=lambda text: (len(text), text)):

@@ -103,8 +103,8 @@ class TwinPorts(ResidualSource):
         return SourceParts(plain, {"middle": self.middle}, {"twin": self.bundle})
 
     @classmethod
-    def of_parts(cls, parts: SourceParts) -> TwinPorts:
-        """See `ResidualSource.of_parts`."""
+    def from_parts(cls, parts: SourceParts) -> TwinPorts:
+        """See `ResidualSource.from_parts`."""
         inputs, middle = texts_of(parts.plain["inputs"], "its inputs"), source_arrays(parts, {})["middle"]
         bundle, period, groups = parts.bundles["twin"], parts.plain["period"], parts.plain["groups"]
         if not isinstance(bundle, TwinBundle):

@@ -115,8 +115,8 @@ class VirtualSensors(ResidualSource):
         return SourceParts(plain, {"middle": self.middle}, dict(self.bundles))
 
     @classmethod
-    def of_parts(cls, parts: SourceParts) -> VirtualSensors:
-        """See `ResidualSource.of_parts`."""
+    def from_parts(cls, parts: SourceParts) -> VirtualSensors:
+        """See `ResidualSource.from_parts`."""
         inputs, middle = texts_of(parts.plain["inputs"], "its inputs"), source_arrays(parts, {})["middle"]
         groups = texts_of(parts.plain["groups"], "its groups")
         every = parts.plain.get("every", 1)  # monitors of earlier versions have none

@@ -140,7 +140,7 @@ class PhysicsBase(Streaming):
     def usual(self) -> dict[str, tuple[float, float]]:
         # The middle of the strokes, since a middle of angles need not be a pose that the linkage reaches.
         """Return middle and width of the usual range of each channel that the base reads, SI units."""
-        pose = self.geometry.at_strokes(0.5 * self.geometry.axis("STROKE"))
+        pose = self.geometry.compute_pose_at_strokes(0.5 * self.geometry.axis("STROKE"))
         middle = torch.atan2(pose.sine, pose.cosine).tolist()
         stroke = self.geometry.axis("STROKE").tolist()
         ranges = dict.fromkeys(SPEEDS, (0.0, SPEED)) | dict.fromkeys((*HEADS, *RODS), PRESSURE)
@@ -162,7 +162,11 @@ class PhysicsBase(Streaming):
     def pose(self, x: Tensor) -> Pose:
         """Return the pose at each sample."""
         values = self.take(x, POSES[self.spec.pose][:AXES])
-        return self.geometry.at_angles(values) if self.spec.pose == "angles" else self.geometry.at_strokes(values)
+        return (
+            self.geometry.compute_pose_at_angles(values)
+            if self.spec.pose == "angles"
+            else self.geometry.compute_pose_at_strokes(values)
+        )
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         pose = self.pose(x)

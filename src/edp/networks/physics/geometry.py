@@ -102,12 +102,12 @@ class Geometry(nn.Module):
         """Return one parameter of the linkage, ``()``."""
         return self.plant[(*PLANT_NUMBERS, *SIDES).index(name)]
 
-    def at_angles(self, angles: Tensor) -> Pose:
+    def compute_pose_at_angles(self, angles: Tensor) -> Pose:
         """Return the pose at relative joint angles ``(..., 3)`` in rad."""
         cosine, sine = torch.cos(angles), torch.sin(angles)
         return Pose(cosine, sine, *self.cylinders(cosine, sine))
 
-    def at_strokes(self, strokes: Tensor) -> Pose:
+    def compute_pose_at_strokes(self, strokes: Tensor) -> Pose:
         """Return the pose at cylinder strokes ``(..., 3)`` in m from closed: cosine law and two circle pairs."""
         length = strokes + self.axis("CLOSED")
         boom = self._corner("BOOM_BASE", "BOOM_ROD", length[..., 0])
@@ -234,7 +234,7 @@ class Geometry(nn.Module):
         """Return the equivalent masses M_ii / J_i^2 in kg averaged over a uniform grid of strokes, ``(3,)``."""
         # A grid over all poses stands for training data that do not exist yet.
         share = torch.linspace(0.0, 1.0, GRID, dtype=self.axes.dtype, device=self.axes.device)
-        pose = self.at_strokes(torch.cartesian_prod(share, share, share) * self.axis("STROKE"))
+        pose = self.compute_pose_at_strokes(torch.cartesian_prod(share, share, share) * self.axis("STROKE"))
         return self.equivalent_mass(pose).mean(dim=0)
 
     def equivalent_mass(self, pose: Pose) -> Tensor:

@@ -47,7 +47,7 @@ def sizes_of(fault: FaultSpec, shares: Array) -> Array:
     return np.where(shares > 0.0, fault.neutral + shares * (fault.full - fault.neutral), fault.neutral)
 
 
-def of_machine(faults: Sequence[FaultSpec]) -> tuple[FaultSpec, ...]:
+def select_machine_faults(faults: Sequence[FaultSpec]) -> tuple[FaultSpec, ...]:
     """Return the faults that change plant parameters."""
     return tuple(fault for fault in faults if isinstance(FAULTS[fault.kind], MachineFault))
 
@@ -76,7 +76,7 @@ class MachineCourse:
     """
 
     def __init__(self, faults: Sequence[FaultSpec], sound: MachineNumbers) -> None:
-        self.faults = of_machine(faults)
+        self.faults = select_machine_faults(faults)
         self._sound = sound.copy()
         changed = self._numbers(np.ones(len(self.faults)))
         half = self._numbers(np.full(len(self.faults), 0.5))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from edp.errors import ConfigError, ExportError, closest, count_of
 from edp.evaluation.monitor_footprint import MonitorFootprint, monitor_footprint
-from edp.export.golden import at_thresholds, grown_tolerance, stream, tolerance
+from edp.export.golden import grown_tolerance, relax_at_thresholds, stream, tolerance
 from edp.export.monitor import (
     GoldenChain,
     GoldenResiduals,
@@ -270,7 +270,7 @@ def _compute_tolerance(part: SourcePart, rows: Rows) -> NDArray[np.float64]:
     fed, judged = ran[:, part.reads], ran[:, part.judged]
     outputs = stream(network, fed)
     # A predictor whose trees may take another leaf there is off by a step.
-    off = (tolerance(network, fed, outputs) + at_thresholds(network, fed).max(axis=0)).astype(np.float64)
+    off = (tolerance(network, fed, outputs) + relax_at_thresholds(network, fed).max(axis=0)).astype(np.float64)
     results, count = np.asarray(part.results), len(part.bundle.task.targets) * len(part.bundle.task.horizons)
     whole = not isinstance(network, IntegerPredictor)
     apart = off[results] + whole * ROUNDING * np.abs(judged).max(axis=0)

@@ -112,4 +112,4 @@ def _decode(result: UnitResult, run: Path) -> object:
     networks = {name: read_network(run, entry) for name, entry in stored.networks.items()}
     if kind == NETWORK:
         return networks[NETWORK]
-    return RESIDUALS[result.values["source"]].source.of_parts(SourceParts(stored.plain, stored.arrays, networks))
+    return RESIDUALS[result.values["source"]].source.from_parts(SourceParts(stored.plain, stored.arrays, networks))

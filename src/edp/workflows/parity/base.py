@@ -12,7 +12,7 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from edp.export.golden import SHARE, Rows, at_thresholds, stream
+from edp.export.golden import SHARE, Rows, relax_at_thresholds, stream
 from edp.registry import Registry
 from edp.sandbox.environment import BUILD_NAMES, reduce_environment
 from edp.training.bundle import Bundle
@@ -65,7 +65,7 @@ class ParityCase:
         predictor = self.bundle.predictor
         # The least over the ticks is what is allowed where no tree is at a threshold.
         least = self.allowed if self.allowed.ndim == 1 else self.allowed.min(axis=0)
-        allowed = [least + at_thresholds(predictor, window)[-1] for window in windows]
+        allowed = [least + relax_at_thresholds(predictor, window)[-1] for window in windows]
         return windows, np.concatenate([stream(predictor, window)[-1:] for window in windows]), np.stack(allowed)
 
 

@@ -71,7 +71,7 @@ class ParameterTable:
         return opening_knots(self.stretches)
 
     @property
-    def in_curves(self) -> NDArray[np.bool_]:
+    def is_in_curves(self) -> NDArray[np.bool_]:
         """Mask of the parameters that are increments of an opening curve."""
         inside = np.zeros(len(self.numbers), np.bool_)
         for first in self.valve_at[:, at.INTO : at.REGENERATION].ravel():
@@ -187,10 +187,10 @@ def number_table(
 def finer_values(coarse: ParameterTable, values: Array, fine: ParameterTable) -> Array:
     """Return the parameters of the same machine with subdivided opening curves of unchanged shape."""
     parts = fine.stretches // coarse.stretches
-    divided, result = coarse.in_curves, np.empty(len(fine.numbers))
+    divided, result = coarse.is_in_curves, np.empty(len(fine.numbers))
     # Curves, and what is no curve, have the same order in both tables.
-    result[fine.in_curves] = np.repeat(values[divided] / parts, parts)
-    result[~fine.in_curves] = values[~divided]
+    result[fine.is_in_curves] = np.repeat(values[divided] / parts, parts)
+    result[~fine.is_in_curves] = values[~divided]
     return result
 
 
@@ -200,9 +200,9 @@ def coarse_by_fine(coarse: ParameterTable, fine: ParameterTable) -> Array:
     Subdivided increments grow together.
     """
     parts = fine.stretches // coarse.stretches
-    slopes, divided = np.zeros((len(coarse.numbers), len(fine.numbers))), coarse.in_curves
-    slopes[np.repeat(np.flatnonzero(divided), parts), np.flatnonzero(fine.in_curves)] = 1.0 / parts
-    slopes[np.flatnonzero(~divided), np.flatnonzero(~fine.in_curves)] = 1.0
+    slopes, divided = np.zeros((len(coarse.numbers), len(fine.numbers))), coarse.is_in_curves
+    slopes[np.repeat(np.flatnonzero(divided), parts), np.flatnonzero(fine.is_in_curves)] = 1.0 / parts
+    slopes[np.flatnonzero(~divided), np.flatnonzero(~fine.is_in_curves)] = 1.0
     return slopes
 
 
