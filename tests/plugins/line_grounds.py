@@ -514,6 +514,7 @@ SPECIAL: tuple[tuple[str, str, str], ...] = (
     (r"runs/tuned_loop --format controller", "runs/tuned_loop", "loop"),
     (r"loop (run|tune) .*runs/twin", "runs/twin", "front_twin"),
     (r"runs/twin --data", "logs/monday", "actuators"),
+    (r"loop run .*--machine mine.toml", "mine.toml", "machine"),
     (r"linkage=mine", "logs", "front"),
     (r"logs/healthy --map", "logs/healthy", "rig_csv"),
     (r"(logs/healthy|logs/today) --map", "map.toml", "rig_map"),
