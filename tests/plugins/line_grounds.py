@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import chdir
 from dataclasses import replace
 from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 from unittest import mock
@@ -26,6 +27,8 @@ from small_studies import CHANGES
 
 from edp.cli import app
 from edp.cli.console import run_app
+from edp.cli.groups import RUN, RunByDefault
+from edp.cli.names import FOCUS, SIMULATION
 from edp.logs import write_recording
 from edp.monitor.monitor_file import save_monitor
 from edp.networks.twin import TWINS
@@ -57,6 +60,7 @@ MACHINES = (
 )
 FEW = ('task.targets=["CylVels_1"]', 'task.features={name="few",channels=["CylVels_1","BmUp"]}')
 LIMIT = ("limit.moments=4", "limit.branches=4", "limit.horizons=[1,10]")
+TUNING = ("--trials", "2", "--tuning-loops", "1", "--evaluation-loops", "1")
 LOOP = ("task.length_m=[0.4,0.5]", "task.hold_s=0.2", "task.lead_s=0.2")
 JUDGED = ("evaluation.duration_s=4", "evaluation.starts=2", "evaluation.at_s=[1,4]")
 TWIN = ("twin.kind=arx", *JUDGED)
@@ -129,8 +133,12 @@ def lines_of(page: Path) -> Iterator[Line]:
         named: tuple[str, ...] = ()
         while words and (*named, words[0]) in known:
             named = (*named, words.pop(0))
-        if named == ("search",) and words:
-            named = ("search", "run")
+        if words and isinstance(known[named].parsed, RunByDefault):
+            named = (*named, RUN)
+        if named == ("train", RUN) and (FOCUS, SIMULATION) in pairwise(words):
+            # The command line reads it as its short form.
+            place = words.index(FOCUS)
+            named, words = ("twin",), [*words[:place], *words[place + 2 :]]
         if not words or words[-1] == "--help" or "..." in words or hasattr(known[named].parsed, "commands"):
             continue
         if any(word.endswith("...") for word in words):
@@ -331,13 +339,13 @@ def _made_by(*words: str, codes: tuple[int, ...] = (0,)) -> Callable[[Ground, Pa
 def _fmu(ground: Ground, path: Path, version: str) -> None:
     made = ground.folder / "units"
     if not made.is_dir():
-        assert edp("export", ground.of("front_twin"), "--to", "fmu", "--out", made, "--name", "twin") == 0
+        assert edp("export", ground.of("front_twin"), "--format", "fmu", "--out", made, "--name", "twin") == 0
     shutil.copy(made / f"twin_fmi{version}.fmu", path)
 
 
 def _tuned(ground: Ground, path: Path) -> None:
     made = ground.folder / "tuning"
-    words = ("--on", ground.of("front_twin"), "--trials", "2", "--loops", "1", "--seeds", "1", *settings(LOOP))
+    words = ("--tuning-plant", ground.of("front_twin"), *TUNING, *settings(LOOP))
     assert edp("loop", "tune", made, "--controller", "pi", *words) == 0
     shutil.copy(made / "tuned.toml", path)
 
@@ -369,7 +377,7 @@ MAKERS: Mapping[str, Callable[[Ground, Path], None]] = {
     "actuators_csv": lambda ground, path: _table(ground.of("actuators"), path),
     "actuators_map": lambda ground, path: _map_of(ground.of("actuators"), path),
     "study": _made_by(
-        "search", "{logs}", "--study", "{out}", "--workers", "1", "--phase", "calibration", *settings(CHANGES)
+        "search", "{logs}", "--out", "{out}", "--workers", "1", "--phase", "calibration", *settings(CHANGES)
     ),
     "mapped": lambda ground, path: _table(ground.of("logs"), path),
     "map": lambda ground, path: _map_of(ground.of("logs"), path),
@@ -382,7 +390,7 @@ MAKERS: Mapping[str, Callable[[Ground, Path], None]] = {
     "actuators": lambda ground, path: _write([sample_actuators(seed=seed) for seed in range(6)], path),
     "machine": _machine,
     "budget": lambda ground, path: shutil.copy(ROOT / "examples" / "budgets" / "small_controller.toml", path),
-    "front": _made_by("simulate", "{out}", "--minutes", "0.4", "--recordings", "4", "--workers", "1"),
+    "front": _made_by("simulate", "{out}", "--duration", "24s", "--recordings", "4", "--workers", "1"),
     "front_log": lambda ground, path: shutil.copytree(ground.of("front"), path, ignore=_all_but_one),
     "one_log": lambda ground, path: shutil.copytree(ground.of("logs"), path, ignore=_all_but_one),
     "rig_log": lambda ground, path: shutil.copytree(ground.of("rig"), path, ignore=_all_but_one),
@@ -396,7 +404,7 @@ MAKERS: Mapping[str, Callable[[Ground, Path], None]] = {
     ),
     "run": _judged,
     "adapted": _made_by("adapt", "{run}", "--out", "{out}"),
-    "whole": _made_by("quantise", "{run}", "--out", "{out}"),
+    "whole": _made_by("compress", "quantise", "{run}", "--out", "{out}"),
     "twin": _made_by("twin", "{actuators}", "--out", "{out}", *settings(TWIN), codes=(0, 6)),
     "recurrent": _made_by("twin", "{actuators}", "--out", "{out}", *settings(RECURRENT), codes=(0, 6)),
     "rig_run": _made_by(
@@ -407,36 +415,45 @@ MAKERS: Mapping[str, Callable[[Ground, Path], None]] = {
     "grounded": _grounded,
     "fmi2": lambda ground, path: _fmu(ground, path, "2"),
     "fmi3": lambda ground, path: _fmu(ground, path, "3"),
-    "loop": _made_by("control", "{out}", "--plant", "{front_twin}", "--seeds", "1", *settings(LOOP)),
+    "loop": _made_by("loop", "run", "{out}", "--plant", "{front_twin}", "--loops", "1", *settings(LOOP)),
     "tuned": _tuned,
     "monitor": _monitor,
     "watched": _made_by("monitor", "run", "{monitor}", "{rig}", "--out", "{out}", codes=(0, 5)),
-    "store": _made_by("store", "build", "{logs}", "--out", "{out}", "--workers", "1"),
-    "fleet": _made_by("store", "build", "{drives}", "--out", "{out}", "--workers", "1"),
-    "base": _made_by("pretrain", "{drives}", "--out", "{out}", "--preset", "quick", *settings(MACHINES)),
+    "store": _made_by("data", "store", "build", "{logs}", "--out", "{out}", "--workers", "1"),
+    "fleet": _made_by("data", "store", "build", "{drives}", "--out", "{out}", "--workers", "1"),
+    "base": _made_by("train", "pretrain", "{drives}", "--out", "{out}", "--preset", "quick", *settings(MACHINES)),
     "registry": _made_by("registry", "add", "{out}", "{base}", "--name", "base"),
-    "deltas": _made_by("finetune", "{base}", "--fleet", "{fleet}", "--out", "{out}", "--workers", "1"),
+    "deltas": _made_by("train", "finetune", "{base}", "--fleet", "{fleet}", "--out", "{out}", "--workers", "1"),
 }
 """By kind."""
-WRITTEN = {"--out", "--page", "--save", "--record", "--mdf", "--name", "--to", "--set"}
-POSITIONS_WRITTEN = {("simulate", "0"), ("control", "0"), ("tune", "0"), ("registry add", "0")}
+WRITTEN = {"--out", "--page", "--save", "--record", "--mdf", "--name", "--format", "--set"}
+POSITIONS_WRITTEN = {("simulate", "0"), ("loop run", "0"), ("loop tune", "0"), ("registry add", "0")}
 ROLES: Mapping[tuple[str, str], str] = {
-    **{(name, "0"): "logs" for name in ("train", "inspect", "init", "screen", "search run", "store build")},
-    **{(name, "0"): "run" for name in ("evaluate", "report", "footprint", "distil", "compress", "quantise", "parity")},
-    **{(name, "0"): "run" for name in ("export", "adapt", "compare", "finetune", "live", "animate")},
+    **{
+        (name, "0"): "logs"
+        for name in ("train run", "data check", "init", "data screen", "search run", "data store build")
+    },
+    **{
+        (name, "0"): "run"
+        for name in ("evaluate", "report", "verify", "export", "adapt run", "compare", "train finetune", "live")
+    },
+    **{
+        (name, "0"): "run"
+        for name in ("data animate", *(f"compress {name}" for name in ("estimate", "distil", "search", "quantise")))
+    },
     **{("compare", str(place)): "run" for place in range(3)},
     ("twin", "0"): "actuators",
-    ("pretrain", "0"): "drives",
+    ("train pretrain", "0"): "drives",
     ("twin", "--start"): "recurrent",
     ("rollout", "0"): "twin",
     ("rollout", "1"): "actuator_log",
-    ("forecast", "0"): "twin",
-    ("forecast", "1"): "actuators",
-    ("identify", "0"): "front",
-    ("replay", "0"): "adapted",
-    ("replay", "1"): "logs",
-    ("finetune", "1"): "logs",
-    ("animate", "last"): "front_log",
+    ("data add-forecasts", "0"): "twin",
+    ("data add-forecasts", "1"): "actuators",
+    ("calibrate", "0"): "front",
+    ("adapt replay", "0"): "adapted",
+    ("adapt replay", "1"): "logs",
+    ("train finetune", "1"): "logs",
+    ("data animate", "last"): "front_log",
     ("monitor fit", "0"): "rig_run",
     ("monitor fit", "last"): "rig",
     ("monitor run", "0"): "monitor",
@@ -446,20 +463,20 @@ ROLES: Mapping[tuple[str, str], str] = {
     ("fleet report", "1"): "fleet",
     ("fleet report", "--deltas"): "deltas",
     ("fleet network", "0"): "deltas",
-    ("finetune", "--fleet"): "fleet",
+    ("train finetune", "--fleet"): "fleet",
     ("registry add", "1"): "run",
     ("registry list", "0"): "registry",
     ("registry show", "0"): "registry",
-    ("store check", "0"): "store",
+    ("data store verify", "0"): "store",
     **{(f"search {name}", "0"): "study" for name in ("status", "report", "export")},
     ("simulate", "--machine"): "machine",
-    ("train", "--start"): "base",
+    ("train run", "--start"): "base",
     ("runs", "0"): "run",
-    ("control", "--plant"): "front_twin",
-    ("control", "--twin"): "front_twin",
-    ("control", "--predictor"): "ahead",
-    ("control", "--config"): "tuned",
-    ("tune", "--on"): "front_twin",
+    ("loop run", "--plant"): "front_twin",
+    ("loop run", "--twin"): "front_twin",
+    ("loop run", "--predictor"): "ahead",
+    ("loop run", "--config"): "tuned",
+    ("loop tune", "--tuning-plant"): "front_twin",
     ("", "--budget"): "budget",
     ("", "--monitor"): "monitor",
     ("", "--map"): "map",
@@ -492,18 +509,19 @@ SPECIAL: tuple[tuple[str, str, str], ...] = (
     (r"finetune fleet/base", "fleet/base", "base"),
     (r"finetune RUN --fleet", "RUN", "base"),
     (r"fleet report", "RUN", "base"),
-    (r"to controller", "RUN", "loop"),
-    (r"runs/plan --to controller", "runs/plan", "loop"),
-    (r"runs/tuned_loop --to controller", "runs/tuned_loop", "loop"),
-    (r"(control|tune) .*runs/twin", "runs/twin", "front_twin"),
+    (r"format controller", "RUN", "loop"),
+    (r"runs/plan --format controller", "runs/plan", "loop"),
+    (r"runs/tuned_loop --format controller", "runs/tuned_loop", "loop"),
+    (r"loop (run|tune) .*runs/twin", "runs/twin", "front_twin"),
     (r"runs/twin --data", "logs/monday", "actuators"),
+    (r"loop run .*--machine mine.toml", "mine.toml", "machine"),
     (r"linkage=mine", "logs", "front"),
     (r"logs/healthy --map", "logs/healthy", "rig_csv"),
     (r"(logs/healthy|logs/today) --map", "map.toml", "rig_map"),
     (r"logs/today --map", "logs/today", "rig_csv"),
     (r"registry add .* fleet/base", "fleet/base", "base"),
     (r"runs/grey_loam --set task", "runs/grey_loam", "grounded"),
-    (r"twin .*--start runs/twin", "runs/twin", "recurrent"),
+    (r"(twin|simulation) .*--start runs/twin", "runs/twin", "recurrent"),
     (r"auto.foundation", "logs/c14", "drives"),
     (r"live .*--monitor", "runs/m22", "rig_run"),
     (r"live .*--monitor", "data/m22/m22_000_combined.parquet", "rig_log"),
@@ -515,52 +533,54 @@ BESIDE = (
 )
 """Line, name and kind of what a setting names."""
 SHORTER: Mapping[tuple[str, str], str] = {
-    ("simulate", "--minutes"): "0.1",
-    ("", "--minutes"): "0.02",
+    ("simulate", "--duration"): "6s",
+    ("", "--time-budget"): "1.2s",
     ("", "--recordings"): "2",
     ("", "--workers"): "1",
-    ("", "--seeds"): "1",
+    ("", "--loops"): "1",
+    ("", "--tuning-loops"): "1",
+    ("", "--evaluation-loops"): "1",
     ("rollout", "--from"): "1",
-    ("rollout", "--seconds"): "2",
+    ("rollout", "--rollout-seconds"): "2",
     ("monitor fit", "--hours-per-false-alarm"): "0.04",
     ("", "--units"): "4",
     ("fleet network", "1"): "digger 7",
 }
 """Values of options that a test cannot wait for, by command and option."""
 MORE: Mapping[str, tuple[str, ...]] = {
-    r"^train .*--preset quick": tuple(settings(TRAINING)),
+    r"^train run .*--preset (quick|small)": tuple(settings(TRAINING)),
     r"^init (?!.*--yes)": ("--yes",),
-    r"^train .*foundation": ("--minutes", "0.01", *settings(MACHINES[1:2])),
-    r"^train .*velocity": ("--minutes", "0.01"),
-    r"^train .*features=all": ("--minutes", "0.01", *settings(FEW[:1])),
-    r"^train .*--minutes": tuple(settings(FEW)),
-    r"^train .*--config examples": (),
-    r"^train": ("--minutes", "0.01", *settings(FEW)),
+    r"^train run .*foundation": ("--time-budget", "0.6s", *settings(MACHINES[1:2])),
+    r"^train run .*velocity": ("--time-budget", "0.6s"),
+    r"^train run .*features=all": ("--time-budget", "0.6s", *settings(FEW[:1])),
+    r"^train run .*--time-budget": tuple(settings(FEW)),
+    r"^train run .*--config examples": (),
+    r"^train run": ("--time-budget", "0.6s", *settings(FEW)),
     r"^search run .*--preset thesis": (
         *("--phase", "isolation", "--workers", "1"),
         *settings((*CHANGES, "search.epochs=2")),
     ),
     r"^search run": ("--phase", "isolation", "--workers", "1", *settings(CHANGES)),
-    r"^pretrain .*test_masses": ("--preset", "quick", *settings(MACHINES[1:])),
-    r"^pretrain (?!.*--preset)": ("--preset", "quick", *settings(MACHINES)),
-    r"^pretrain": tuple(settings(MACHINES)),
-    r"^monitor fit .*--hours": ("--minutes", "0.02"),
-    r"^monitor fit": ("--minutes", "0.02", "--hours-per-false-alarm", "0.04"),
+    r"^train pretrain .*test_masses": ("--preset", "quick", *settings(MACHINES[1:])),
+    r"^train pretrain (?!.*--preset)": ("--preset", "quick", *settings(MACHINES)),
+    r"^train pretrain": tuple(settings(MACHINES)),
+    r"^monitor fit .*--hours": ("--time-budget", "1.2s"),
+    r"^monitor fit": ("--time-budget", "1.2s", "--hours-per-false-alarm", "0.04"),
     r"^twin .*--start": tuple(settings(RECURRENT)),
     r"^twin .*kind=": tuple(settings(JUDGED)),
     r"^twin": tuple(settings(("twin.candidates=['static','arx']", *JUDGED))),
-    r"^(control|tune) .*--machine C14": tuple(settings(LOOP)),
-    r"^control .*fmu": ("--yes", *settings(LOOP)),
-    r"^tune .*fmu": ("--yes", "--trials", "2", "--loops", "1", "--seeds", "1", *settings(LOOP)),
-    r"^control": tuple(settings(LOOP)),
-    r"^tune": ("--trials", "2", "--loops", "1", "--seeds", "1", *settings(LOOP)),
-    r"^distil": tuple(settings(("training.epochs=1", "training.updates=3"))),
-    r"^finetune": tuple(settings(("finetune.single_phase_epochs=1",))),
-    r"^simulate .*--limit": ("--minutes", "0.1", "--recordings", "1", *settings(LIMIT)),
-    r"^simulate (?!.*--minutes)": ("--minutes", "0.1", "--recordings", "2"),
+    r"^loop (run|tune) .*--machine C14": tuple(settings(LOOP)),
+    r"^loop run .*fmu": ("--yes", *settings(LOOP)),
+    r"^loop tune .*fmu": ("--yes", *TUNING, *settings(LOOP)),
+    r"^loop run": tuple(settings(LOOP)),
+    r"^loop tune": (*TUNING, *settings(LOOP)),
+    r"^compress distil": tuple(settings(("training.epochs=1", "training.updates=3"))),
+    r"^train finetune": tuple(settings(("finetune.single_phase_epochs=1",))),
+    r"^simulate .*--limit": ("--duration", "6s", "--recordings", "1", *settings(LIMIT)),
+    r"^simulate (?!.*--duration)": ("--duration", "6s", "--recordings", "2"),
     r"^evaluate (?!.*(runs/twin|TWIN))": ("--baselines", "persistence"),
-    r"^rollout (?!.*--seconds)": ("--seconds", "2"),
-    r"^parity": ("--form", "torch_ticks", "--form", "c", "--ticks", "60"),
+    r"^rollout (?!.*--rollout-seconds)": ("--rollout-seconds", "2"),
+    r"^verify": ("--format", "torch_ticks", "--format", "c", "--samples", "60"),
     r"^live .*--log": ("--until-end", "--speed", "inf"),
 }
 """Further options by the begin of the command or a part of the line."""

@@ -41,20 +41,16 @@ LEFT_OUT = {
         "needs a cluster; tests/unit/search/test_cluster.py"
     ),
     "edp calibrate LOGS --out MACHINE.toml": "fits a machine; tests/unit/cli/test_cli_identify.py",
-    "edp calibrate LOGS --out machine.toml": "fits a machine; tests/unit/cli/test_cli_identify.py",
     "edp calibrate logs --out mine.toml --machine measured.toml": "fits a machine; tests/unit/cli/test_cli_identify.py",
     "edp adapt replay runs/first_adapted logs/monday --twin runs/grey": (
         "needs a grey box of the network's velocities; tests/unit/test_adaptation.py runs it on one"
     ),
     "edp calibrate logs --out mine.toml --run runs/grey": "fits a machine; tests/unit/cli/test_cli_identify.py",
-    "edp twin logs --set twin.kind=greybox --set twin.linkage=mine.toml --out runs/grey": (
+    "edp train logs --focus simulation --set twin.kind=greybox --set twin.linkage=mine.toml --out runs/grey": (
         "fits a grey box; tests/unit/twin/test_grey_linkage.py"
     ),
-    "edp twin data/m22 --set twin.kind=greybox --set twin.linkage=mine.toml --out runs/grey": (
+    "edp train data/m22 --focus simulation --set twin.kind=greybox --set twin.linkage=mine.toml --out runs/grey": (
         "fits a grey box; tests/unit/twin/test_grey_linkage.py"
-    ),
-    "edp export RUN --format follower --twin GREY --out DIR": (
-        "needs a grey box of the network's velocities; tests/unit/test_adaptation.py runs it on one"
     ),
     "edp export runs/first_adapted --format follower --twin runs/grey --out firmware/follower": (
         "needs a grey box of the network's velocities; tests/unit/test_adaptation.py runs it on one"
@@ -74,17 +70,18 @@ SHELL_LEFT_OUT = {
 """First words of lines of other programs that are not run, and why; targets of make: tests/unit/test_code_blocks.py."""
 LIVE_S = 240.0
 """After which a session that says no address, or does not end, is killed: its code is then no success."""
-MAX_LEFT_OUT = 12
+MAX_LEFT_OUT = 11
 QUICK = re.compile(
-    r"(init|inspect|evaluate|report|compare|adapt|replay|footprint|runs|registry|rollout|forecast|store|monitor r)"
+    r"(init|data (check|add-forecasts|store)|evaluate|report|compare|adapt|compress estimate|runs|registry|rollout)"
+    r"|monitor r"
 )
 """Commands that take fractions of a second."""
 ALLOWED = {
-    "inspect": (0, 3),
+    "data check": (0, 3),
     "evaluate": (0, 6),
-    "finetune": (0, 6),
+    "train finetune": (0, 6),
     "twin": (0, 6),
-    "identify": (0, 6),
+    "calibrate": (0, 6),
     "monitor run": (0, 5),
 }
 """Exit codes that say something of the data or the model."""
@@ -96,7 +93,7 @@ def form_of(line: Line) -> tuple[object, ...]:
     for role, word in zip(line.roles, line.words):
         if role == "--name" or word == "--name":
             continue
-        free = role in WRITTEN and role not in ("--to", "--set")
+        free = role in WRITTEN and role not in ("--format", "--set")
         words.append(kind_of(line, role, word) or SHORTER.get((line.command, role)) or ("OUT" if free else word))
     return (line.command, *words, *more_of(line))
 
@@ -252,7 +249,7 @@ def test_exported_code_is_built_and_tested_by_the_lines_of_the_docs(text, ground
     (folder,) = set(re.findall(r"-S (\S+)", text))
     kind = {"firmware/control": "loop", "firmware/monitor": "monitor"}.get(folder, "run")
     form = "controller" if kind == "loop" else "c"
-    assert edp("export", ground.of(kind), "--to", form, "--out", tmp_path / folder) == 0
+    assert edp("export", ground.of(kind), "--format", form, "--out", tmp_path / folder) == 0
     done = subprocess.run(text, shell=True, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     assert "100% tests passed" in done.stdout

@@ -253,8 +253,13 @@ def test_command_lines_that_cannot_be_are_told(line, problem):
         ("train", "twin.kind=greybox", False),
         ("twin", "twin.kind=greybox", True),
         ("twin", "twin.kinds=greybox", False),
-        ("finetune", "finetune.single_phase_epochs=3", True),
-        ("finetune", "finetune.round=3", False),
+        ("train logs --focus simulation", "twin.kind=greybox", True),
+        ("train logs --focus simulation", "training.epochs=3", False),
+        ("train finetune", "finetune.single_phase_epochs=3", True),
+        ("train finetune", "finetune.round=3", False),
+        ("calibrate", "twin.kind=greybox", True),
+        ("loop run", "controller.blocks=[4]", True),
+        ("loop tune", "controller.block=[4]", False),
         ("export", "opset=11", True),
         ("simulate", "limit.moments=60", True),
         ("simulate", "limit.moment=60", False),
@@ -262,7 +267,7 @@ def test_command_lines_that_cannot_be_are_told(line, problem):
     ],
 )
 def test_settings_that_do_not_exist_are_told(command, change, exists):
-    assert (settings_keys.unknown_keys((command,) if command else (), [change]) == []) == exists
+    assert (settings_keys.unknown_keys(tuple(command.split()), [change]) == []) == exists
 
 
 def test_a_built_page_is_held_to_its_links_and_to_loading_nothing(tmp_path):

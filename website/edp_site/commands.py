@@ -78,13 +78,14 @@ def problems_of(line: str, known: dict[tuple[str, ...], Command]) -> list[str]:
         named = (*named, words.pop(0))
     if not named and not (words and words[0].startswith("-")):
         return [f"there is no command '{words[0]}'"] if words and not _PLACES.match(words[0]) else []
+    typed = named
     # `edp search DATA` is `edp search run DATA`
     if words and (*named, RUN) in known and isinstance(known[named].parsed, RunByDefault):
         named = (*named, RUN)
     command = known[named]
     options = command.options
     wrong = [
-        f"'edp {' '.join(named)}' has no option '{name}'"
+        f"'edp {' '.join(typed)}' has no option '{name}'"
         for name in (word.partition("=")[0].rstrip(",;:.") for word in words if re.match(r"--?[A-Za-z]", word))
         if name not in options and name not in ("--help",)
     ]

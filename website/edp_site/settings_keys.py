@@ -6,8 +6,10 @@ import re
 import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
+from itertools import pairwise
 from typing import Any
 
+from edp.cli.names import FOCUS, SIMULATION
 from edp.config.control import CONTROL_SETTINGS, ControlExperiment
 from edp.config.experiment import SETTINGS, Experiment
 from edp.config.monitor import MONITOR_SETTINGS, MonitorExperiment
@@ -39,9 +41,8 @@ TABLES: Mapping[str, type] = {
 _ROOTS: Mapping[str, tuple[type, ...]] = {
     "simulate": (ScenarioFile,),
     "twin": (TwinExperiment,),
-    "identify": (TwinExperiment,),
-    "control": (ControlExperiment,),
-    "tune": (ControlExperiment,),
+    "calibrate": (TwinExperiment,),
+    "loop": (ControlExperiment,),
     "monitor": (MonitorExperiment,),
 }
 """What keys begin in, by the first word of a command; an experiment and the tables of commands for all others."""
@@ -58,6 +59,8 @@ def unknown_keys(words: tuple[str, ...], changes: list[str]) -> list[str]:
         changes: ``key.path=value`` each; placeholders without ``=`` are passed over.
     """
     command = words[0] if words else ""
+    if command == "train" and (FOCUS, SIMULATION) in pairwise(words):
+        command = "twin"
     keys = [change.partition("=")[0].strip() for change in changes if "=" in change]
     return [key for key in keys if key not in ("key", "key.path") and not _exists(command, key)]
 
