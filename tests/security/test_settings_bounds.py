@@ -295,7 +295,7 @@ def test_a_judgement_of_too_many_predictions_is_refused(monkeypatch):
     experiment = load_experiment(preset="small", overrides=[f"task.horizons={list(range(1, 1001))}"])
     task = experiment.task.resolve(100.0)
     net = build_model(task, experiment.model, blank_scaler(task), 0)
-    with pytest.raises(ConfigError, match=r"judge: 2,000 ticks of 1,000 horizon\(s\)"):
+    with pytest.raises(ConfigError, match=r"evaluation: 2,000 ticks of 1,000 horizon\(s\)"):
         judge(net, prepared(task, 2000), experiment.evaluation, "net")
 
 
