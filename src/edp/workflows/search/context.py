@@ -178,7 +178,7 @@ def set_apart(
         ConfigError: a session that is to be set apart is not there, or is named for both test sets.
         DataError: too few sessions for the folds.
     """
-    for part, named in (("test", spec.test), ("second", spec.second_test)):
+    for part, named in (("test", spec.test), ("second_test", spec.second_test)):
         strange = [name for name in named if name not in sessions]
         if strange:
             raise ConfigError(
