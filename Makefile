@@ -62,7 +62,7 @@ english: $(READY) ## the language: constructions and names that the style guide 
 	$(BIN)/python tests/language/english.py
 
 reading-test: $(READY) ## samples for a reader without the repository in build/reading/SEED; SEED=1
-	$(BIN)/python tests/language/reading_test.py --seed $(or $(SEED),0)
+	$(BIN)/python tests/language/reading.py --seed $(or $(SEED),0)
 
 docs-test: $(READY) ## every code block, command line, link, figure and length of the documentation
 	$(BIN)/python -m pytest $(SIDE_BY_SIDE) tests/site tests/examples tests/unit/test_language.py

@@ -35,8 +35,8 @@ TAKEN = {
     ("Sgd", "learning_rate"): {10**18},
     ("Soap", "learning_rate"): {10**18},  # up to what float32 holds; a training that diverges says so
     ("SearchSpec", "elastic"): {10**18},
-    ("MetaSpec", "inner_rate"): {10**18},
-    **{("FinetuneSpec", f"{name}rate"): {10**18} for name in ("backbone_", "head_", "inner_", "")},
+    ("MetaSpec", "inner_learning_rate"): {10**18},
+    **{("FinetuneSpec", f"{name}learning_rate"): {10**18} for name in ("backbone_", "head_", "inner_", "")},
     ("RecordingEntry", "rows"): {10**18},  # compared with the rows of the log
     **{("RowsFile", name): {10**18} for name in ("bytes", "changed_ns", "written_ns")},  # of the file system
     **{("ChannelMap", name): {10**18, -1e26} for name in ("constant", "scale")},  # any unit

@@ -100,13 +100,13 @@ def test_a_task_with_spans_survives_the_header_of_a_bundle():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"how": "change"}, "looks back over a span.*seconds = 0.1"),
-        ({"how": "difference", "seconds": 0.1}, "has no span.*'change' or 'trailing_mean'"),
-        ({"how": "change", "seconds": 0.0}, "seconds"),
-        ({"how": "change", "seconds": float("nan")}, "seconds"),
-        ({"how": "change", "seconds": 0.004}, r"0\.4 ticks at 100 Hz; from 1 to 4096"),
-        ({"how": "trailing_mean", "seconds": 0.01}, "from 2 to 4096 ticks"),
-        ({"how": "change", "seconds": 41.0}, "4100 ticks.*choose from 0.01 to 40.96 s"),
+        ({"how": "change"}, "looks back over a span.*span_s = 0.1"),
+        ({"how": "difference", "span_s": 0.1}, "has no span.*'change' or 'trailing_mean'"),
+        ({"how": "change", "span_s": 0.0}, "span_s"),
+        ({"how": "change", "span_s": float("nan")}, "span_s"),
+        ({"how": "change", "span_s": 0.004}, r"0\.4 ticks at 100 Hz; from 1 to 4096"),
+        ({"how": "trailing_mean", "span_s": 0.01}, "from 2 to 4096 ticks"),
+        ({"how": "change", "span_s": 41.0}, "4100 ticks.*choose from 0.01 to 40.96 s"),
     ],
 )
 def test_spans_that_cannot_be_are_one_error(options, message):

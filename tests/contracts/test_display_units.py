@@ -25,7 +25,7 @@ DIFFERENCES = {
     "monitor/detectable.py": "shifts of a channel",
     "evaluation/context.py": "errors",
     "evaluation/channel_importance.py": "errors",
-    "training.ensemble/perceptrons.py": "errors",
+    "training/bagging/perceptrons.py": "errors",
     "training/validation.py": "errors",
     "workflows/twin/judge_twin.py": "kept in a file; readers add `display_offset` to values",
     "training/compression/imitation.py": "errors",

@@ -306,8 +306,9 @@ def test_steered_sources_have_a_speed_and_others_do_not():
 
 @pytest.mark.parametrize(
     "words",
-    [["--log", "a.csv", "--rate", "100"], ["--log", "a.csv", "--seed", "0"], ["--log", "a.csv", "--free-s", "60"],
-     ["--udp", "0", "--speed", "1"], ["--sim", "M22", "--udp-bind", "127.0.0.1"], ["--ros2", "--map", "a.toml"],
+    [["--log", "a.csv", "--rate", "100"], ["--log", "a.csv", "--seed", "0"],
+     ["--log", "a.csv", "--rollout-seconds", "60"], ["--udp", "0", "--speed", "1"],
+     ["--sim", "M22", "--udp-bind", "127.0.0.1"], ["--ros2", "--map", "a.toml"],
      ["--udp", "0", "--rate", "nan"], ["--sim", "M22", "--rate", "1e308"], ["--udp", "0", "--bind", ""],
      ["--udp", "0", "--rate", "100", "--udp-bind", ""], ["--sim", "M22", "--speed", "nan"], ["--log", "a", "--yes"]],
     ids=" ".join,

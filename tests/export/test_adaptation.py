@@ -27,7 +27,7 @@ def adapted(bundle, **options):
     task, predictor = bundle.task, bundle.predictor
     centre, spread = usual_range(predictor)
     columns = tuple(task.inputs.index(name) for name in task.targets)
-    spec = AdaptationSpec(**({"rank": 3, "noise": 5.0, "judged_s": 0.3, "forgetting_s": 5.0} | options))
+    spec = AdaptationSpec(**({"rank": 3, "noise": 5.0, "evaluation_s": 0.3, "forgetting_s": 5.0} | options))
     shape = (len(task.horizons), len(task.targets))
     arrays = {
         "offset": centre,

@@ -72,7 +72,7 @@ def test_the_training_of_table_b1_is_what_is_printed_there():
     assert (training.weight_power, training.clip_norm, training.patience, training.epochs) == (2.0, 1.0, 8, 25)
     assert (training.loss.delta, training.optimizer.learning_rate, training.optimizer.weight_decay) == (1.5, 3e-4, 5e-4)
     assert (training.chunks.regime, training.chunks.length, training.chunks.batch) == ("window", 50, 32)
-    assert 3e-4 * training.schedule.floor == pytest.approx(1e-7, rel=0.02)
+    assert 3e-4 * training.schedule.min_lr_ratio == pytest.approx(1e-7, rel=0.02)
 
 
 def test_a_label_names_what_is_not_plain():

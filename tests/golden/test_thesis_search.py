@@ -161,9 +161,9 @@ def test_the_space_is_the_printed_one():
 def test_deferred_dimensions_set_what_they_say():
     base = context().base
     cosine = apply(base, {"schedule": "cosine", "patience": 3})["training"]["schedule"]
-    assert cosine == {"kind": "cosine", "warmup": 0.0, "floor": 0.0}
+    assert cosine == {"kind": "cosine", "warmup": 0.0, "min_lr_ratio": 0.0}
     plateau = apply(base, {"schedule": "plateau", "patience": 3})["training"]["schedule"]
-    assert (plateau["kind"], plateau["shrink"], plateau["patience"], plateau["threshold"]) == ("plateau", 0.5, 3, 1e-4)
+    assert (plateau["kind"], plateau["factor"], plateau["patience"], plateau["threshold"]) == ("plateau", 0.5, 3, 1e-4)
     smooth = apply(base, {"smoothness": 0.05})["training"]
     assert smooth["terms"] == [{"kind": "smoothness", "weight": 0.05}]
     assert smooth["chunks"]["consecutive"] == 4  # of a batch of 32: three are needed for a second difference
@@ -200,7 +200,7 @@ def test_budgets_are_the_printed_ones():
     spec = PLAN.spec
     assert spec.calibration == CalibrationSpec(trials=28, warm_rounds=6)
     assert (spec.screening.trials, spec.confirmation.alpha, spec.planning.power) == (10, 0.05, 0.8)
-    assert (spec.planning.least_effect, spec.planning.most_runs, spec.pruner, spec.sampler.kind) == (
+    assert (spec.planning.min_effect, spec.planning.max_runs, spec.pruner, spec.sampler.kind) == (
         0.02,
         25,
         "median",

@@ -17,7 +17,7 @@ HARD = st.sampled_from([np.nan, np.inf, -np.inf, 3e38, -3e38, 1e-40, 0.0, 1.0, -
 
 
 def law(horizons=(3,), inputs=5, targets=2, **options):
-    spec = AdaptationSpec(**({"rank": 2, "noise": 1.0, "judged_s": 2.0} | options))
+    spec = AdaptationSpec(**({"rank": 2, "noise": 1.0, "evaluation_s": 2.0} | options))
     rng = np.random.default_rng(0)
     shape = (len(horizons), targets)
     arrays = {

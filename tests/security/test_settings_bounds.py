@@ -101,7 +101,12 @@ def attempt(cls, name, listed, value):
 def test_the_fields_are_all_there():
     assert len(FIELDS) > 120
     names = {(cls.__name__, name) for cls, name, _ in FIELDS}
-    assert {("JudgeSpec", "skip"), ("TrainingSpec", "seed"), ("Plateau", "threshold"), ("HybridSpec", "units")} <= names
+    assert {
+        ("JudgeSpec", "warmup_samples"),
+        ("TrainingSpec", "seed"),
+        ("Plateau", "threshold"),
+        ("HybridSpec", "units"),
+    } <= names
 
 
 @pytest.mark.parametrize("cls", SPECS, ids=lambda cls: cls.__qualname__)
@@ -162,8 +167,8 @@ def test_the_bound_of_a_network_is_never_below_its_size(structure, predictor_of)
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("evaluation.warmup_samples=-5", r"judge: skip = -5; integers, 0 <= skip"),
-        ("evaluation.warmup_samples=-100000", r"skip = -100000"),
+        ("evaluation.warmup_samples=-5", r"evaluation: warmup_samples = -5; integers, 0 <= warmup_samples"),
+        ("evaluation.warmup_samples=-100000", r"warmup_samples = -100000"),
         ("model.window=true", r"model\.window = True: true and false are no numbers"),
         ("model.window=1000000000", r"window = 1000000000"),
         ("model.backbone.units=100000", r"units = 100000; integers, 1 <= units <= 4,096"),
@@ -197,7 +202,7 @@ def test_all_problems_are_still_told_at_once_and_long_ones_are_cut():
             overrides=["evaluation.warmup_samples=-5", "training.seed=-1", "model.window=0", "x" * 5000 + "=1"]
         )
     text = str(caught.value)
-    for part in ("4 problems", "skip = -5", "seed = -1", "window = 0", "unknown key 'xxx"):
+    for part in ("4 problems", "evaluation: warmup_samples = -5", "seed = -1", "window = 0", "unknown key 'xxx"):
         assert part in text
     assert len(text) < 1000
     with pytest.raises(ConfigError, match="and 950 more"):
@@ -290,7 +295,7 @@ def test_a_judgement_of_too_many_predictions_is_refused(monkeypatch):
     experiment = load_experiment(preset="small", overrides=[f"task.horizons={list(range(1, 1001))}"])
     task = experiment.task.resolve(100.0)
     net = build_model(task, experiment.model, blank_scaler(task), 0)
-    with pytest.raises(ConfigError, match=r"judge: 2,000 ticks of 1,000 horizon\(s\)"):
+    with pytest.raises(ConfigError, match=r"evaluation: 2,000 ticks of 1,000 horizon\(s\)"):
         judge(net, prepared(task, 2000), experiment.evaluation, "net")
 
 

@@ -56,7 +56,7 @@ def test_stretches_are_whole_two_minutes_of_all_recordings_and_stay_on_disk(stor
 def test_an_inspection_says_that_it_looked_at_a_part_of_the_data(store):
     source = DataSource(store, at_most_h=0.2)
     ours = source.inspect()
-    (note,) = [finding for finding in ours.findings if "--at-most" in finding.advice]
+    (note,) = [finding for finding in ours.findings if "--max-hours" in finding.advice]
     stretches = draw_recordings(DataSource.from_path(store).read(), 0.2)
     assert note.what.startswith(f"looked at 0.2 of 0.6278 h: {len(stretches)} evenly spread")
     assert not DataSource(store, at_most_h=5.0).inspect().findings

@@ -10,7 +10,7 @@ import edp
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "language"))
 import english
-import reading_test
+import reading
 
 OLD = (
     "What a training that ends here gives; this one is over with it.",
@@ -67,15 +67,15 @@ def test_docstrings_of_the_public_interface_have_no_findings():
 
 
 def test_reading_test_draws_the_same_items_for_a_seed_without_file_names(tmp_path):
-    items = reading_test.draw_items(3)
-    assert items == reading_test.draw_items(3) != reading_test.draw_items(4)
-    assert Counter(item.kind for item in items)["docstring"] == reading_test.COUNTS["docstring"]
-    reading_test.write_items(items, tmp_path)
+    items = reading.draw_items(3)
+    assert items == reading.draw_items(3) != reading.draw_items(4)
+    assert Counter(item.kind for item in items)["docstring"] == reading.COUNTS["docstring"]
+    reading.write_items(items, tmp_path)
     text = (tmp_path / "items.md").read_text()
     assert text.count("\n## ") == len(items)
     assert "src/edp" not in text.replace("``src/edp``", "")
 
 
 def test_score_counts_unmarked_items_as_wrong_and_leaves_controls_out():
-    key = {"1": {"kind": "name"}, "2": {"kind": "name"}, "3": {"kind": reading_test.CONTROL}}
-    assert reading_test.score(key, {"1": True, "3": True}) == {"name": 0.5, "all": 0.5, "control": 1.0}
+    key = {"1": {"kind": "name"}, "2": {"kind": "name"}, "3": {"kind": reading.CONTROL}}
+    assert reading.score(key, {"1": True, "3": True}) == {"name": 0.5, "all": 0.5, "control": 1.0}

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
+from edp.config.experiment import SETTINGS, Experiment
 from edp.errors import ConfigError
 from edp.settings.tree import SettingsTree
 
@@ -58,3 +59,12 @@ def test_plain_values_come_back_as_they_were_built():
     built = TREE.build(Outer, table, "'a.toml'")
     assert built == Outer(True, (1.0, 2.5), (0.0, 2.0), ((1.0, 2.0),), {"a": 1.0}, Inner(3))
     assert TREE.build(Outer, TREE.to_dict(built), "'a.toml'") == built
+
+
+def test_earlier_keys_of_a_part_are_renamed_unless_its_kind_is_unknown():
+    """An unknown kind may be that of a plug-in that is not loaded yet; its keys are its own."""
+    for kind in ({"kind": "committee"}, {}):
+        renamed = SETTINGS.renamed(Experiment, {"model": {"backbone": {**kind, "near": [1]}}})
+        assert renamed == {"model": {"backbone": {**kind, "local_lags": [1]}}}
+    foreign = {"model": {"backbone": {"kind": "of_a_plug_in", "near": [1]}}}
+    assert SETTINGS.renamed(Experiment, foreign) == foreign

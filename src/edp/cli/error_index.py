@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+from edp.storage.paths import files_below
+
 PACKAGE = Path(__file__).parents[1]
 DIGITS = 6
 VALUE = "..."
@@ -80,7 +82,7 @@ class ErrorMessage:
 
 def list_messages() -> tuple[ErrorMessage, ...]:
     """Return the error messages of EDP, sorted by module, then in the order of the source code."""
-    messages = [message for path in sorted(PACKAGE.rglob("*.py")) for message in _read_messages(path)]
+    messages = [message for path in sorted(files_below(PACKAGE, "*.py")) for message in _read_messages(path)]
     return tuple({message.identifier: message for message in reversed(messages)}.values())[::-1]
 
 
@@ -105,7 +107,7 @@ def _find_sources(text: str) -> Iterator[Path]:
     """Yield the source files with two consecutive words of a message; reading is much faster than parsing."""
     words = text.split()
     phrases = {" ".join(words[i : i + 2]) for i in range(max(len(words) - 1, 1))}
-    for path in sorted(PACKAGE.rglob("*.py")):
+    for path in sorted(files_below(PACKAGE, "*.py")):
         source = _read_text(path)
         if any(phrase in source for phrase in phrases):
             yield path

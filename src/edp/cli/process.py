@@ -57,7 +57,7 @@ ADVICE = {
     "simulate": "fewer --workers, or more and shorter recordings",
     "screen": "fewer recordings or channels",
     "report": "fewer recordings judged, or a shorter data set",
-    "search": "fewer --workers, or a cap --memory on each training",
+    "search": "fewer --workers, or a cap --max-memory on each training",
 }
 
 

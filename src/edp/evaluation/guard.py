@@ -224,7 +224,7 @@ def network_verdict(scores: ScoresFile, minutes: float | None = None) -> ErrorVe
         return None
     unit = "minute" if minutes == 1 else "minutes"
     advice = (
-        ADVICE if minutes is None else f"give it more than {figure(minutes)} {unit} (--minutes), or more recordings"
+        ADVICE if minutes is None else f"give it more than {figure(minutes)} {unit} (--time-budget), or more recordings"
     )
     horizons, network, ratios = scores.task.horizons, models[NETWORK], []
     for name, model in models.items():

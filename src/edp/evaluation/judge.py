@@ -327,9 +327,9 @@ def _check_memory(predictor: Predictor, data: Prepared, spec: JudgeSpec) -> None
     each = 4 * (2 + 2 * len(predictor.spec.output.coverages)) + 3 * 8  # predictions, intervals; truth, errors: doubles
     check_setting(
         ticks * ends * each,
-        f"judge: {sum(series.samples for series in data.test):,} ticks of {len(task.horizons):,} horizon(s) of "
+        f"evaluation: {sum(series.samples for series in data.test):,} ticks of {len(task.horizons):,} horizon(s) of "
         f"{len(task.targets):,} target(s)",
-        "judge fewer recordings, or predict fewer horizons",
+        "evaluate fewer recordings, or predict fewer horizons",
     )
 
 

@@ -228,7 +228,7 @@ def read_study(path: str | Path) -> StudyFile:
     if is_folder_at(file) or file.suffix != ".json":
         file = file / FILE
         if not is_file_at(file):
-            raise StorageError(f"'{path}' holds no study ({FILE} is missing); give the folder of edp search --study")
+            raise StorageError(f"'{path}' holds no study ({FILE} is missing); give the folder of edp search --out")
     return parse_study(read_json(file), str(file))
 
 

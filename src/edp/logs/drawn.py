@@ -40,7 +40,7 @@ def check_hours(hours: float) -> float:
         ConfigError: not a positive, finite number.
     """
     if not 0.0 < hours < float("inf"):
-        raise ConfigError(f"--at-most {setting_text(hours)}: a positive number of hours must hold")
+        raise ConfigError(f"--max-hours {setting_text(hours)}: a positive number of hours must hold")
     return hours
 
 
@@ -56,4 +56,4 @@ def findings_of_part(recordings: Sequence[Recording], of_hours: float) -> tuple[
     drawn = Drawn(hours, of_hours, len(recordings))
     if drawn.hours == drawn.of_hours:
         return ()
-    return (Finding("note", None, f"looked at {drawn.what}", drawn.stretches, "", "leave --at-most out for all"),)
+    return (Finding("note", None, f"looked at {drawn.what}", drawn.stretches, "", "leave --max-hours out for all"),)

@@ -330,7 +330,7 @@ class DataSource:
             )
         if self.at_most_h is not None:
             raise ConfigError(
-                f"--at-most {setting_text(self.at_most_h)} came with '{self.path}', which is no store; read the logs "
+                f"--max-hours {setting_text(self.at_most_h)} came with '{self.path}', which is no store; read the logs "
                 "once "
                 "with `edp data store build LOGS --out STORE`, and give this command the store"
             )

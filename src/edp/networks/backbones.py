@@ -315,7 +315,7 @@ class CommitteeSpec:
 
     def parts(self) -> tuple[str, ...]:
         """Return the members and the radial basis functions; differences and trees are not trained by gradients."""
-        return ("groups", *(["radial"] if self.centres else []), *(["local_lags"] if self.local_lags else []))
+        return ("groups", *(["radial"] if self.centres else []), *(["near"] if self.local_lags else []))
 
     def build(self, features: int, window: int, blocks: Blocks, outputs: int = 1) -> tuple[Streaming, int]:
         """Build the bank of differences, and the members and trees on it."""

@@ -24,11 +24,13 @@ def check_near(near: Sequence[int], lags: Sequence[int], centres: int) -> None:
     """
     if list(near) != sorted(set(near)) or any(span != 0 and span not in lags for span in near):
         raise ConfigError(
-            f"near: {shown(near)}; spans that rise, each 0 for present values alone or among lags = {shown(lags)}, "
-            "must hold"
+            f"local_lags: {shown(near)}; spans that rise, each 0 for present values alone or among "
+            f"lags = {shown(lags)}, must hold"
         )
     if near and not centres:
-        raise ConfigError(f"near: {shown(near)} with centres = 0, which makes no basis functions; give centres as well")
+        raise ConfigError(
+            f"local_lags: {shown(near)} with centres = 0, which makes no basis functions; give centres as well"
+        )
 
 
 class RadialFeatures(Streaming):

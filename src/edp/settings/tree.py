@@ -227,8 +227,8 @@ class SettingsTree:
     def renamed(self, cls: type, table: Mapping[str, object], path: str = "") -> dict[str, object]:
         """Return a table that a user gave with the keys of this version, before it is merged with other tables.
 
-        Tables need not be complete: where a part does not name its kind, all kinds count. Earlier keys are recorded
-        for a notice.
+        Tables need not be complete: where a part does not name its kind, all kinds count; the table of an unknown kind
+        is unchanged. Earlier keys are recorded for a notice.
 
         Args:
             cls: dataclass of the table.
@@ -263,8 +263,9 @@ class SettingsTree:
         if name in self.parts:
             kind = value.get("kind")
             registry = self.parts[name]
-            named = isinstance(kind, str) and kind in registry
-            classes = [registry[str(kind)]] if named else list(registry.values())
+            # An unknown kind may be that of a plug-in that is not loaded yet, whose keys are not those of other kinds.
+            known = isinstance(kind, str) and kind in registry
+            classes = [registry[str(kind)]] if known else [] if "kind" in value else list(registry.values())
         else:
             forms = [_form(_strip_optional(hint)) for hint in hints]
             classes = [cls for form in forms for cls in (form.table, form.item) if cls is not None]

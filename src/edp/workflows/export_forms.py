@@ -82,7 +82,7 @@ def _follower(order: ExportOrder) -> list[Path]:
 
     if order.twin is None:
         raise ConfigError(
-            f"--to {order.to} needs --twin GREY, the run of a grey box (edp twin --set twin.kind=greybox)"
+            f"--format {order.to} needs --twin GREY, the run of a grey box (edp twin --set twin.kind=greybox)"
         )
     return export_follower(order.run, order.twin, order.folder, order.name, order.options)
 
@@ -114,7 +114,7 @@ def export_run(order: ExportOrder) -> Exported:
     """
     if order.to not in all_forms():
         raise ConfigError(
-            f"unknown export target '{order.to}'{closest(order.to, all_forms())}; `edp export --forms` lists them"
+            f"unknown export target '{order.to}'{closest(order.to, all_forms())}; `edp export --formats` lists them"
         )
     form, monitor = RUN_FORMS.get(order.to), holds_monitor(order.run)
     if order.twin is not None and (form is None or not form.follows):

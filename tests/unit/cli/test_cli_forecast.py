@@ -127,7 +127,9 @@ def test_logs_are_there_all_together_or_not_at_all(edp, run, logs, tmp_path):
     assert [path.name for path in (tmp_path / "ahead").iterdir()] == ["0001_first.parquet"]
 
 
-@pytest.mark.parametrize(("option", "value"), [("--ahead", "0"), ("--ahead", "1000000000000"), ("--gain", "2")])
+@pytest.mark.parametrize(
+    ("option", "value"), [("--horizon", "0"), ("--horizon", "1000000000000"), ("--observer-gain", "2")]
+)
 def test_numbers_that_cannot_be_are_refused_before_logs_are_read(edp, run, tmp_path, option, value):
     ended = edp("data", "add-forecasts", run, tmp_path / "missing", "--out", tmp_path / "ahead", option, value)
     assert ended.code == 1

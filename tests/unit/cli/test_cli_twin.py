@@ -342,7 +342,7 @@ def test_channels_that_stay_measured(edp, logs, trained, tmp_path):
         ),
         (
             ["--from", 11, "--rollout-seconds", 5],
-            "goes beyond the end of 'actuators_1' at 12 s; at most --seconds 0.98 from there",
+            "goes beyond the end of 'actuators_1' at 12 s; at most --rollout-seconds 0.98 from there",
         ),
         (["--from", 50], "goes beyond the end.*begin earlier"),
         (["--rollout-seconds", -1], "--rollout-seconds: got -1.0, expected 0 < rollout_seconds"),

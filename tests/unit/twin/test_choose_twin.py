@@ -147,7 +147,7 @@ def test_trainings_that_a_budget_has_no_time_for_are_left_out(run, monkeypatch):
     _, tried = choice(run, candidates=("recurrent",), minutes=6.0).best()
     assert trained == [key for key in [*errors][:3] for _ in range(5)]
     assert [one.error for one in tried] == [0.9, 0.8, 0.85, None]
-    assert tried[-1].why == "about 8 min of counted time with those before it, of minutes = 6"
+    assert tried[-1].why == "about 8 min of counted time with those before it, of time_budget_min = 6"
     with Run(run.path / "again") as other:
         result, tried = choice(other, candidates=("static", "recurrent"), minutes=0.5).best()
     assert result.spec == StaticMap(prefix_ticks=20)

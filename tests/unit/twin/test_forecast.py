@@ -113,13 +113,13 @@ def test_far_horizons_take_no_more_memory(machine, monkeypatch):
 
 @pytest.mark.parametrize("horizons", [(), (0,), (3, 3), (1.5,), (True,), (1001,), (10**12,)])
 def test_horizons_that_cannot_be_are_refused(machine, horizons):
-    with pytest.raises(ConfigError, match="--ahead"):
+    with pytest.raises(ConfigError, match="--horizon"):
         forecast(*machine, horizons)
 
 
 @pytest.mark.parametrize("gain", [-0.1, 1.1, float("nan")])
 def test_a_gain_outside_zero_to_one_is_refused(machine, gain):
-    with pytest.raises(ConfigError, match="--gain"):
+    with pytest.raises(ConfigError, match="--observer-gain"):
         forecast(*machine, AHEAD, gain)
 
 

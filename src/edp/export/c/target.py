@@ -1,4 +1,4 @@
-"""``--to c``: the folder of a model with its runtime, test and example."""
+"""``--format c``: the folder of a model with its runtime, test and example."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``--to casadi``: a module and data from which CasADi builds the step, and the C code behind an external function."""
+"""``--format casadi``: a module and data from which CasADi builds the step, and C code behind an external function."""
 
 from __future__ import annotations
 

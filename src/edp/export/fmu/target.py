@@ -1,4 +1,4 @@
-"""``--to fmu``: a predictor as units of FMI 2.0 and 3.0 for co-simulation."""
+"""``--format fmu``: a predictor as units of FMI 2.0 and 3.0 for co-simulation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Export target ``--to onnx``: the graphs of a network, and files that describe inputs and outputs."""
+"""Export target ``--format onnx``: the graphs of a network, and files that describe inputs and outputs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``--to ros2``: a package for ROS 2 in Python around the C code, float32 or w8a16."""
+"""``--format ros2``: a package for ROS 2 in Python around the C code, float32 or w8a16."""
 
 from __future__ import annotations
 

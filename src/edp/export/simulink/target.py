@@ -1,4 +1,4 @@
-"""``--to simulink``: a folder that an engineer opens in MATLAB."""
+"""``--format simulink``: a folder that an engineer opens in MATLAB."""
 
 from __future__ import annotations
 

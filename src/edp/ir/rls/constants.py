@@ -26,6 +26,8 @@ BOUND = 4.0
 """Coefficients are held within so many prior spreads."""
 BETTER = 0.01
 """Share by which the correction must be better than nothing to go out again."""
+_KEYS_OF_DIGEST = {"dead_zone": "rest", "evaluation_s": "judged_s"}
+"""Keys of earlier versions in the digest: a state that a controller of such a version saved contains its digest."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,11 +191,10 @@ class Adaptation:
 
     @property
     def digest(self) -> str:
-        # Sorted, so that the digest depends on the content and not on the order of fields.
         """Content address."""
         plain = self.to_dict()
-        # The word before bundles of schema 8: a state that a controller saved bears the digest.
-        plain["spec"] = {"rest" if key == "dead_zone" else key: value for key, value in plain["spec"].items()}
+        plain["spec"] = {_KEYS_OF_DIGEST.get(key, key): value for key, value in plain["spec"].items()}
+        # Sorted, so that the digest depends on the content and not on the order of fields.
         state = hashlib.blake2b(repr(sorted(plain.items())).encode(), digest_size=16)
         for name, values in sorted(self.arrays().items()):
             state.update(repr((name, values.shape)).encode() + values.astype("<f4").tobytes())

@@ -46,7 +46,7 @@ def check_horizons(horizons: Sequence[int]) -> None:
     wrong = [k for k in horizons if not allowed.holds(k)]
     if not horizons or wrong or len(set(horizons)) < len(horizons):
         came = f"{wrong[0]}" if wrong else ", ".join(map(str, horizons)) or "none"
-        raise ConfigError(f"--ahead {came}: {allowed.rule('ahead')} must hold, each number once")
+        raise ConfigError(f"--horizon {came}: {allowed.rule('horizon')} must hold, each number once")
 
 
 def check_gain(gain: float) -> None:
@@ -57,7 +57,7 @@ def check_gain(gain: float) -> None:
     """
     allowed = span(0.0, 1.0)
     if not allowed.holds(gain):
-        raise ConfigError(f"--gain {gain}: {allowed.rule('gain')} must hold")
+        raise ConfigError(f"--observer-gain {gain}: {allowed.rule('observer_gain')} must hold")
 
 
 def choose_gain(twin: Twin, series: Sequence[Series], horizons: Sequence[int]) -> float:

@@ -119,7 +119,7 @@ class SearchStudy:
 
 
 def load_study(path: str | Path) -> SearchStudy:
-    """Load a model search from the folder of ``edp search --study``, finished or not.
+    """Load a model search from the folder of ``edp search --out``, finished or not.
 
     Raises:
         StorageError: no study, or one of another version.

@@ -136,7 +136,7 @@ def _refuse_settings_of_chunks(asked: TrainingSpec, before: TrainingSpec) -> Non
         raise ConfigError(
             f"training.{', training.'.join(changed)}: the student of a committee learns on rows of its bank, and reads "
             "training.seed and training.threads alone; leave them out, or give an objective to train in chunks, for "
-            "example --set distil.objective.truth=0.5"
+            "example --set distil.objective.target_weight=0.5"
         )
 
 

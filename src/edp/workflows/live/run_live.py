@@ -129,7 +129,8 @@ class LiveRun:
         models = models_of(order.run)
         if models.twin is None and order.free_s is not None:
             raise ConfigError(
-                "--free-s belongs to a twin, and no run folder of edp twin was given; leave --free-s out, or give one"
+                "--rollout-seconds belongs to a twin, and no run folder of edp twin was given; leave the option "
+                "out, or give one"
             )
         preparing = (source or SOURCES[order.source]).preparing
         if preparing:

@@ -97,7 +97,7 @@ def forecast_logs(
     bundle = load_twin(run)
     twin = bundle.twin
     velocities = [channel.name for channel in twin.channels.velocities]
-    columns = answer_columns(twin, list(dict.fromkeys(answers or velocities)), "--answer")
+    columns = answer_columns(twin, list(dict.fromkeys(answers or velocities)), "--channel")
     _refuse_used(Path(out))
     recordings = source.read()
     if gain is None:

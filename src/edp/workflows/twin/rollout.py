@@ -136,7 +136,8 @@ def _span(twin: Twin, recording: Recording, seconds: float, start_s: float | Non
     """Return the first tick of a free run and its length, which both lie in the log."""
     rate, prefix = recording.rate_hz, twin.prefix_ticks
     if not above(0.0, MAX_SECONDS).holds(seconds):
-        raise ConfigError(f"--seconds {setting_text(seconds)}: {above(0.0, MAX_SECONDS).rule('seconds')} must hold")
+        rule = above(0.0, MAX_SECONDS).rule("rollout_seconds")
+        raise ConfigError(f"--rollout-seconds {setting_text(seconds)}: {rule} must hold")
     if start_s is not None and not span(0.0, MAX_SECONDS).holds(start_s):
         raise ConfigError(f"--from {setting_text(start_s)}: {span(0.0, MAX_SECONDS).rule('from')} must hold")
     start = prefix if start_s is None else round(start_s * rate)
@@ -156,7 +157,7 @@ def _span(twin: Twin, recording: Recording, seconds: float, start_s: float | Non
     # One more row than answers: the last answer is compared with the tick after the last command.
     if start + ticks + 1 > recording.samples:
         longest = (recording.samples - 1 - start) / rate
-        room = f"at most --seconds {setting_text(longest)} from there" if longest > 0 else "begin earlier"
+        room = f"at most --rollout-seconds {setting_text(longest)} from there" if longest > 0 else "begin earlier"
         raise DataError(
             f"a free run of {typed(seconds)} s from {typed(start / rate)} s goes beyond the end of "
             f"'{recording.name}' at "

@@ -4,7 +4,7 @@
    names, and 10 % of its docstrings are controls from other projects.
 2. A reader without the repository writes ``answers.json``: ``{"1": "one sentence, or unclear", ...}``.
 3. A second reader with the code and ``key.json`` writes ``marks.json``: ``{"1": true, ...}``, true if right.
-4. ``python tests/language/reading_test.py --score FOLDER`` prints the fraction understood by kind against the targets.
+4. ``python tests/language/reading.py --score FOLDER`` prints the fraction understood by kind against the targets.
 """
 
 from __future__ import annotations
