@@ -139,7 +139,7 @@ KINDS = {
     **{f"{name} on chunks": {"augmentations": (AUGMENTATIONS[name](),)} for name in AUGMENTATIONS},
     **{f"{name} on windows": {"augmentations": (AUGMENTATIONS[name](),), "chunks": WINDOWS} for name in AUGMENTATIONS},
     **{name: {"average": AVERAGES[name]()} for name in AVERAGES},
-    "swa throughout": {"average": AVERAGES["swa"](share=0.7, rate=0.0)},
+    "swa throughout": {"average": AVERAGES["swa"](fraction=0.7, lr_ratio=0.0)},
     "adaptive weights": {"adaptive": AdaptiveWeights(blend=0.5), "horizon_decay": 0.5},
     "terms": {"terms": tuple(TERMS[name]() for name in TERMS)},
     "terms on windows": {"terms": tuple(TERMS[name]() for name in TERMS), "chunks": WINDOWS},

@@ -124,7 +124,7 @@ class FreeRunSpec:
             )
         if self.measured_fraction + self.mixed_fraction >= 1.0:
             raise ConfigError(
-                f"free runs: measured_fraction = {setting_text(self.measured_fraction)} and mixed_share = "
+                f"free runs: measured_fraction = {setting_text(self.measured_fraction)} and mixed_fraction = "
                 f"{setting_text(self.mixed_fraction)} leave no "
                 "lane that runs free; a sum below 1 must hold"
             )

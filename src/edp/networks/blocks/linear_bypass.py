@@ -44,7 +44,7 @@ class LinearBypass:
     def __post_init__(self) -> None:
         check_bounds("linear_bypass", self, taps=integer(1, MAX_KERNEL))
         if self.init not in STARTS:
-            raise ConfigError(f"linear_bypass: unknown start '{self.init}'{closest(self.init, STARTS)}")
+            raise ConfigError(f"linear_bypass: unknown init '{self.init}'{closest(self.init, STARTS)}")
         # A map that starts at zero and never changes adds nothing; the combination is refused, not ignored.
         if self.init == "zero" and not self.trainable:
             raise ConfigError("linear_bypass: init = 'zero' with trainable = false does nothing; change one of them")

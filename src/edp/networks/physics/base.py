@@ -77,10 +77,10 @@ class PhysicsSpec(ABC):
                 "velocities these names in the signal map, or remove model.physics"
             )
         # The regression predicts the whole target; a physics base added to it would count the velocity twice.
-        if any(getattr(block, "start", "zero") != "zero" for block in model.blocks):
+        if any(getattr(block, "init", "zero") != "zero" for block in model.blocks):
             return (
                 f"{name} would be added to the regression of the whole target, from which linear_bypass starts; set "
-                "its start = 'zero', or remove one of them"
+                "its init = 'zero', or remove one of them"
             )
         return None
 

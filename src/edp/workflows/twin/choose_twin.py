@@ -225,7 +225,7 @@ class TwinChoice:
     def _skip_training(self, form: Recurrent, training: FreeRunSpec, seconds: float) -> TwinCandidate:
         """Return a training that is left out, with the reason."""
         why = (
-            f"about {typed(seconds / 60.0, 2)} min of counted time with those before it, of minutes = "
+            f"about {typed(seconds / 60.0, 2)} min of counted time with those before it, of time_budget_min = "
             f"{setting_text(self.auto.time_budget_min)}"
         )
         return TwinCandidate(labelled(form, training), 0.0, why=why)
