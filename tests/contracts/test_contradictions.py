@@ -79,7 +79,7 @@ REFUSED = [
         ModelSpec(backbone=BACKBONES["committee"](trees=1)),
         "would read 70,000 columns",
     ),
-    ("hybrid", reads("hybrid"), with_physics("hybrid", "linear_bypass"), "start = 'zero'"),
+    ("hybrid", reads("hybrid"), with_physics("hybrid", "linear_bypass"), "init = 'zero'"),
 ]
 ALONE = {name: make() for registry in REGISTRIES for name, make in registry.items() if issubclass(make, HasConflicts)}
 

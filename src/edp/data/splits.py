@@ -165,7 +165,7 @@ class ByTime:
         if self.validation_fraction + self.test_fraction >= 1:
             raise ConfigError(
                 f"split: validation_fraction = {self.validation_fraction}, test_fraction = {self.test_fraction}; "
-                "validation_share + test_share must be below 1"
+                "validation_fraction + test_fraction must be below 1"
             )
 
     def split(self, recordings: Sequence[Recording], gap: int) -> Split:

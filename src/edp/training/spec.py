@@ -209,7 +209,7 @@ def _list_bagging_conflicts(model: ModelSpec, spec: TrainingSpec, bagging: Baggi
     reasons = []
     if not isinstance(model.backbone, CommitteeSpec) or not isinstance(model.head, LinearHead):
         reasons.append(
-            "bagging trains model.backbone = 'committee' with model.head = 'linear'; take these, or leave it"
+            "training.ensemble trains model.backbone = 'committee' with model.head = 'linear'; take these, or leave it"
         )
     elif model.backbone.members % (bagging.folds * (2 if bagging.huber_delta else 1)):
         twice = "twice " if bagging.huber_delta else ""

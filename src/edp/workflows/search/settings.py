@@ -205,7 +205,7 @@ class CompressionSpec:
             "updates": integer(0, MAX_UPDATES),
         }
         check_bounds("compression", self, **bounds)
-        wrong = [] if self.width_fractions else ["shares = [] (at least one)"]
+        wrong = [] if self.width_fractions else ["width_fractions = [] (at least one)"]
         for name in self.formats:
             if name not in FORMATS:
                 wrong.append(f"formats = {shown(name)} ({', '.join(FORMATS)}{closest(name, FORMATS)})")
