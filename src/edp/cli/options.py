@@ -104,7 +104,7 @@ DEPENDENT: Mapping[tuple[str, str], str] = {
     ("train pretrain", "changes.pretrain"): "an episodic method",
     ("report", "limit"): "the run of a network, which looks a fixed time ahead",
     ("report", "budget"): "the run of a network (edp compress estimate takes twins)",
-    ("search run", "budget"): "phase 6 (search.compression.on)",
+    ("search run", "budget"): "phase 6 (search.compression.enabled)",
     **{("data screen", f"changes.{table}"): "--trials" for table in TRIAL_TABLES},
     ("simulate", "changes.limit"): "--limit",
     ("train run", "time_budget"): "the preset auto",
@@ -138,7 +138,7 @@ _SAME = {
     "train pretrain": "inner_rate inner_steps shots",
     "data screen": "trusted",
 }
-_KEYS = {**KEYS["FinetuneSpec"], **KEYS["MetaSpec"]}
+_KEYS = {**KEYS["FinetuneSpec"], **KEYS["MetaSpec"], **KEYS["ScreeningSpec"]}
 FORMER = {
     (command, name): f"{_TABLES[command]}.{_KEYS.get(name, name)}=VALUE"
     for command, names in _SAME.items()

@@ -201,7 +201,7 @@ def set_apart(
         second = named or _draw_sessions(rest, families, [spec.seed, 0x7E58], count)
     development = tuple(name for name in sessions if name not in (*test, *second))
     if not _fills_folds(len(development), spec):
-        less = "a smaller test_share" + (", --set search.compression.on=false" if second else "")
+        less = "a smaller test_fraction" + (", --set search.compression.enabled=false" if second else "")
         raise DataError(
             f"{len(sessions)} sessions came: {len(test)} are set apart as test"
             + (f", {len(second)} for phase 6" if second else "")

@@ -48,7 +48,7 @@ class CompressionPhase:
         """Train teacher and students of each width, round the better ones, evaluate the choice on the test set."""
         if not context.spec.compression.enabled:
             yield from ()
-            return Decision(NAME, SmallerFacts(on=False), ("Left out: search.compression.on is false.",))
+            return Decision(NAME, SmallerFacts(on=False), ("Left out: search.compression.enabled is false.",))
         teacher_arm = teacher_of(context)
         # The teacher first: all others are made of it.
         (first,) = yield [order_of(context, teacher_arm, recipe_of(context))]
