@@ -47,12 +47,12 @@ class ErrorMessage:
 
     @property
     def cause(self) -> str:
-        """What was found: the template up to its remedy."""
+        """Finding: the template up to its remedy."""
         return self.template.partition("; ")[0]
 
     @property
     def remedy(self) -> str:
-        """What to do: the template after the first semicolon; empty for a message without one."""
+        """Remedy: the template after the first semicolon; empty for a message without one."""
         return self.template.partition("; ")[2]
 
     def fits(self, text: str) -> bool:
@@ -103,7 +103,7 @@ def identify(error: BaseException) -> str:
 
 
 def _find_sources(text: str, length: int) -> Iterator[Path]:
-    """Yield the source files with so many consecutive words of a message; reading is much faster than parsing."""
+    """Yield the source files that contain ``length`` consecutive words of a message; reading is faster than parsing."""
     words = text.split()
     phrases = {" ".join(words[i : i + length]) for i in range(max(len(words) - length + 1, 1))}
     for path in sorted(PACKAGE.rglob("*.py")):

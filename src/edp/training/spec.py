@@ -214,8 +214,8 @@ def _list_bagging_conflicts(model: ModelSpec, spec: TrainingSpec, bagging: Baggi
     elif model.backbone.members % (bagging.folds * (2 if bagging.huber_delta else 1)):
         twice = "twice " if bagging.huber_delta else ""
         reasons.append(
-            f"training.ensemble.folds = {bagging.folds} with {model.backbone.members} members; a multiple of {twice}the "
-            f"folds must hold{' with training.ensemble.huber_delta' if twice else ''}"
+            f"training.ensemble.folds = {bagging.folds} with {model.backbone.members} members; a multiple of {twice}"
+            f"the folds must hold{' with training.ensemble.huber_delta' if twice else ''}"
         )
     parts = [
         name

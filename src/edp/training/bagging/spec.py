@@ -79,6 +79,6 @@ class BaggingSpec:
         )
         if self.tree_max_leaves == 1:
             raise ConfigError(
-                "training.ensemble: tree_max_leaves = 1, but a tree of one leaf splits nothing; 2 or more must hold, or "
-                "0 for as many as the depth allows"
+                "training.ensemble: tree_max_leaves = 1, but a tree of one leaf splits nothing; 2 or more must hold, "
+                "or 0 for as many as the depth allows"
             )
