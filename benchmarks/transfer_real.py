@@ -68,7 +68,7 @@ def transferred(regimes: Regimes, work: Path, quick: bool, seed: int) -> dict[st
     changes = [f"training.seed={seed}", "training.threads=1", *CHANGES, *(["training.epochs=2"] if quick else [])]
     experiment = load_experiment(EXAMPLES / regimes.settings, OWN_NETWORK, changes)
     train(DataSource.from_path(work / "source"), experiment, work / "run")
-    specs = [replace(SPEC, single_phase_epochs=2)] if quick else [replace(SPEC, rate=rate) for rate in RATES]
+    specs = [replace(SPEC, single_phase_epochs=2)] if quick else [replace(SPEC, learning_rate=rate) for rate in RATES]
     logs = DataSource.from_path(work / "target")
     tried = {work / f"tuned_{number}": FinetuneRequest(spec=spec, method=OURS) for number, spec in enumerate(specs)}
     for folder, order in tried.items():

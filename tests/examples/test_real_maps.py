@@ -134,7 +134,7 @@ def test_the_default_twin_is_held_against_the_best_of_its_rivals(scripts):
     errors = {"twin": 0.4, "static": 1.0, "arx": 0.5, "n4sid": 2.0}
     row = {"errors": errors, "diverged": dict.fromkeys(errors, 0.0), "chosen": "x", "promise": 0.5, "processor_s": 1.0}
     first, second, mean = twins.show({"one": row, "two": row | {"errors": errors | {"twin": 0.6}}}, quick=True)
-    assert (first.met, second.met) == (True, False)
+    assert (first.is_met, second.is_met) == (True, False)
     assert (first.ratio, second.ratio) == (pytest.approx(0.8), pytest.approx(1.2))
     assert mean.ratio == pytest.approx(np.sqrt(0.8 * 1.2))
 

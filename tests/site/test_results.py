@@ -146,7 +146,7 @@ def test_the_leaderboard_begins_with_headlines_and_has_every_verdict_and_goal():
 def test_a_benchmark_page_has_its_results_and_where_its_script_is(page):
     text = results.benchmark_page(ALL, page)
     assert "/tmp/" not in text
-    for result in ALL.of_script(page.script):
+    for result in ALL.find_by_script(page.script):
         section = text.split(f"\n## {result.name}\n")[1].split("\n## ")[0]
         assert result.date in section
         archived = [one for one in ALL.archive if one.covers(result)]

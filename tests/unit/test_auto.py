@@ -99,7 +99,7 @@ def test_a_finished_run_is_read_again_and_another_one_refused(result):
     [
         (["model.window=5"], "chooses the network"),
         (["training.epochs=5"], "chooses the network"),
-        (["auto.time_budget_min=0"], "minutes"),
+        (["auto.time_budget_min=0"], "time_budget_min = 0"),
         (["auto.seconds=5"], "did you mean|unknown"),
         (["auto.candidates=['liner']"], "linear"),
         (["auto.candidates=['recurrent']"], "suits"),
@@ -302,9 +302,9 @@ def test_spans_grow_with_the_horizon_as_far_as_the_data_allow():
     assert CANDIDATES["recurrent"].plan(replace(amount, rows=5000)) is None
     assert CANDIDATES["recurrent"].plan(replace(amount, shortest=140)) is not None
     assert CANDIDATES["recurrent"].plan(replace(amount, shortest=140, horizon=100)) is None
-    assert CANDIDATES["committee"].plan(amount).model.backbone.near == ()
+    assert CANDIDATES["committee"].plan(amount).model.backbone.local_lags == ()
     backbone = CANDIDATES["committee"].plan(replace(amount, rows=5000, shortest=40)).model.backbone
-    assert (backbone.lags, backbone.near) == ((1, 2, 3, 4), (0, 1, 2, 4))
+    assert (backbone.lags, backbone.local_lags) == ((1, 2, 3, 4), (0, 1, 2, 4))
     steps = [
         CANDIDATES["committee"].plan(replace(amount, minutes=minutes)).training.ensemble.steps
         for minutes in (0.01, 1.0, 100.0)

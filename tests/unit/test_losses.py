@@ -270,7 +270,7 @@ def test_adaptive_weights_are_inverse_running_errors_cut_and_blended():
         (lambda: Correlation(weight=math.nan), "correlation: weight = nan"),
         (lambda: AdaptiveWeights(blend=2.0), r"blend = 2\.0.*must hold"),
         (lambda: AdaptiveWeights(max_ratio=1.0), r"max_ratio = 1\.0.*must hold"),
-        (lambda: AdaptiveWeights(decay=1.0), r"memory = 1\.0.*must hold"),
+        (lambda: AdaptiveWeights(decay=1.0), r"decay = 1\.0.*must hold"),
     ],
 )
 def test_values_out_of_range_are_refused_with_the_value(make, message):

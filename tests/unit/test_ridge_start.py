@@ -105,7 +105,7 @@ def test_it_beats_persistence_from_the_start():
 
 def test_a_start_from_zero_stays_zero():
     task = Task(FEATURES, ("speed",), (3,), TargetMode.DELTA, 100.0)
-    predictor, _, _ = start(task, start="zero")
+    predictor, _, _ = start(task, init="zero")
     assert not predictor.bypass.weight.any()
 
 
@@ -143,7 +143,7 @@ def test_cross_validation_chooses_penalty_and_history_that_generalise():
 
 def test_a_crossed_start_learns_from_validation_too_and_is_kept_whole():
     task = Task(FEATURES, ("speed",), (3,), TargetMode.DELTA, 100.0)
-    predictor, train, validation = start(task, start="crossed")
+    predictor, train, validation = start(task, init="cross_validated")
     parts = [Series(part.name, features_of(part), part.targets) for part in [*train, *validation]]
     wanted = cross_validate_ridge(parts, LagTask((3,), (0,), TAPS))
     test = series(task, 4, 90)

@@ -503,8 +503,8 @@ def test_phase_6_whose_teacher_fails_opens_nothing(sound):
     ("change", "match"),
     [
         ({"units": (0,)}, "units"),
-        ({"shares": ()}, "shares"),
-        ({"shares": (2.0,)}, "shares"),
+        ({"width_fractions": ()}, "width_fractions"),
+        ({"width_fractions": (2.0,)}, "width_fractions"),
         ({"formats": ("w8a61",)}, "did you mean 'w8a16'"),
         ({"updates": -1}, "updates = -1"),
         ({"units": (10**9,)}, "units"),

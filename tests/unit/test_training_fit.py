@@ -144,7 +144,7 @@ def test_a_by_pass_starts_better_than_a_network_alone(fitted, tiny, tiny_bypass,
 
 
 def test_a_by_pass_that_is_not_trained_stays(tiny, tiny_bypass, tiny_training):
-    fixed = dataclasses.replace(tiny_bypass.blocks[1], trained=False)
+    fixed = dataclasses.replace(tiny_bypass.blocks[1], trainable=False)
     model = dataclasses.replace(tiny_bypass, blocks=(fixed,))
     short = fit(tiny, model, dataclasses.replace(tiny_training, epochs=1)).predictor.bypass
     longer = fit(tiny, model, dataclasses.replace(tiny_training, epochs=2)).predictor.bypass

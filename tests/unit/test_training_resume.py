@@ -104,7 +104,7 @@ def test_optimizers_without_the_compiler_step_to_the_same_bits(mine, theirs, opt
 def test_optimizers_schedules_with_memory_and_fixed_by_passes_go_on_too(
     optimizer, tmp_path, tiny, tiny_bypass, tiny_training
 ):
-    fixed = dataclasses.replace(tiny_bypass.blocks[1], trained=False)
+    fixed = dataclasses.replace(tiny_bypass.blocks[1], trainable=False)
     model = dataclasses.replace(tiny_bypass, blocks=(tiny_bypass.blocks[0], fixed))
     spec = dataclasses.replace(
         tiny_training, optimizer=OPTIMIZERS[optimizer](), schedule=Plateau(patience=0, threshold=0.5), epochs=4
@@ -139,7 +139,7 @@ KINDS = {
     **{f"{name} on chunks": {"augmentations": (AUGMENTATIONS[name](),)} for name in AUGMENTATIONS},
     **{f"{name} on windows": {"augmentations": (AUGMENTATIONS[name](),), "chunks": WINDOWS} for name in AUGMENTATIONS},
     **{name: {"average": AVERAGES[name]()} for name in AVERAGES},
-    "swa throughout": {"average": AVERAGES["swa"](share=0.7, rate=0.0)},
+    "swa throughout": {"average": AVERAGES["swa"](fraction=0.7, lr_ratio=0.0)},
     "adaptive weights": {"adaptive": AdaptiveWeights(blend=0.5), "horizon_decay": 0.5},
     "terms": {"terms": tuple(TERMS[name]() for name in TERMS)},
     "terms on windows": {"terms": tuple(TERMS[name]() for name in TERMS), "chunks": WINDOWS},

@@ -160,5 +160,5 @@ def test_mistakes_are_told(source, experiment, tmp_path):
         try_feature_sets(source, experiment, {"x": "FG3"}, tmp_path)
     with pytest.raises(ConfigError, match="no feature set can be tried: FG1 was not tried"):
         try_feature_sets(source, experiment, {"FG1": "FG1"}, tmp_path)
-    with pytest.raises(ConfigError, match="random = -1"):
+    with pytest.raises(ConfigError, match="random_sets = -1"):
         TrialSpec(random_sets=-1)

@@ -264,7 +264,7 @@ def test_a_bundle_is_judged_without_a_run_folder(logs, tmp_path):
     bundle = train(source_of(logs), experiment(), tmp_path / "run")
     data = prepare_data(source_of(logs), experiment())
     assert isinstance(data, Prepared)
-    found = judge_bundle(bundle, data, experiment().judge)
+    found = judge_bundle(bundle, data, experiment().evaluation)
     assert found.scores.models["network"].overall["2"]["mean"]["mae"] > 0
 
 

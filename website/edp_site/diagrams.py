@@ -78,7 +78,7 @@ class Drawing:
             self.text(box.x + box.width / 2, top + 16 * number, line, style="b" if number == 0 else "")
 
     def arrow(self, *points: float) -> None:
-        """Add an arrow through points, given as x, y, x, y and so on."""
+        """Add an arrow through points, given as x, y, x, y, ..."""
         places = " L".join(f"{x:g} {y:g}" for x, y in zip(points[::2], points[1::2], strict=True))
         self.parts.append(f'<path d="M{places}" class="a"/>')
 
@@ -196,7 +196,7 @@ def automatic_choice() -> str:
 
 
 def expected_errors() -> str:
-    """Draw the error ratio that the training states against the one on the test part."""
+    """Draw the error ratio stated by the training against the error ratio on the test part."""
     tasks = [task for task in _details("auto_preset")["tasks"] if task.get("skill") is not None]
     drawing = Drawing("Expected and measured error, both relative to the linear model", 860, 400)
     left, bottom, scale = 260.0, 340.0, 300.0

@@ -46,7 +46,7 @@ def source_of(cell: dict[str, Any]) -> str:
 
 
 def run_notebook(path: Path, folder: Path) -> Notebook:
-    """Run the cells of a notebook one after the other in one name space, and keep what they print, say and draw.
+    """Run the cells of a notebook one after the other in one name space, and keep their texts and figures.
 
     Args:
         path: of the notebook, which is not written.

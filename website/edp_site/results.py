@@ -209,7 +209,7 @@ class Benchmarks:
     docs: Path
     published: Mapping[str, float]
 
-    def of_script(self, script: str) -> list[Result]:
+    def find_by_script(self, script: str) -> list[Result]:
         """Return the result files of a script."""
         return [result for result in self.results if result.script == script]
 
@@ -286,7 +286,7 @@ def results_page(benchmarks: Benchmarks) -> str:
         "|---|---|---:|---:|---|",
     ]
     for page in benchmarks.pages:
-        results = benchmarks.of_script(page.script)
+        results = benchmarks.find_by_script(page.script)
         verdicts = [verdict for result in results for verdict in result.verdicts]
         lines.append(
             f"| [{page.title}](results/{page.script}.md) | {page.question} | {len(verdicts)} "
@@ -300,7 +300,7 @@ def benchmark_page(benchmarks: Benchmarks, page: Page) -> str:
     lines = [f"# {page.title}", "", page.question, "", page.notes, ""]
     if (benchmarks.docs / page.docs).is_file():
         lines += [f"[Documentation](../{page.docs.replace('.ipynb', '.md')})", ""]
-    results = benchmarks.of_script(page.script)
+    results = benchmarks.find_by_script(page.script)
     names = {result.name for result in results}
     if goals := [goal for goal in benchmarks.goals if goal.result in names]:
         lines += ["| Goal that was asked | Outcome |", "|---|---|"]
@@ -342,7 +342,7 @@ def leaderboard_page(benchmarks: Benchmarks) -> str:
     ]
     for page in benchmarks.pages:
         lines += ["", f"## {page.title}"]
-        for result in benchmarks.of_script(page.script):
+        for result in benchmarks.find_by_script(page.script):
             lines += ["", f"[{result.name}]({place_of(result)}), {result.date}", "", *_table(result.verdicts)]
     lines += ["", "## Goals that were asked", "", "| Goal | Outcome | Measured by |", "|---|---|---|"]
     for goal in benchmarks.goals:

@@ -66,7 +66,7 @@ class Section(NamedTuple):
 
 
 def sections_of(table: str, cls: type) -> list[Section]:
-    """Return the sections of a settings class: its own keys, then those of each table and part below.
+    """Return the sections of a settings class: its own keys, then the keys of each table and part below.
 
     Args:
         table: table in which its keys stand; empty for the root of a file.

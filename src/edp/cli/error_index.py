@@ -49,12 +49,12 @@ class ErrorMessage:
 
     @property
     def cause(self) -> str:
-        """What was found: the template up to its remedy."""
+        """Finding: the template up to its remedy."""
         return self.template.partition("; ")[0]
 
     @property
     def remedy(self) -> str:
-        """What to do: the template after the first semicolon; empty for a message without one."""
+        """Remedy: the template after the first semicolon; empty for a message without one."""
         return self.template.partition("; ")[2]
 
     def fits(self, text: str) -> bool:
@@ -96,17 +96,18 @@ def identify(error: BaseException) -> str:
         return ""
     files = {Path(frame.filename) for frame in traceback.extract_tb(error.__traceback__)}
     near = sorted(path for path in files if path.is_relative_to(PACKAGE))
-    for paths in (near, _find_sources(text)):
+    # Some templates have no three words in a row that are the same in every message.
+    for paths in (near, _find_sources(text, 3), _find_sources(text, 2)):
         fitting = [entry for path in paths for entry in _read_messages(path) if entry.fits(text)]
         if fitting:
             return max(fitting, key=lambda entry: entry.letters).identifier
     return ""
 
 
-def _find_sources(text: str) -> Iterator[Path]:
-    """Yield the source files with two consecutive words of a message; reading is much faster than parsing."""
+def _find_sources(text: str, length: int) -> Iterator[Path]:
+    """Yield the source files that contain ``length`` consecutive words of a message; reading is faster than parsing."""
     words = text.split()
-    phrases = {" ".join(words[i : i + 2]) for i in range(max(len(words) - 1, 1))}
+    phrases = {" ".join(words[i : i + length]) for i in range(max(len(words) - length + 1, 1))}
     for path in sorted(files_below(PACKAGE, "*.py")):
         source = _read_text(path)
         if any(phrase in source for phrase in phrases):

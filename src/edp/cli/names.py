@@ -131,7 +131,7 @@ def rewrite(words: Sequence[str]) -> Rewritten:
 
 
 def _choose_focus(words: list[str]) -> list[str]:
-    """Return the command line of a twin where `--focus` asks for a simulation; otherwise the words unchanged."""
+    """Return the command line of `edp twin` for `--focus simulation`; other words unchanged."""
     for position, word in enumerate(words):
         if word == f"{FOCUS}={SIMULATION}":
             return ["twin", *words[1:position], *words[position + 1 :]]

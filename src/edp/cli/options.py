@@ -138,7 +138,7 @@ _SAME = {
     "train pretrain": "inner_rate inner_steps shots",
     "data screen": "trusted",
 }
-_KEYS = {**KEYS["FinetuneSpec"], **KEYS["MetaSpec"]}
+_KEYS = {**KEYS["FinetuneSpec"], **KEYS["MetaSpec"], **KEYS["ScreeningSpec"]}
 FORMER = {
     (command, name): f"{_TABLES[command]}.{_KEYS.get(name, name)}=VALUE"
     for command, names in _SAME.items()

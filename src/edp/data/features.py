@@ -156,7 +156,7 @@ class FeatureSet:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Logged channels that are read at each sample; those of `init_channels` count in the first samples only."""
+        """Logged channels that are read at each sample, and `init_channels`, which count in the first samples only."""
         return self.channels + self.hidden + self.init_channels
 
     @property

@@ -161,7 +161,7 @@ class ByFrozen:
             f"split: {len(lacking)} of {len(self.frozen)} frozen sessions of the search are missing: "
             f"{', '.join(sorted(lacking.values()))}; {how} (hash {next(iter(lacking))} is wanted for "
             f"'{next(iter(lacking.values()))}'). What was changed could train unseen: restore the recordings and read "
-            "them with the same signal map, or, for other data, --set split.on_missing=draw"
+            "them with the same signal map, or, for other data, --set split.on_missing=resample"
         )
 
 
@@ -199,7 +199,7 @@ def keep_frozen(before: SplitSpec, after: SplitSpec) -> None:
     if lost:
         raise ConfigError(
             f"the run comes from a search, and --set split lets go of {len(lost)} of its frozen sessions; they stay "
-            "frozen: leave the change out, or, for other data, --set split.on_missing=draw"
+            "frozen: leave the change out, or, for other data, --set split.on_missing=resample"
         )
 
 
@@ -242,7 +242,7 @@ def _whole(recordings: Sequence[Recording], parts: Mapping[str, Sequence[int]]) 
         if not places:
             raise DataError(
                 f"split: no recording is left for {part}; {len(recordings)} recording(s) given. Give the recordings of "
-                "the search, or, for other data, --set split.on_missing=draw"
+                "the search, or, for other data, --set split.on_missing=resample"
             )
     stretches = {
         part: tuple(Stretch(i, 0, recordings[i].samples) for i in sorted(places)) for part, places in parts.items()

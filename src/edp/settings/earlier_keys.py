@@ -168,7 +168,7 @@ def used_earlier_keys() -> Mapping[str, str]:
 
 
 def common_renames(classes: typing.Iterable[type], present: typing.Collection[str]) -> Mapping[str, str]:
-    """Return the renames of several classes one of which a table belongs to; a key that one of them has stays.
+    """Return the renames of a table that may describe any of several classes; a key that one of them has stays.
 
     Args:
         classes: classes that the table may describe.

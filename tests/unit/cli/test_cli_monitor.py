@@ -83,7 +83,7 @@ def test_fit_says_what_is_watched_and_promised_and_two_workers_give_the_same_mon
         (("--machine", "M99"), "unknown machine 'M99'; known: C14, M22"),
         (("--set", 'dictionary.kinds=["leak"]'), "leak"),
         (("--hours-per-false-alarm", -1), "hours_per_false_alarm = -1"),
-        (("--time-budget", "min" - 1), "minutes = -1"),
+        (("--time-budget", "-1min"), "time_budget_min = -1"),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_is_trained(edp, healthy, tmp_path, options, told):

@@ -130,7 +130,7 @@ LINES = {
         ("data screen", f"changes.{table}"): f"data screen there --out new --set {table}.any=1"
         for table in TRIAL_TABLES
     },
-    ("search run", "budget"): "search there --out new --budget budget.toml --set search.compression.on=false",
+    ("search run", "budget"): "search there --out new --budget budget.toml --set search.compression.enabled=false",
     ("simulate", "changes.limit"): "simulate new --set limit.moments=60",
     ("train run", "time_budget"): "train there --out new --preset quick --time-budget 5min",
     ("train run", "workers"): "train there --out new --preset quick --workers 2",

@@ -92,7 +92,7 @@ def test_screen_proposes_and_a_training_uses_it(edp, logs, tmp_path, small):
     trained = edp("train", logs, *settings, *small)
     assert trained.code == 0, trained.err
     derived = load_experiment(tmp_path / "second" / "config.toml", preset=None).task.features.derived
-    spans = {entry.source: round(entry.seconds * found["rate_hz"]) for entry in derived if entry.how == "change"}
+    spans = {entry.source: round(entry.span_s * found["rate_hz"]) for entry in derived if entry.how == "change"}
     assert spans == {"lever": lead, "speed": 5}
 
 

@@ -162,7 +162,7 @@ def test_a_curve_is_the_sum_of_its_hats():
 
 def test_options_are_bounded_and_registered():
     assert RESIDUALS["flow_balances"] is FlowBalancesSpec
-    assert asdict(SPEC)["least"] == 0.6
-    for change in ({"rows": 10}, {"trials": 0}, {"least": 2.0}):
+    assert asdict(SPEC)["min_explained"] == 0.6
+    for change in ({"rows": 10}, {"trials": 0}, {"min_explained": 2.0}):
         with pytest.raises(ConfigError, match="flow_balances"):
             FlowBalancesSpec(**change)

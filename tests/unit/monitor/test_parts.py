@@ -49,7 +49,7 @@ def test_a_view_of_averages_makes_them_of_one_size(view):
     rng = np.random.default_rng(1)
     mixing = rng.normal(size=(4, 4))
     sessions = [rng.normal(size=(600, 4)) @ mixing for _ in range(8)]
-    spec = WatchSpec(detector=CusumSpec(), memory_s=5.0, factor=0.0, view=view)
+    spec = WatchSpec(detector=CusumSpec(), memory_s=5.0, shrink=0.0, view=view)
     watch = fit_watch(spec, sessions, 1.0, 0)
     rows = np.concatenate([watch(session) for session in sessions])
     np.testing.assert_allclose(rows.std(axis=0), 1.0, atol=0.15)

@@ -284,7 +284,7 @@ def test_the_commands_of_a_fleet_say_what_they_did(told, own, run, store, tmp_pa
         (("finetune", "RUN", "--out", "OUT"), "give LOGS of one machine, or --fleet"),
         (("finetune", "RUN", "STORE", "--fleet", "STORE", "--out", "OUT"), "do not go with --fleet"),
         (("finetune", "RUN", "STORE", "--delta-kb", "9", "--out", "OUT"), "no effect without --fleet"),
-        (("evaluate", "RUN", "--workers", "2", "--minutes", "1"), "--minutes: it has no effect without"),
+        (("evaluate", "RUN", "--workers", "2", "--time-budget", "1min"), "--time-budget: it has no effect without"),
         (("inspect", "STORE", "--workers", "2", "--cluster", "127.0.0.1:9"), "expected one of the two"),
         (("fleet", "network", "OWN", "Press-77", "--out", "OUT"), "has no machine 'Press-77'"),
     ],

@@ -262,7 +262,7 @@ def test_what_cannot_be_is_refused(machines, experiment, tmp_path, prepared_mach
         PRETRAININGS["reptile"]().strategy(MetaSpec(head_only=True), None)
     with pytest.raises(ConfigError, match="unknown"):
         Pretrain(method="mamml")
-    for change in ({"inner_rate": 0.0}, {"inner_steps": 0}, {"shots": 0}):
+    for change in ({"inner_learning_rate": 0.0}, {"inner_steps": 0}, {"shots": 0}):
         with pytest.raises(ConfigError, match="must hold"):
             MetaSpec(**change)
     with pytest.raises((BundleError, DataError), match="nowhere"):

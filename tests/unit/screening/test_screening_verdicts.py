@@ -66,7 +66,7 @@ def test_lags_have_the_sign_of_table_4_2(found: ScreeningResult) -> None:
 
 
 def test_without_trust_a_lever_may_stay_and_leaks_of_targets_go(sessions: list[Recording]) -> None:
-    told = flags(screen(sessions, replace(SPEC, trusted=())))
+    told = flags(screen(sessions, replace(SPEC, measured=())))
     assert told["aux_ahead"][0] == told["aux_smooth"][0] == FlagKind.LEAK
     assert "lever_a" not in told
     assert "lever_b" not in told
@@ -111,7 +111,7 @@ def test_one_long_recording_is_cut_and_a_channel_with_gaps_set_aside(sessions: l
     values[500, sessions[0].index("pressure")] = np.nan
     spec = replace(SPEC, candidates=("lever_a", "lever_b", "pressure", "aux_noise"))
     found = screen([replace(sessions[0], values=values)], spec)
-    assert len(found.pieces) >= spec.pieces
+    assert len(found.pieces) >= spec.min_segments
     assert flags(found)["pressure"][0] == FlagKind.MISSING
     assert {"lever_a", "lever_b"} <= set(found.proposal.kept)
     assert "pressure" in found.proposal.dropped
@@ -154,8 +154,8 @@ def test_bad_requests_are_named(sessions: list[Recording]) -> None:
     [
         ({"horizon": -1}, "horizon = -1"),
         ({"horizon": 70}, "beyond max_lag"),
-        ({"copy": 1.0}, "0 < copy < 1 must hold"),
-        ({"pieces": 2}, "4 <= pieces"),
+        ({"copy_threshold": 1.0}, "0 < copy_threshold < 1 must hold"),
+        ({"min_segments": 2}, "4 <= min_segments"),
         ({"information_samples": 10}, "100 <= information_samples"),
     ],
 )
@@ -164,5 +164,5 @@ def test_wrong_options_are_refused(wrong: dict, said: str) -> None:
         replace(SPEC, **wrong)
     with pytest.raises(ConfigError, match=r"screening\.forest: trees = 0"):
         ForestSpec(trees=0)
-    with pytest.raises(ConfigError, match=r"0 < held_out <= 0\.8"):
+    with pytest.raises(ConfigError, match=r"0 < test_fraction <= 0\.8"):
         ForestSpec(test_fraction=0.9)

@@ -255,9 +255,9 @@ def test_other_data_are_drawn_only_when_that_is_said(study, run, six_sessions, t
         moved = replace(recording, values=recording.values + np.float32(1))
         write_recording(moved, tmp_path / f"{recording.name}.parquet")
     other = DataSource.from_path(tmp_path)
-    with pytest.raises(DataError, match=r"2 of 2 frozen sessions.*split\.missing=draw"):
+    with pytest.raises(DataError, match=r"2 of 2 frozen sessions.*split\.on_missing=resample"):
         prepare_data(other, load_experiment(study.teacher, "quick"))
-    drawn = prepare_data(other, load_experiment(study.teacher, "quick", ["split.on_missing=draw"]))
+    drawn = prepare_data(other, load_experiment(study.teacher, "quick", ["split.on_missing=resample"]))
     assert (len(drawn.train), len(drawn.validation), len(drawn.test)) == (4, 1, 1)
     with pytest.raises(ConfigError, match="lets go of 2 of its frozen sessions"):
         distil(run, DistilRequest(spec=DistilSpec(units=2), changes=("split.kind=time",)), tmp_path / "student")

@@ -232,12 +232,12 @@ def test_changes_that_cannot_be_are_refused(run, change, reason):
     [
         {"epochs": 0},
         {"single_phase_epochs": 0},
-        {"head_rate": 0.0},
-        {"rate": 0.0},
+        {"head_learning_rate": 0.0},
+        {"learning_rate": 0.0},
         {"smoothness": -1.0},
         {"depth_decay": 1.5},
         {"patience": -1},
-        {"soft": 0.0},
+        {"distillation_fraction": 0.0},
     ],
 )
 def test_options_out_of_range_are_refused(change):

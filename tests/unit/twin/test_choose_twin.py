@@ -39,7 +39,7 @@ def choice(run, training=TINY, recordings=None, **auto):
     channels = twin_channels(recordings[0])
     data = prepare(recordings, channels.task(), ByRecording(), 20)
     experiment = TwinExperiment(twin=AutoTwin(prefix_ticks=20, **auto), training=training)
-    experiment = replace(experiment, evaluation=replace(experiment.evaluation, seconds=4.0, calibration_starts=4))
+    experiment = replace(experiment, evaluation=replace(experiment.evaluation, duration_s=4.0, calibration_starts=4))
     fit = TwinFit(channels, fit_scales(channels, data.train), data, experiment)
     return TwinChoice(fit, experiment.twin, KeyedRun(run, "k" * 32))
 
@@ -51,11 +51,11 @@ def run(tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("least_gain", "kept"), [(0.0, "n4sid"), (0.2, "arx"), (0.5, "static")])
-def test_the_simplest_candidate_that_is_as_good_as_the_best_is_kept(run, monkeypatch, least_gain, kept):
+@pytest.mark.parametrize(("min_gain", "kept"), [(0.0, "n4sid"), (0.2, "arx"), (0.5, "static")])
+def test_the_simplest_candidate_that_is_as_good_as_the_best_is_kept(run, monkeypatch, min_gain, kept):
     errors = iter([1.0, 0.7, 0.6])
     monkeypatch.setattr(TwinChoice, "_error", lambda self, runs, reference: next(errors))
-    result, tried = choice(run, candidates=("static", "arx", "n4sid"), least_gain=least_gain, folds=2).best()
+    result, tried = choice(run, candidates=("static", "arx", "n4sid"), min_gain=min_gain, folds=2).best()
     assert [one.error for one in tried] == [1.0, 0.7, 0.6]
     assert [one.label for one in tried if one.chosen] == [kept]
     assert TWINS.name_of(result.spec) == kept
@@ -144,12 +144,12 @@ def test_trainings_that_a_budget_has_no_time_for_are_left_out(run, monkeypatch):
     trained = list_evaluated_channels(monkeypatch, errors)
     # A minute of counted time an update: 1, 1 and 3 fit into six minutes, one more of 3 does not.
     monkeypatch.setattr(choose_twin, "training_seconds", lambda *parts: 60.0 * sum(parts[2].updates))
-    _, tried = choice(run, candidates=("recurrent",), minutes=6.0).best()
+    _, tried = choice(run, candidates=("recurrent",), time_budget_min=6.0).best()
     assert trained == [key for key in [*errors][:3] for _ in range(5)]
     assert [one.error for one in tried] == [0.9, 0.8, 0.85, None]
     assert tried[-1].why == "about 8 min of counted time with those before it, of time_budget_min = 6"
     with Run(run.path / "again") as other:
-        result, tried = choice(other, candidates=("static", "recurrent"), minutes=0.5).best()
+        result, tried = choice(other, candidates=("static", "recurrent"), time_budget_min=0.5).best()
     assert result.spec == StaticMap(prefix_ticks=20)
     assert [one.label.split(",")[0] for one in tried] == ["static", "recurrent (5 x 32 units"]
 
@@ -184,7 +184,7 @@ def test_every_tick_that_may_be_learned_from_is_left_out_by_one_fit_and_the_twin
 @pytest.mark.long
 def test_long_recordings_are_judged_by_the_validation_part_and_have_one_wide_network(run, monkeypatch):
     monkeypatch.setattr(choose_twin, "LONG_TICKS", 1)
-    one = choice(run, candidates=("static", "recurrent"), least_gain=0.0)
+    one = choice(run, candidates=("static", "recurrent"), min_gain=0.0)
     result, tried = one.best()
     assert [fold.train for fold in one.folds] == [one.fit.data.train]
     assert [fold.validation for fold in one.folds] == [one.fit.data.validation]
@@ -350,7 +350,7 @@ def test_a_share_of_a_training_keeps_its_stages():
         ("twin.candidates=['arx','arx']", "each once must hold"),
         ("twin.candidates=['auto']", "unknown twin 'auto'"),
         ("twin.units=64", "unknown key 'twin.units'; it belongs to kind = 'recurrent' or 'residual'"),
-        ("twin.min_gain=1.5", "least_gain = 1.5"),
+        ("twin.min_gain=1.5", "min_gain = 1.5"),
         ("twin.folds=0", "folds = 0"),
         ("twin.folds=33", "folds = 33"),
         ("twin={kind='recurrent',units=10,members=3}", "10 units and 3 members; a whole number"),

@@ -76,7 +76,9 @@ def test_a_short_stretch_calibrates_short_horizons_by_more_starts_than_fit_a_lon
     intervals = calibrated([(twin, short)], spec)
     assert intervals.ticks[-1] == 60 - 10 - 1
     assert 50 < intervals.runs <= 3 + 3 * 3 * 8  # but for starts beyond an end stop
-    assert calibrated([(twin, short)], replace(spec, seconds=0.9)).runs <= 3 * 5  # as long as asked: nothing is added
+    assert (
+        calibrated([(twin, short)], replace(spec, duration_s=0.9)).runs <= 3 * 5
+    )  # as long as asked: nothing is added
 
 
 def twin_and_series():

@@ -15,7 +15,7 @@ from edp.testing.twins import sample_series
 from edp.training.free_run import FreeRunDiverged, FreeRunSpec, draw_measured_ports, fit_free_runs
 from edp.training.optimizers import AdamW, Soap
 
-SMALL = {"lanes": 16, "lengths_s": (0.2, 1.0), "updates": (150, 100), "validate_every": 50, "validation_s": 5.0}
+SMALL = {"batch": 16, "lengths_s": (0.2, 1.0), "updates": (150, 100), "validate_every": 50, "validation_s": 5.0}
 SMALL |= {"optimizer": AdamW(learning_rate=2e-2)}
 
 
@@ -135,8 +135,8 @@ def test_ports_are_measured_by_their_shares():
     ("changes", "message"),
     [
         ({"lengths_s": (1.0,)}, r"1 lengths_s and 4 updates; one number"),
-        ({"measured_share": 0.7, "mixed_share": 0.3}, "leave no lane that runs free"),
-        ({"lanes": 0}, "lanes = 0"),
+        ({"measured_fraction": 0.7, "mixed_fraction": 0.3}, "leave no lane that runs free"),
+        ({"batch": 0}, "batch = 0"),
         ({"lengths_s": (0.1, 1.0, 2.0, 1e9)}, "lengths_s"),
     ],
 )
@@ -155,4 +155,4 @@ def test_recordings_that_are_too_short_are_refused(data):
 @pytest.mark.long
 def test_a_gradient_that_is_not_finite_ends_the_training(data):
     with pytest.raises(FreeRunDiverged, match=r"the gradient of update \d+ is not finite; lower"):
-        fitted(data, optimizer=AdamW(learning_rate=1e38), clip=1e6)
+        fitted(data, optimizer=AdamW(learning_rate=1e38), clip_norm=1e6)

@@ -153,15 +153,15 @@ def test_finer_opening_curves_answer_as_the_coarser_ones_they_were_made_of(bench
         )
     with pytest.raises(ValueError, match="a multiple of 10"):
         machine.with_stretches(10).with_stretches(5)
-    with pytest.raises(ConfigError, match="stretches = 7; any of 5, 10, 20, or 0"):
-        replace(BENCH, stretches=7)
+    with pytest.raises(ConfigError, match="curve_segments = 7; any of 5, 10, 20, or 0"):
+        replace(BENCH, curve_segments=7)
 
 
 @pytest.mark.long
 def test_free_runs_choose_how_many_stretches_an_opening_curve_has(bench):
     """A machine whose curves bend within the coarse stretches is fitted better by the finer ones."""
     machine, runs = bench
-    free = replace(BENCH, stretches=0, fit=replace(BENCH.fit, final_rounds=16))
+    free = replace(BENCH, curve_segments=0, fit=replace(BENCH.fit, final_rounds=16))
     arrays = {"numbers": machine.numbers.astype(np.float32), "full": machine.full}
     coarse = free.build(machine.channels, machine.scales, arrays)
     bent = machine.with_stretches(10)
@@ -175,7 +175,7 @@ def test_free_runs_choose_how_many_stretches_an_opening_curve_has(bench):
     result = fit_grey_box(coarse, told[:2], told[2:3], seed=0)
     tried = {row["stretches"] for row in result.history}
     assert tried >= {5, 10}
-    kept = result.twin.spec.stretches
+    kept = result.twin.spec.curve_segments
     assert kept in (10, 20)
     assert result.error == min(row["validation"] for row in result.history if row["stretches"] == kept)
     assert len(result.information) == len(result.twin.numbers) == len(result.theta)
@@ -189,9 +189,9 @@ def test_a_curve_that_gains_too_little_stays_coarse(bench, monkeypatch):
     monkeypatch.setattr(grey_fit, "MIN_GAIN", 1.0)
     arrays = {"numbers": machine.numbers.astype(np.float32), "full": machine.full}
     fit = replace(BENCH.fit, lengths_s=(0.1,), rounds=(1,), starts=1)
-    begun = replace(BENCH, stretches=0, fit=fit).build(machine.channels, machine.scales, arrays)
+    begun = replace(BENCH, curve_segments=0, fit=fit).build(machine.channels, machine.scales, arrays)
     result = fit_grey_box(begun, runs[:2], runs[2:3], seed=0)
-    assert result.twin.spec.stretches == 5
+    assert result.twin.spec.curve_segments == 5
     assert {row["stretches"] for row in result.history} == {5, 10}
 
 
@@ -201,7 +201,7 @@ def test_a_bundle_that_names_no_stretches_has_five(bench, tmp_path):
     path = tmp_path / "old" / "twin.json"
     header = json.loads(path.read_text())
     # As bundles were written before: the key is not there.
-    assert header["twin"].pop("stretches") == 5
+    assert header["twin"].pop("curve_segments") == 5
     del header[HASH]
     path.write_text(json.dumps(header | {HASH: content_digest(header)}))
     old = load_twin(tmp_path / "old").twin
@@ -210,7 +210,7 @@ def test_a_bundle_that_names_no_stretches_has_five(bench, tmp_path):
     finer = machine.with_stretches(20)
     save_twin(TwinBundle(finer.spec, finer), tmp_path / "new")
     again = load_twin(tmp_path / "new").twin
-    assert again.spec.stretches == again.table.stretches == 20
+    assert again.spec.curve_segments == again.table.stretches == 20
     np.testing.assert_array_equal(again.numbers, finer.numbers.astype(np.float32))
 
 
@@ -218,7 +218,7 @@ def test_a_bundle_that_names_no_stretches_has_five(bench, tmp_path):
 def test_what_is_left_out_does_nothing_and_is_not_fitted(bench):
     machine, runs = bench
     parts = ("power_limit", "cushions", "play")
-    spec = replace(BENCH, without=parts)
+    spec = replace(BENCH, omit=parts)
     scales = machine.scales
     bare = spec.build(machine.channels, scales, {"numbers": machine.numbers.astype(np.float32), "full": machine.full})
     names = [number.name for number in bare.table.numbers]
@@ -249,7 +249,7 @@ def test_what_is_left_out_does_nothing_and_is_not_fitted(bench):
 
 
 def test_a_part_that_cannot_be_left_out_is_refused_by_name():
-    with pytest.raises(ConfigError, match=r"without names 'cushion'.*cushions.*power_limit, cushions, play must hold"):
+    with pytest.raises(ConfigError, match=r"omit names 'cushion'.*cushions.*power_limit, cushions, play must hold"):
         GreyBox(omit=("cushion",))
 
 

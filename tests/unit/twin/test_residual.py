@@ -164,7 +164,7 @@ def test_settings_come_back_and_what_cannot_be_is_refused(tmp_path):
     experiment = load_twin_experiment(tmp_path / "twin.toml")
     (tmp_path / "again.toml").write_text(twin_toml(experiment))
     assert load_twin_experiment(tmp_path / "again.toml") == experiment
-    assert (experiment.twin.units, experiment.twin.fit.starts, experiment.twin.without) == (8, 2, ("play",))
+    assert (experiment.twin.units, experiment.twin.fit.starts, experiment.twin.omit) == (8, 2, ("play",))
     with pytest.raises(ConfigError, match="3 lengths_s and 2 updates"):
         Residual(updates=(1, 2))
 

@@ -111,7 +111,7 @@ class GreyBox:
         for part in self.omit:
             if part not in LEFT_OUT:
                 raise ConfigError(
-                    f"grey box: without names '{part}'{closest(part, tuple(LEFT_OUT))}; any of {', '.join(LEFT_OUT)} "
+                    f"grey box: omit names '{part}'{closest(part, tuple(LEFT_OUT))}; any of {', '.join(LEFT_OUT)} "
                     "must hold"
                 )
 
