@@ -209,13 +209,13 @@ def _list_bagging_conflicts(model: ModelSpec, spec: TrainingSpec, bagging: Baggi
     reasons = []
     if not isinstance(model.backbone, CommitteeSpec) or not isinstance(model.head, LinearHead):
         reasons.append(
-            "training.ensemble trains model.backbone = 'committee' with model.head = 'linear'; take these, or leave it"
+            "ensemble trains model.backbone = 'committee' with model.head = 'linear'; take these, or leave it"
         )
     elif model.backbone.members % (bagging.folds * (2 if bagging.huber_delta else 1)):
         twice = "twice " if bagging.huber_delta else ""
         reasons.append(
-            f"training.ensemble.folds = {bagging.folds} with {model.backbone.members} members; a multiple of {twice}"
-            f"the folds must hold{' with training.ensemble.huber_delta' if twice else ''}"
+            f"ensemble.folds = {bagging.folds} with {model.backbone.members} members; a multiple of {twice}"
+            f"the folds must hold{' with ensemble.huber_delta' if twice else ''}"
         )
     parts = [
         name
@@ -230,10 +230,10 @@ def _list_bagging_conflicts(model: ModelSpec, spec: TrainingSpec, bagging: Baggi
         if present
     ]
     if parts:
-        reasons.append(f"training.ensemble does not train {', '.join(parts)}; leave it out")
+        reasons.append(f"ensemble does not train {', '.join(parts)}; leave it out")
     if not isinstance(spec.loss, Penalty):
         fitting = [name for name, part in LOSSES.items() if issubclass(part, Penalty)]
-        reasons.append(f"training.ensemble with the loss '{LOSSES.name_of(spec.loss)}'; {_either(fitting)} must hold")
+        reasons.append(f"ensemble with the loss '{LOSSES.name_of(spec.loss)}'; {_either(fitting)} must hold")
     return reasons
 
 
