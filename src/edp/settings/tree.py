@@ -264,8 +264,8 @@ class SettingsTree:
             kind = value.get("kind")
             registry = self.parts[name]
             # An unknown kind may be that of a plug-in that is not loaded yet, whose keys are not those of other kinds.
-            known = isinstance(kind, str) and kind in registry
-            classes = [registry[str(kind)]] if known else [] if "kind" in value else list(registry.values())
+            is_registered = isinstance(kind, str) and kind in registry
+            classes = [registry[str(kind)]] if is_registered else [] if "kind" in value else list(registry.values())
         else:
             forms = [_form(_strip_optional(hint)) for hint in hints]
             classes = [cls for form in forms for cls in (form.table, form.item) if cls is not None]
