@@ -43,7 +43,7 @@ lock: ## write requirements.lock from pyproject.toml and constraints.txt; give t
 	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate --no-header \
 		--group docs --output-file requirements-docs.lock
 
-demo: $(READY) ## the main job, small: simulate, train, judge, write a report page
+demo: $(READY) ## the main job, small: simulate, train, evaluate, write a report page
 	$(BIN)/edp demo --out demo
 
 # The builder has an environment of its own: whoever trains models needs none of it.
