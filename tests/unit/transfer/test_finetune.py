@@ -271,7 +271,7 @@ def test_windows_are_drawn_together_for_smoothness_and_chunks_walked_again():
     made = tuning(TrainingSpec(terms=(Smoothness(weight=0.2), Drift()), refit="best"), spec, epochs=25)
     assert [type(term) for term in made.terms] == [Drift, Smoothness]
     assert made.terms[1].weight == 0.05
-    assert (made.chunks.carried, made.epochs, made.refit) == (8, 25, "none")
+    assert (made.chunks.reset_after_chunks, made.epochs, made.refit) == (8, 25, "none")
     assert tuning(TrainingSpec(chunks=ChunkSpec(length=8, burn_in=100)), spec).chunks.carried == 13
 
 
