@@ -272,7 +272,7 @@ def test_windows_are_drawn_together_for_smoothness_and_chunks_walked_again():
     assert [type(term) for term in made.terms] == [Drift, Smoothness]
     assert made.terms[1].weight == 0.05
     assert (made.chunks.reset_after_chunks, made.epochs, made.refit) == (8, 25, "none")
-    assert tuning(TrainingSpec(chunks=ChunkSpec(length=8, burn_in=100)), spec).chunks.carried == 13
+    assert tuning(TrainingSpec(chunks=ChunkSpec(length=8, burn_in=100)), spec).chunks.reset_after_chunks == 13
 
 
 @pytest.mark.parametrize("method", ["full", "two_phase", "low_rank", "linear_probe"])
