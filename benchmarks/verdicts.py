@@ -90,35 +90,18 @@ class ReferenceRule:
 
 
 @dataclass(frozen=True)
-class Headline:
-    """Verdict on the first page of results, with its task, its metric and the reference that is shown."""
-
-    result: str
-    title: str
-    task: str
-    metric: str
-    reference_title: str = ""
-    published: str = ""
-
-
-@dataclass(frozen=True)
-class Page:
-    """Title, question, related page and notes of a benchmark script."""
-
-    script: str
-    title: str
-    question: str
-    docs: str
-    notes: str
-
-
-@dataclass(frozen=True)
 class Catalogue:
-    """Contents of ``benchmarks/catalogue.toml``."""
+    """Names, headlines and pages of verdicts in ``benchmarks/catalogue.toml``; the site reads its texts.
+
+    Attributes:
+        references: rules for the names of references.
+        headlines: result and title of the verdicts on the first page of results.
+        pages: page of docs/ on the subject of each script.
+    """
 
     references: tuple[ReferenceRule, ...]
-    headlines: tuple[Headline, ...]
-    pages: tuple[Page, ...]
+    headlines: frozenset[tuple[str, str]]
+    pages: Mapping[str, str]
 
     def reference_name(self, result: str, title: str) -> str:
         """Return the name of a verdict's reference, or an empty text if the verdict has a fixed target only."""
@@ -127,14 +110,6 @@ class Catalogue:
                 return rule.name
         return ""
 
-    def is_headline(self, result: str, title: str) -> bool:
-        """Return whether a verdict is on the first page of results."""
-        return any((one.result, one.title) == (result, title) for one in self.headlines)
-
-    def docs(self, script: str) -> str:
-        """Return the page of docs/ on the subject of a script, or an empty text for an unknown script."""
-        return next((page.docs for page in self.pages if page.script == script), "")
-
 
 @cache
 def read_catalogue(path: Path = FOLDER / "catalogue.toml") -> Catalogue:
@@ -142,8 +117,8 @@ def read_catalogue(path: Path = FOLDER / "catalogue.toml") -> Catalogue:
     table = tomllib.loads(path.read_text(encoding="utf-8"))
     return Catalogue(
         tuple(ReferenceRule(**row) for row in table["reference"]),
-        tuple(Headline(**row) for row in table["headline"]),
-        tuple(Page(**row) for row in table["page"]),
+        frozenset((row["result"], row["title"]) for row in table["headline"]),
+        {row["script"]: row["docs"] for row in table["page"]},
     )
 
 
@@ -174,8 +149,8 @@ def stored_verdicts(verdicts: Iterable[Verdict], result: str, script: str) -> li
                 unit=one.unit,
                 direction=LOWER if one.goal.startswith("<=") else HIGHER,
                 target=one.bound if name or not one.reference else one.bound * one.reference,
-                headline=catalogue.is_headline(result, one.title),
-                docs=catalogue.docs(script),
+                headline=(result, one.title) in catalogue.headlines,
+                docs=catalogue.pages.get(script, ""),
             )
         )
     return rows
@@ -191,7 +166,7 @@ def refresh(result: str, script: str, verdict: Mapping[str, object]) -> dict[str
     name = catalogue.reference_name(result, title) if verdict["reference"] is not None else ""
     if bool(name) != bool(verdict["reference_name"]):
         raise ValueError(f"{result}: verdict {title!r} has another kind of target in the catalogue; run the benchmark")
-    headline, docs = catalogue.is_headline(result, title), catalogue.docs(script)
+    headline, docs = (result, title) in catalogue.headlines, catalogue.pages.get(script, "")
     return {**verdict, "reference_name": name, "headline": headline, "docs": docs}
 
 

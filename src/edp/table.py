@@ -20,7 +20,7 @@ def plainly(value: Value) -> str:
 
 
 def figures(values: Iterable[Value], signed: bool = False, decimals: int | None = None) -> Show:
-    """Return a function that formats the numbers of one column with a common precision.
+    """Return a function that formats the values of a column with a common precision.
 
     Args:
         values: the column, whose smallest number sets the decimals.

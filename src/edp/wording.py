@@ -24,7 +24,7 @@ HUGE_SHARE = 1e13
 
 
 def decimals_for(values: Iterable[float | None], significant: int = 3) -> int:
-    """Return the decimals that show the smallest non-zero magnitude of a column with `significant` digits, 0 to 6."""
+    """Return the number of decimals (0 to 6) for a column whose smallest value has `significant` digits."""
     sizes = [abs(value) for value in values if value is not None and math.isfinite(value) and value != 0]
     if not sizes:
         return 1
@@ -99,12 +99,12 @@ def interval(low: float | None, high: float | None, signed: bool = False) -> str
 
 
 def interval_decimals(low: float, high: float) -> int:
-    """Return the decimals that show the width of an interval with two significant digits, 0 to 6."""
+    """Return the number of decimals, 0 to 6, that shows the width of an interval with two significant digits."""
     return decimals_for([high - low or high], significant=2)
 
 
 def _useful_decimals(value: float, digits: int = MAX_DIGITS) -> int:
-    """Return the decimals with which a number has at most `digits` significant digits."""
+    """Return the number of decimals with which a value has at most `digits` significant digits."""
     # The exponent after rounding: 9.9996 has two digits before the point once it is rounded.
     exponent = int(f"{abs(value):.{digits - 1}e}".partition("e")[2])
     return max(digits - 1 - exponent, 0)

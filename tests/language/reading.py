@@ -79,10 +79,10 @@ def read_module(source: str, file: str) -> Iterator[Item]:
             text = node.args[0]
             if isinstance(text, ast.JoinedStr) or (isinstance(text, ast.Constant) and isinstance(text.value, str)):
                 yield Item("message", ast.unparse(text), f"{file}:{node.lineno}")
-    for number, line in enumerate(source.splitlines(), 1):
-        match = re.match(r"\s*# (?!type:|fmt:|noqa)(.+)$", line)
-        if match and len(match[1].split()) >= MIN_WORDS:
-            yield Item("comment", match[1], f"{file}:{number}")
+    for block in re.finditer(r"(?:^[ ]*# (?!type:|fmt:|noqa).+\n)+", source, re.MULTILINE):
+        text = " ".join(line.strip().removeprefix("# ") for line in block[0].splitlines())
+        if len(text.split()) >= MIN_WORDS:
+            yield Item("comment", text, f"{file}:{source.count(chr(10), 0, block.start()) + 1}")
 
 
 def read_paragraphs(text: str, file: str) -> Iterator[Item]:

@@ -56,26 +56,35 @@ app = typer.Typer(
     # Tracebacks are for developers; users get one message.
     pretty_exceptions_enable=False,
 )
-data_app = typer.Typer(
-    no_args_is_help=True, rich_markup_mode="markdown", help="Check, select, convert and show recordings."
+
+
+def _make_group(summary: str, commands: Mapping[str, Callable[..., None]]) -> typer.Typer:
+    group = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help=summary)
+    for name, function in commands.items():
+        group.command(name)(function)
+    return group
+
+
+data_app = _make_group(
+    "Check, select, convert and show recordings.",
+    {
+        "check": inspect.inspect,
+        "screen": screen.screen,
+        "animate": animate.animate,
+        "add-forecasts": forecast.forecast,
+    },
 )
-data_app.command("check")(inspect.inspect)
-data_app.command("screen")(screen.screen)
-data_app.command("animate")(animate.animate)
-data_app.command("add-forecasts")(forecast.forecast)
 data_app.add_typer(store.app, name="store")
-compress_app = typer.Typer(
-    no_args_is_help=True, rich_markup_mode="markdown", help="Make a trained network smaller or faster."
+compress_app = _make_group(
+    "Make a trained network smaller or faster.",
+    {
+        "distil": distil.distil,
+        "quantise": quantise.quantise,
+        "search": compress.compress,
+        "estimate": footprint.footprint,
+    },
 )
-compress_app.command("distil")(distil.distil)
-compress_app.command("quantise")(quantise.quantise)
-compress_app.command("search")(compress.compress)
-compress_app.command("estimate")(footprint.footprint)
-loop_app = typer.Typer(
-    no_args_is_help=True, rich_markup_mode="markdown", help="Run and tune controllers in closed loop."
-)
-loop_app.command("run")(control.control)
-loop_app.command("tune")(control.tune)
+loop_app = _make_group("Run and tune controllers in closed loop.", {"run": control.control, "tune": control.tune})
 PANELS: tuple[tuple[str, Mapping[str, typer.Typer | Callable[..., None]]], ...] = (
     ("Start", {"init": init.init, "demo": demo.demo, "doctor": doctor.doctor}),
     ("Data", {"data": data_app}),

@@ -115,7 +115,7 @@ PATH_OPTIONS = frozenset(
 
 
 def emit(as_json: bool, facts: Mapping[str, object], show: Callable[[], None]) -> None:
-    """Print facts as JSON, or call `show` for readable output."""
+    """Print a result as JSON, or call `show` for readable output."""
     if as_json:
         # Strict JSON: NaN would break every other reader.
         sys.stdout.write(json.dumps(facts, indent=1, allow_nan=False) + "\n")

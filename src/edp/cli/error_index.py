@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from types import FunctionType
 
 from edp.storage.paths import files_below
 
@@ -89,29 +90,26 @@ def list_messages() -> tuple[ErrorMessage, ...]:
 def identify(error: BaseException) -> str:
     """Return the identifier of the most specific template that an error's message fits; empty if no template fits.
 
-    The modules of the traceback are searched first: the others are read only for an error of another process.
+    The modules of the traceback and the functions that they import are searched first. All other modules are read only
+    for an error of another process.
     """
     text = str(error)
     if len(text) > MAX_CHARACTERS:
         return ""
-    files = {Path(frame.filename) for frame in traceback.extract_tb(error.__traceback__)}
-    near = sorted(path for path in files if path.is_relative_to(PACKAGE))
-    # Some templates have no three words in a row that are the same in every message.
-    for paths in (near, _find_sources(text, 3), _find_sources(text, 2)):
-        fitting = [entry for path in paths for entry in _read_messages(path) if entry.fits(text)]
+    for paths in (_find_near_sources(error), files_below(PACKAGE, "*.py")):
+        fitting = [entry for path in sorted(paths) for entry in _read_messages(path) if entry.fits(text)]
         if fitting:
             return max(fitting, key=lambda entry: entry.letters).identifier
     return ""
 
 
-def _find_sources(text: str, length: int) -> Iterator[Path]:
-    """Yield the source files that contain ``length`` consecutive words of a message; reading is faster than parsing."""
-    words = text.split()
-    phrases = {" ".join(words[i : i + length]) for i in range(max(len(words) - length + 1, 1))}
-    for path in sorted(files_below(PACKAGE, "*.py")):
-        source = _read_text(path)
-        if any(phrase in source for phrase in phrases):
-            yield path
+def _find_near_sources(error: BaseException) -> set[Path]:
+    """Return the source files of EDP that raised an error, and of the functions that these files import."""
+    files = set()
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        functions = [value for value in frame.f_globals.values() if isinstance(value, FunctionType)]
+        files |= {frame.f_code.co_filename, *(function.__code__.co_filename for function in functions)}
+    return {path for path in map(Path, files) if path.is_relative_to(PACKAGE)}
 
 
 @cache

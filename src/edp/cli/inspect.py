@@ -134,7 +134,7 @@ def _training(data: Sequence[Path], signal_map: Path | None) -> str:
 
 
 def _coverage(source: DataSource, split: str, inputs: tuple[str, ...], asked: bool) -> tuple[Coverage | None, str]:
-    """Coverage of a source, or why there is none; a question of its own that cannot be answered is an error."""
+    """Return the coverage of a source, or the reason why it has none."""
     from edp.workflows.covering import coverage
 
     try:

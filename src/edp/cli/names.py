@@ -5,6 +5,7 @@ Earlier names are read for one release: `rewrite` replaces them in a command lin
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -123,11 +124,16 @@ def rewrite(words: Sequence[str]) -> Rewritten:
         if option not in renamed:
             continue
         new = renamed[option]
-        rest[position] = new.name + (f"={value}{new.unit}" if sign else "")
-        if new.unit and not sign and position + 1 < len(rest):
-            rest[position + 1] += new.unit
+        rest[position] = new.name + (f"={_add_unit(value, new.unit)}" if sign else "")
+        if not sign and position + 1 < len(rest):
+            rest[position + 1] = _add_unit(rest[position + 1], new.unit)
         notices.append(f"{option} is now {new.name}" + (f", with a unit such as 5{new.unit}" if new.unit else ""))
     return Rewritten(rest, notices)
+
+
+def _add_unit(value: str, unit: str) -> str:
+    """Return the value of an earlier option, a number, with its unit; any other text is unchanged."""
+    return value + unit if re.fullmatch(r"[-+0-9.e]+", value) else value
 
 
 def _choose_focus(words: list[str]) -> list[str]:

@@ -120,7 +120,7 @@ def twin(
 
 
 def show_trained(trained: TrainedTwin) -> None:
-    """Print the free-run errors of a trained twin, and what it learned of ground and network."""
+    """Print the free-run errors of a trained twin and the results of its training."""
     from edp.evaluation.beyond import describe_excess
     from edp.report.twin.facts import ground_line
 
@@ -283,7 +283,7 @@ def coverage_table(scores: FreeRunScores) -> None:
 
 
 def situation_table(scores: FreeRunScores) -> None:
-    """Print the errors at end stops, at rest and in motion."""
+    """Print the errors at end stops, at standstill and in motion."""
     rows = []
     for name, row in scores.situations.items():
         strokes = None if row.stroke_error is None else row.stroke_error.mean
@@ -294,7 +294,7 @@ def situation_table(scores: FreeRunScores) -> None:
 
 
 def print_ahead_table(scores: FreeRunScores) -> None:
-    """Print the k-step-ahead errors, together with those of a look-ahead predictor if one was given."""
+    """Print the k-step-ahead errors, next to the errors of a predictor if one was given."""
     ahead, beside = scores.ahead, scores.beside
     if ahead is not None:
         velocity = ahead.velocity_mae

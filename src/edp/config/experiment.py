@@ -206,13 +206,10 @@ def read_layers(path: str | Path | None = None, overrides: Sequence[Change] = ()
         ConfigError: a file or an override that cannot be read.
     """
     # Files named in settings lie beside the settings file, files named on the command line in the working directory.
-    first = [] if path is None else [embed_feature_set(_renamed(read_toml(path)), Path(path).parent)]
-    every = combined([embed_feature_set(_renamed(override(change)), Path()) for change in overrides])
-    return first + ([every] if every else [])
-
-
-def _renamed(table: Mapping[str, object]) -> dict[str, object]:
-    return SETTINGS.renamed(Experiment, table)
+    first = [] if path is None else [embed_feature_set(read_toml(path), Path(path).parent)]
+    every = combined([embed_feature_set(override(change), Path()) for change in overrides])
+    # All overrides are renamed together: an earlier and a present name of one key are an error also in two overrides.
+    return [SETTINGS.renamed(Experiment, table) for table in first + ([every] if every else [])]
 
 
 def preset_table(name: str) -> dict[str, object]:

@@ -60,14 +60,14 @@ class ControlFault(Exception):
 
 
 class Controller(ABC):
-    """Levers for a reference, tick by tick.
+    """Controller that computes the levers for a reference, one sample at a time.
 
-    A subclass gives `begin` and `levers`. `step` guards it: where a channel of `reads` is missing or not finite, where
-    `levers` raises `ControlFault` or outputs something that is not finite, the levers go back to neutral at the slew
-    limit and an event is logged; nothing is raised in a loop. What a controller asks for is cut to the limits.
+    A subclass implements `begin` and `levers`. `step` protects the loop: if a channel of `reads` is missing or not
+    finite, or if `levers` raises `ControlFault` or returns values that are not finite, the levers return to neutral at
+    the slew limit and an event is logged. The loop itself never raises an error. Levers are cut to the limits.
 
-    Where a guard says so (`edp.control.guard`), a channel counts as missing though it has a value, but for those of
-    `spared`, and `fallback` outputs in place of `levers`.
+    A guard (`edp.control.guard`) can declare channels as missing, except the channels in `spared`. `fallback` then
+    computes the levers instead of `levers`.
 
     Args:
         plant: controlled plant.

@@ -56,7 +56,7 @@ class EpisodeSampler:
                 )
 
     def updates(self, number: int = 0) -> int:
-        """Return the batches of an epoch."""
+        """Return the number of batches of an epoch."""
         return -(-len(self.owned) // self.machines)
 
     def epoch(self, number: int) -> Iterator[Batch]:
@@ -70,7 +70,7 @@ class EpisodeSampler:
             yield stack(rows, [True] * len(rows))
 
     def _pieces(self, part: Series, offset: int) -> int:
-        """Return the number of segments in a series from `offset`, with a loss on all samples after the burn-in."""
+        """Return the number of segments in a series from `offset`; the loss covers all samples after the burn-in."""
         return max(0, (part.samples - offset - max(self.horizons)) // self.spec.length)
 
     def _episode(self, machine: str, rng: np.random.Generator) -> list[Piece]:

@@ -87,7 +87,7 @@ def _shares(split: ByRecording | ByTime | ByBlocks) -> dict[str, float]:
 def most_unlike(
     split: ByTime | ByBlocks, recordings: Sequence[Recording], gap: int, channels: Sequence[str], spans: Sequence[int]
 ) -> tuple[float, str, int]:
-    """Compare root-mean-square changes of each channel in the test part with the rest; return the largest difference.
+    """Return the largest difference in root-mean-square change between the test part and the other parts.
 
     Args:
         split: division of the recordings.
@@ -139,7 +139,7 @@ def _mean_change(recordings: Sequence[Recording], stretches: Sequence[Stretch], 
 def blocks_where_time_is_uneven(
     recordings: Sequence[Recording], channels: Sequence[str], horizons: Sequence[int], by_time: ByTime
 ) -> tuple[ByBlocks, str] | None:
-    """Return a split by blocks and its reason if the end of the recordings does not represent the rest; otherwise None.
+    """Return a split by blocks and its reason if the end of the recordings is not representative, else None.
 
     The end says nothing where the machine rests there, or moves far less or far more than before (sweeps of frequency,
     a warm-up): a model would be tested by what it was not trained for, or by the easiest of what it was.

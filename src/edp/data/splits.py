@@ -96,10 +96,10 @@ class ByRecording:
         test, validation = list(self.test), list(self.validation)
         free = [name for name in names if name not in {*test, *validation}]
         families = self._families(recordings)
-        drawn = _spread(self._shuffle_names(free), families)
+        drawn = _order_evenly(self._shuffle_names(free), families)
         if not test:
             test, drawn = _take(drawn, self.test_fraction, len(names))
-            drawn = _spread(drawn, families)
+            drawn = _order_evenly(drawn, families)
         if not validation and len(drawn) >= 3:
             validation, drawn = _take(drawn, self.validation_fraction, len(names))
         whole = [Stretch(i, 0, recording.samples) for i, recording in enumerate(recordings)]
@@ -354,8 +354,8 @@ def machine_of(recording: Recording) -> str:
     return name
 
 
-def _spread(names: Sequence[str], families: Mapping[str, str]) -> list[str]:
-    """Return the names in an order that distributes each family evenly, so that any cut has its proportion of each."""
+def _order_evenly(names: Sequence[str], families: Mapping[str, str]) -> list[str]:
+    """Return the names in an order that distributes each family evenly."""
     size = Counter(families[name] for name in names)
     seen: Counter[str] = Counter()
     position = {}

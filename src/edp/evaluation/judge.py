@@ -185,7 +185,7 @@ class JudgedPart:
 
 
 def network_parts(data: Prepared) -> int:
-    """Return the parts that a network is run along the test part in: by its size alone, whoever runs them."""
+    """Return the number of parts into which the test data are divided for a network; it depends only on their size."""
     ticks = sum(part.samples for part in data.test)
     return max(1, min(MAX_PARTS, ticks // PART_TICKS, len(stream_groups(data.test))))
 

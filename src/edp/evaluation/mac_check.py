@@ -64,7 +64,7 @@ class Trace(TorchDispatchMode):
         self._enter_answer(network)
 
     def _enter_answer(self, network: nn.Module) -> None:
-        """Enter the output layer, whose `answer` is called in place of the module."""
+        """Enter the output layer, whose method `answer` is called instead of the module."""
         output = getattr(network, "output", None)
         if output is None:
             return

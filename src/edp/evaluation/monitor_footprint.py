@@ -233,9 +233,10 @@ def monitor_footprint(parts: MonitorParts) -> MonitorFootprint:
 
 
 def _network_cycles(networks: Sequence[NetworkCost], core: str) -> tuple[float, float, float]:
-    """Return the estimates of all networks: low and typical averaged over samples, high of the longest one.
+    """Return the cycles of all networks per sample: low and typical estimate as means, high estimate as a maximum.
 
-    Networks that run at the same ticks add up; of several periods the longest ticks are taken to fall together.
+    Cycles of networks that run in the same sample are added. For several periods, the worst samples are assumed to
+    coincide.
     """
     low, typical, at_once = 0.0, 0.0, dict[tuple[int, int], float]()
     for network in networks:

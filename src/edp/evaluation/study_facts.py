@@ -51,10 +51,11 @@ class ArmFacts(SplitVariance):
 
 @dataclass(frozen=True, kw_only=True)
 class IsolationFacts:
-    """Phase 0: arms by backbone and feature set, mean scores by feature set, and the chosen feature set.
+    """Results of phase 0: scores of every arm, mean score of every feature set, and the selected feature set.
 
-    `comparisons` of feature sets are by backbone, `backbones` are compared with the chosen feature set, and `variance`
-    is that of paired differences, for planning.
+    An arm is a backbone with a feature set. `comparisons` has the comparison of feature sets for each backbone.
+    `backbones` compares the backbones with the selected feature set. `variance` is the variance of paired differences,
+    which planning uses.
     """
 
     arms: Mapping[str, ArmFacts]

@@ -1,4 +1,4 @@
-"""Trials of feature sets: errors of one network, trained on each feature set."""
+"""Trials of feature sets: errors of one network for each feature set."""
 
 from __future__ import annotations
 

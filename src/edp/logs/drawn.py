@@ -34,7 +34,7 @@ class Drawn:
 
 
 def check_hours(hours: float) -> float:
-    """Return the hours of a sample.
+    """Check the hours of a sample and return them.
 
     Raises:
         ConfigError: not a positive, finite number.

@@ -183,7 +183,7 @@ class MonitorChain:
         }
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the numbers of its file."""
+        """Return the arrays of its file."""
         named: dict[str, NDArray[Any]] = {f"summaries.{k}": v for k, v in self.summaries.arrays().items()}
         named |= {f"conditioning.{name}": values for name, values in self.conditioning.arrays().items()}
         for index, watch in enumerate(self.watches):

@@ -74,7 +74,7 @@ class Conditioning:
         return np.clip(z, -GROSS, GROSS)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the numbers of its file."""
+        """Return the arrays of its file."""
         return {name: getattr(self, name) for name in ARRAYS}
 
     @staticmethod

@@ -193,7 +193,7 @@ def _check_sessions(spec: ChainSpec, count: int) -> None:
 
 
 def _settle_blocks(spec: ChainSpec, sessions: Sequence[Recording], block: int) -> int:
-    """Return the blocks at the start of every session that are not watched."""
+    """Return the number of blocks at the start of every session that are not monitored."""
     shortest = min(session.samples for session in sessions)
     # A tenth: one-minute cycles of a rig would otherwise lose most of what they have.
     settle_ticks = min(round(spec.settle_s * sessions[0].rate_hz), shortest // 10)

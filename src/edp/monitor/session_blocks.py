@@ -67,7 +67,7 @@ def fit_summaries(
 
 
 def block_ticks(block_s: float, sessions: Sequence[Recording]) -> int:
-    """Return the ticks of a block of these sessions."""
+    """Return the number of samples of a block in these sessions."""
     block = max(round(block_s * sessions[0].rate_hz), MIN_TICKS)
     return min(block, max(1, min(session.samples for session in sessions) // 2))
 

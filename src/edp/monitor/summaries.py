@@ -197,7 +197,7 @@ class BlockSummaries:
         return {"block": self.block}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the numbers of its file."""
+        """Return the arrays of its file."""
         return {name: getattr(self, name) for name in ARRAYS}
 
     @staticmethod

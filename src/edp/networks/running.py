@@ -138,7 +138,7 @@ def streamed(
 
 
 def stream_groups(series: Sequence[Series], batch: int = 16) -> list[list[int]]:
-    """Return numbers of series whose streams run side by side, in the order in which they run: shorter ones come first.
+    """Return groups of series indices whose streams run in parallel, sorted by length.
 
     A stream's answers may differ in their last bits with its neighbours, which these groups settle once for all.
     """

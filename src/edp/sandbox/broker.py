@@ -229,7 +229,7 @@ class _Opener:
         return handle
 
     def _path(self, thread: int, folder: int, text: str) -> str:
-        """Return a path of the reader as this process calls it."""
+        """Translate a path of the reader process to a path that is valid in this process."""
         own = f"/proc/{self.child}"
         if not text.startswith(os.sep):
             is_current = folder == _CURRENT_FOLDER & 0xFFFFFFFF

@@ -50,7 +50,7 @@ _MARGIN: dict[str, Numbers] = {
     # Waiting.
     "poll": (7, None), "ppoll": (271, 73), "select": (23, None), "pselect6": (270, 72), "nanosleep": (35, 101),
     "clock_nanosleep": (230, 115), "sched_yield": (24, 124), "restart_syscall": (219, 128),
-    # Clocks, where the kernel's page of them (vDSO) is missing.
+    # Clock calls, which reach the kernel only if the vDSO page is missing.
     "clock_gettime": (228, 113), "clock_getres": (229, 114), "gettimeofday": (96, 169), "time": (201, None),
     # Handlers of signals (faulthandler) and what a process asks about itself.
     "rt_sigreturn": (15, 139), "sigaltstack": (131, 132), "set_tid_address": (218, 96), "getcpu": (309, 168),

@@ -143,7 +143,7 @@ def check_bounds(what: str, spec: object, **bounds: Bound) -> None:
 
 
 def bounds_of(cls: type) -> Mapping[str, Bound]:
-    """Return the bounds of a settings class by attribute, as far as an object of the class was made in this process."""
+    """Return the bounds of a settings class by attribute; empty before the first object of the class."""
     return dict(_checked.get(cls, {}))
 
 

@@ -138,7 +138,7 @@ def present_keys(cls: type, table: Mapping[str, T], path: str = "") -> dict[str,
     for key, value in table.items():
         name = earlier(cls).get(key, key) if isinstance(key, str) else key
         if name != key and name in table:
-            raise ConfigError(f"'{join(path, key)}' is now '{join(path, name)}', and both are given; give the second")
+            raise ConfigError(f"'{join(path, key)}' is now '{join(path, name)}', and both are given; delete the first")
         changed = next((VALUES[base.__name__, name] for base in cls.__mro__ if (base.__name__, name) in VALUES), {})
         present[name] = typing.cast(T, changed.get(value, value)) if isinstance(value, str) else value
     return present
@@ -168,7 +168,7 @@ def used_earlier_keys() -> Mapping[str, str]:
 
 
 def common_renames(classes: typing.Iterable[type], present: typing.Collection[str]) -> Mapping[str, str]:
-    """Return the renames of a table that may describe any of several classes; a key that one of them has stays.
+    """Return the renames of a table for several possible classes; a key that a class has is unchanged.
 
     Args:
         classes: classes that the table may describe.

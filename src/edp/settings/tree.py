@@ -84,7 +84,7 @@ def merged(base: Mapping[str, object], change: Mapping[str, object]) -> dict[str
 
 
 def value_at(table: object, path: str, default: Any = None) -> Any:
-    """Return the value at keys that are joined by points; a default where there is none."""
+    """Return the value at keys that are joined by points, or a default."""
     for key in path.split("."):
         if not isinstance(table, Mapping) or key not in table:
             return default
@@ -220,7 +220,7 @@ class SettingsTree:
             ConfigError: names every unknown key, wrong type and impossible value at once.
         """
         table = merged({} if path is None else self.renamed(cls, read_toml(path)), options or {})
-        table = merged(table, combined([self.renamed(cls, override(text)) for text in overrides]))
+        table = merged(table, self.renamed(cls, combined([override(text) for text in overrides])))
         where = of if path is None else f"'{path}'"
         return self.build(cls, table, where + (" with --set" if overrides else ""))
 
@@ -249,7 +249,7 @@ class SettingsTree:
             where = _join(path, str(name))
             if name != key:
                 if name in table:
-                    raise ConfigError(f"'{_join(path, key)}' is now '{where}', and both are given; give the second")
+                    raise ConfigError(f"'{_join(path, key)}' is now '{where}', and both are given; delete the first")
                 note_earlier(_join(path, key), where)
             hints = [keys[name].hint for keys in fields_by_class if name in keys]
             result[name] = self._renamed_value(str(name), hints, value, where)

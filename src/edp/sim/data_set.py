@@ -286,7 +286,7 @@ def identity_of(plan: Sequence[Scenario], files: WriteOptions, suffix: str = ".p
 
 
 def bytes_needed(plan: Sequence[Scenario], suffix: str) -> int:
-    """Return the room that the logs of a plan take, rounded up."""
+    """Return the disk space in bytes that the logs of a plan need, rounded up."""
     usual = len(TABLE_A1) + len(EXTRA_CHANNELS)
     values = sum(s.samples * (usual + _further_channels(s)) for s in plan)
     return int(values * BYTES_PER_VALUE.get(suffix, max(BYTES_PER_VALUE.values())))

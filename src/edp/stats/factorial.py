@@ -129,7 +129,7 @@ def _repair_runs(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
 
 
 def _exchange_levels(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
-    """Return the flip a level of a run, or move it within a group, as long as this lowers the cost."""
+    """Flip a level of a run, or move it within a group, until the cost no longer decreases."""
     best, cost = levels.copy(), float(_quality(levels, groups)[0])
     moves: list[tuple[int, ...]] = [(factor,) for factor in range(levels.shape[1])]
     moves += sorted(pair for group in groups for pair in combinations(group, 2))

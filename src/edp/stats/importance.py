@@ -44,7 +44,7 @@ def main_effects(
     covariates: ArrayLike | None = None,
     pass_at: float = PASS_AT,
 ) -> tuple[MainEffect, ...]:
-    """Return the regress the scores on all factors at once, and on covariates such as randomised rates.
+    """Regress the scores on all factors at once, and on covariates such as randomised rates.
 
     Args:
         levels: ``(run, factor)``, True if the factor is on; a repeated design is stacked.

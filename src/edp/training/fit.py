@@ -233,7 +233,7 @@ class Loop:
         return self.refitted is None and 0 < self.spec.patience <= waited and self.spec.average.may_stop()
 
     def _batches(self) -> Iterator[Batch]:
-        """Return the exactly `updates` batches; the order depends on the seed and the epoch alone."""
+        """Yield exactly `updates` batches; the order depends only on the seed and the epoch."""
         passes, batches = 0, 0
         while batches < self.updates:
             for batch in self.sampler.epoch(self.progress.epoch * 1000 + passes):  # orders of epochs do not meet

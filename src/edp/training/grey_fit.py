@@ -167,8 +167,8 @@ def fit_grey_box(
         return _Stages(GreyProblem(twin, train, parametrisation), validation, seed, history).fit()
     coarse = GreyProblem(twin.with_stretches(STRETCHES[0]), train)
     begin = best = _Stages(coarse, validation, seed, history).fit(final=False)
-    # Final rounds of a coarser form remember too well what it made of the logs: a finer one begins before them. Rounds
-    # that remember one another know several times what one does; the share makes it one round's.
+    # Start a finer form before the final rounds of the coarser one, whose accumulated information suits its own curves.
+    # Scale the accumulated information of several rounds to the information of a single round.
     share = 1.0 - spec.memory
     for stretches in STRETCHES:
         finer = begin.twin.with_stretches(stretches)

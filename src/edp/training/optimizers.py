@@ -24,7 +24,7 @@ class OptimizerSpec(Protocol):
         ...
 
     def remembers(self, shape: Sequence[int]) -> int:
-        """Return the numbers that it keeps for a parameter of this shape."""
+        """Return the number of state values for a parameter of this shape."""
         ...
 
 

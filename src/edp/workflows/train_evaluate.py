@@ -284,7 +284,7 @@ def evaluate(
 
 @dataclass(frozen=True)
 class EvaluatedRun:
-    """Location of evaluated data for a process: run folder, other recordings as JSON, and most hours of them."""
+    """Location of evaluated data for a process: run folder, other recordings as JSON, and maximum hours."""
 
     run: str
     source: str
@@ -342,7 +342,7 @@ def evaluate_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithS
 
 @lru_cache(maxsize=1)
 def _open_bench(evaluated_run: EvaluatedRun, digest: str, spec: JudgeSpec) -> ModelBench:
-    """Return a run with its data, read once for all units of a process; `digest` is that of the data."""
+    """Return a run with its data, read once for all units of a process; `digest` identifies the data."""
     bundle, _, provenance, data = read_trained_run(Path(evaluated_run.run))
     other = json.loads(evaluated_run.source)
     others = other_recordings(None if other is None else DataSource.from_dict(other), provenance)
@@ -351,7 +351,7 @@ def _open_bench(evaluated_run: EvaluatedRun, digest: str, spec: JudgeSpec) -> Mo
 
 
 def other_recordings(source: DataSource | None, provenance: Provenance) -> list[Recording] | None:
-    """Return other recordings, read with the run's map if they have none; None for the held-out ones."""
+    """Return other recordings, by default read with the run's map; None for the held-out recordings."""
     return None if source is None else read_as_before(source, provenance.origin.reader).read()
 
 
@@ -362,7 +362,7 @@ def _check_run_writable(folder: Path) -> None:
 
 
 def read_trained_run(folder: Path) -> tuple[Bundle, Experiment, Provenance, Prepared]:
-    """Return bundle, settings, provenance and data of a run, after a check that the data are those of its training.
+    """Return bundle, settings, provenance and data of a run, after a check of the data against the training data.
 
     Raises:
         EdpError: not a run folder of EDP, or its recordings changed since.

@@ -65,3 +65,17 @@ def test_a_time_without_a_unit_is_refused(edp, tmp_path):
     ended = edp("simulate", tmp_path / "x", "--duration", "5")
     assert ended.code == 2
     assert "'--duration': got '5', expected a number with a unit" in ended.err
+
+
+@pytest.mark.parametrize(("value", "new"), [("5", "5min"), ("1h", "1h"), ("x", "x"), ("--out", "--out")])
+def test_only_a_number_gets_the_unit_of_an_earlier_option(value, new):
+    assert rewrite(["simulate", "logs", "--minutes", value]).words == ["simulate", "logs", "--duration", new]
+    assert rewrite(["simulate", "logs", f"--minutes={value}"]).words == ["simulate", "logs", f"--duration={new}"]
+
+
+@pytest.mark.parametrize("preset", ["auto", "quick"])
+def test_both_names_of_a_key_in_two_overrides_are_an_error(edp, logs, tmp_path, preset):
+    given = ("--set", "judge.skip=5", "--set", "evaluation.warmup_samples=4")
+    ended = edp("train", logs, "--preset", preset, "--out", tmp_path / "run", *given)
+    assert ended.code == 1
+    assert "'judge' is now 'evaluation', and both are given" in ended.err

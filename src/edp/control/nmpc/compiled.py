@@ -149,7 +149,7 @@ def fill_limits(
     ends: tuple[Array, Array, float],
     room: tuple[Array, Array, Array],
 ) -> int:
-    """Return the rows of values that come near a limit; their number.
+    """Write one row for each value near a limit, and return the number of rows.
 
     Args:
         values: values of all runs at the ends of the blocks, the base first, shape (variable + 1, block, number).

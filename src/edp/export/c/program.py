@@ -57,7 +57,7 @@ def called(statements: Iterable[str]) -> set[str]:
 
 
 def runtime_bytes(functions: Iterable[str]) -> int:
-    """Return the functions of the runtime, with the functions, tables and parts of the C library that they need."""
+    """Return the bytes of the runtime functions, with the functions, tables and C library parts that they call."""
     sizes, needs = _read_measurements()
     # A set: functions share what they need, and the linker takes it once.
     every = {symbol for function in functions for symbol in needs[function]}

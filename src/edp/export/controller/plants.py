@@ -1,4 +1,4 @@
-"""Template values and files that both plant models of a controller share."""
+"""Template values and files of both plant models of a controller."""
 
 from __future__ import annotations
 

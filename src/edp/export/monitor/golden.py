@@ -23,7 +23,7 @@ Rows = NDArray[np.float32]
 
 
 def golden_blocks(chain: MonitorChain) -> int:
-    """Return the blocks of the self-test."""
+    """Return the number of blocks of the self-test."""
     return min(chain.settle + JUDGED_BLOCKS, max(2, MOST_TICKS // chain.summaries.block))
 
 
@@ -55,7 +55,7 @@ def usual_widths(chain: MonitorChain) -> tuple[Rows, Rows, Rows]:
 
 
 def _lcg(count: int, seed: int) -> NDArray[np.uint32]:
-    """Return the numbers of the linear congruential generator of Numerical Recipes, modulo 2^32."""
+    """Return pseudo-random integers modulo 2^32 by the linear congruential generator of Numerical Recipes."""
     out = np.empty(count, np.uint32)
     x = seed
     for i in range(count):

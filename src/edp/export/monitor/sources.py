@@ -344,7 +344,7 @@ class FlowCode(SourceCode):
 
 
 def _network_bytes(bundle: Bundle) -> int:
-    """Return the counters and the last inputs.
+    """Return the bytes of the counters and the last inputs.
 
     Which the state of every network has in addition to what its layers remember.
     """

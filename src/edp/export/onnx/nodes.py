@@ -134,7 +134,7 @@ class Nodes:
         return self.add("Gather", x, self.constant(chosen.astype(np.int64), "columns"), axis=1)
 
     def shaped(self, x: str, *shape: int) -> str:
-        """Return the reshape a value, keeping the order of its elements."""
+        """Reshape a value; the order of its elements is unchanged."""
         return self.add("Reshape", x, self.constant(np.array(shape, np.int64), "shape"))
 
     def clip(self, x: str, low: float, high: float) -> str:

@@ -207,7 +207,7 @@ class RlsCorrector:
         better = self.fallback[h] & (self._corrected[h] < constants["better"] * self._plain[h])
         self.fallback[h] = (self.fallback[h] | worse) & ~better
         if learn and worse.any():
-            # A correction that increased the error is reset to zero, together with the error for the comparison.
+            # Reset a correction that increased the error to zero, and its mean error to the error without correction.
             self.theta[h][worse] = 0.0
             self._corrected[h][worse] = self._plain[h][worse]
             self.covariance[h] = self._start()
@@ -244,6 +244,6 @@ class RlsCorrector:
 
 
 def _clip(values: Array, limit: float | np.floating) -> Array:
-    """Return the numbers cut off at plus and minus `limit`."""
+    """Limit values to plus and minus `limit`."""
     bound = np.float32(limit)
     return np.asarray(np.minimum(np.maximum(values, -bound), bound), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""In-memory unpacking of bag files that are compressed as a whole, since readers write nothing to disk."""
+"""In-memory unpacking of compressed bag files; the readers do not write to disk."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ def find_table(
 
 
 def _runs_on(row: Sequence[str], width: int, is_number: Callable[[str], bool]) -> bool:
-    """Return whether names and the first values share a line, because a line end is missing after the names."""
+    """Return whether a missing line end puts names and first values on one line."""
     names, numbers = row[:width], row[width:]
     return (
         len(numbers) == width

@@ -116,7 +116,7 @@ def _parse_switch(cells: pa.Array) -> pa.Array | None:
 
 
 def _parse_scaled(cells: pa.Array) -> pa.Array | None:
-    """Return the numbers with a prefix of SI behind them (``25.1m``), as panels of instruments write them.
+    """Parse values with an SI prefix as suffix (``25.1m``), as instrument panels write them.
 
     None for other text.
     """
@@ -294,7 +294,7 @@ class CsvTable:
                 return
 
     def _parse_grouped(self, cells: pa.Array, column_index: int) -> pa.Array:
-        """Return the numbers of a column of text: those that have points for thousands, or the states of a switch."""
+        """Parse a text column with thousands points, or with the states of a switch."""
         numbers = _parse_without_groups(cells) if self.layout.decimal == "," else None
         numbers = _parse_switch(cells) if numbers is None else numbers
         numbers = _parse_scaled(cells) if numbers is None and self.layout.decimal == "." else numbers

@@ -59,7 +59,7 @@ class _Topic:
     facts: str = ""
 
     def take(self, at_ns: int, values: dict[str, float], where: str) -> None:
-        """Add the numbers of a message; missing values become NaN, also for earlier messages without the column."""
+        """Add the values of a message; missing values become NaN, also for earlier messages without the column."""
         rows = len(self.at_ns)
         for name, value in values.items():
             column = self.columns.get(name)

@@ -245,7 +245,7 @@ class _Walk:
             at = channel.links[0]
 
     def held(self, data: _Block) -> int:
-        """Return the bytes of records behind a link to data."""
+        """Return the number of record bytes behind a link to data blocks."""
         total, at, seen = 0, data.at, set[int]()
         while at:
             if at in seen:

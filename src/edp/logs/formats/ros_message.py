@@ -203,7 +203,7 @@ class _Walk:
 def columns_of(
     raws: Sequence[bytes], names: Sequence[str], message_type: str, types: Types, cdr: bool
 ) -> list[NDArray[Any]]:
-    """Return the numbers of the named fields in many messages of one type, each an array of shape ``(message,)``.
+    """Return the named fields of many messages of one type, each an array of shape ``(message,)``.
 
     float32 where the field is, else float64; whole seconds and nanoseconds keep every digit. A message without the
     field, whose list is shorter, has NaN.

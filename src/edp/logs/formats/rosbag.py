@@ -159,7 +159,7 @@ class _Collected:
         self.log_ns.append(log_ns)
         if self.paths:
             self.raws.append(raw)
-            # An eighth, since a message holds many numbers.
+            # Flush after an eighth of the usual rows, since a message contains many values.
             if len(self.raws) >= PIECE_ROWS // 8:
                 self.flush()
 

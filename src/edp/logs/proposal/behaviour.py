@@ -220,7 +220,7 @@ def _relation(column: LogColumn, other: LogColumn) -> Relation | None:
 
 
 def repeats(column: LogColumn, other: LogColumn) -> bool:
-    """Return whether a column can be a copy of another one in another unit."""
+    """Return whether a column can be a copy of a column in other units."""
     own, theirs = column.pieces[0], other.pieces[0]
     if len(own) != len(theirs):
         return False

@@ -115,7 +115,7 @@ def quantum(values: Values) -> tuple[float | None, int]:
     if smallest <= 4 * grain or 2 * len(seen) > len(values):
         return None, len(seen)
     multiples = np.rint(apart / smallest)
-    # Over the whole range, since the smallest distance alone carries the rounding of float32.
+    # Estimate the step from all distances, since the rounding of float32 affects the smallest distance most.
     step = float(apart.sum() / multiples.sum())
     off = np.abs(apart / step - np.rint(apart / step))
     fits = float(np.mean(off < _ON_LATTICE + 2 * grain / step)) >= _SHARE_ON_LATTICE

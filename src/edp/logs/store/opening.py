@@ -81,7 +81,7 @@ def check_store(folder: str | Path) -> StoreIndex:
 
 
 def _map_file(folder: Path, file: RowsFile) -> FloatArray:
-    """Return the memory-map a data file, shape ``(values,)``. Changes remain in this process."""
+    """Map a data file into memory, shape ``(values,)``. Changes remain in this process."""
     size = _status(folder, file).st_size
     path = rows_path(folder, file.key)
     if size != file.bytes or size % NUMBER_BYTES or size == 0:

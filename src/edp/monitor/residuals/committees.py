@@ -107,7 +107,7 @@ def _prepare_data(task: Task, material: FitMaterial) -> Prepared:
 
 
 def _shorten_series(series: Sequence[Series]) -> list[Series]:
-    """Return the shorten the series in equal proportion to `VALIDATED_TICKS` samples in total."""
+    """Shorten the series in equal proportion to `VALIDATED_TICKS` samples in total."""
     share = min(1.0, VALIDATED_TICKS / max(1, sum(part.samples for part in series)))
     cut = [part.samples if share == 1.0 else max(1000, int(part.samples * share)) for part in series]
     return [Series(p.name, p.inputs[:n], p.targets[:n]) for p, n in zip(series, cut, strict=True)]

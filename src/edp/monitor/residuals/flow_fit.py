@@ -244,7 +244,7 @@ def _compute_remaining(
 
 
 def _curves(spots: ChamberPlaces, model: SpoolModel, sessions: Sequence[Singles], rate_hz: float, rows: int) -> Curves:
-    """Return the numbers of a chamber by all sessions that train."""
+    """Return the fitted curves of a chamber, over all training sessions."""
     stride = max(1, sum(map(len, sessions)) // rows)
     parts = [_terms(spots, model, session, rate_hz, lambda v: v[50::stride]) for session in sessions]
     target = np.concatenate([part[2] for part in parts]).astype(np.float64) * spots.sign

@@ -26,7 +26,7 @@ class GlobalAveragePooling:
     space: ClassVar[dict[str, object]] = {}
 
     def extra(self, width: int) -> int:
-        """Return the features added for recurrent states of `width`."""
+        """Return the number of features added for recurrent states of `width`."""
         # At least one feature, so that a single unit does not give an empty layer.
         return max(1, width // 2)
 

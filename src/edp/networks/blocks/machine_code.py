@@ -83,7 +83,7 @@ class CodedChannels(Streaming):
         return build.add(ScaleShift, "machine_code", x, gain=gain, shift=shift)
 
     def costs(self) -> list[Cost]:
-        """Return the costs: one element-wise product per channel, since the maps act on a constant."""
+        """Return the costs: one product per channel. Gains and shifts are constants of the machine."""
         return [
             Cost(
                 "machine code",

@@ -23,7 +23,7 @@ class TemporalDifference:
     space: ClassVar[dict[str, object]] = {}
 
     def extra(self, width: int) -> int:
-        """Return the features added for recurrent states of `width`."""
+        """Return the number of features added for recurrent states of `width`."""
         return width
 
     def build(self, width: int, window: int) -> Streaming:

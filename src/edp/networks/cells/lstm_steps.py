@@ -128,7 +128,7 @@ class _Steps(torch.autograd.Function):
 
 
 def _each(share: Shares, ticks: int) -> tuple[Sequence[Tensor | float], Sequence[Tensor | float]] | None:
-    """Return the shares of h and of c tick by tick; None where all of the new state is taken."""
+    """Return the update fractions of h and c for each sample; None for a full update."""
     if isinstance(share, tuple):
         return share[0].unbind(0), share[1].unbind(0)
     return None if share == 1.0 else ([share] * ticks, [share] * ticks)

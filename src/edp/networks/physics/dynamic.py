@@ -77,7 +77,7 @@ class Dynamic(PhysicsBase):
 
     @abstractmethod
     def start(self, x: Tensor, pose: Pose, rate: Tensor, speed: Tensor) -> tuple[Tensor, Tensor]:
-        """Present velocities in m/s and accelerations in m/s^2 of the cylinders, ``(batch, time, 3)``."""
+        """Cylinder velocities (m/s) and accelerations (m/s^2) at the present sample, each ``(batch, time, 3)``."""
 
     def lasting(self) -> list[float]:
         """Return the time (s) during which an acceleration acts for each horizon: k steps, minus the fading time."""

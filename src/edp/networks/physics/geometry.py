@@ -171,7 +171,7 @@ class Geometry(nn.Module):
         return length, turned / ((link_y * arm_x - link_x * arm_y) * length)
 
     def lever_change(self, pose: Pose) -> Tensor:
-        """Return the dJ/dpsi in m/rad^2, ``(..., 3)``, by a central difference over `TURN` to either side."""
+        """Return dJ/dpsi in m/rad^2, ``(..., 3)``, by a central difference over `TURN` in both directions."""
         # A central difference: the derivative of the four-bar in closed form is long and would be needed in every
         # export.
         c, s = float(np.cos(TURN)), float(np.sin(TURN))

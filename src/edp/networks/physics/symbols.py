@@ -144,7 +144,7 @@ class Symbol:
 
 
 def _array(value: Any) -> np.ndarray:
-    """Return the numbers that are known when the graph is made."""
+    """Return the values that are constant when the graph is built."""
     return np.asarray(value.detach().cpu().numpy() if isinstance(value, Tensor) else value, dtype=np.float32)
 
 

@@ -79,7 +79,7 @@ class Recurrent:
         return self._map_spec.start(channels, scales, train, 0) if self.valve_map else None
 
     def member(self, channels: TwinChannels, scales: TwinScales, static: StaticTwin | None, seed: int) -> RecurrentTwin:
-        """Return one of its members, untrained, on a fitted map."""
+        """Return an untrained member with a fitted map."""
         network = self.alone()._network(channels)
         # Outputs that start at zero change would make the first free runs stand still.
         network.draw(seed, 0.1)

@@ -73,7 +73,7 @@ def _is_stop(there: Sequence[np.ndarray], pushes: Sequence[np.ndarray], rate_hz:
 
 
 def _longest(there: np.ndarray) -> int:
-    """Return the ticks of the longest stay."""
+    """Return the number of samples of the longest stay."""
     turns = np.flatnonzero(np.diff(np.concatenate([[0], there.astype(np.int8), [0]])))
     return int((turns[1::2] - turns[::2]).max(initial=0))
 

@@ -330,7 +330,7 @@ def _axis_values(x: Positions | Evenly) -> dict[str, object]:
 
 
 def _escape_names(positions: Any) -> Any:
-    """Return positions with names escaped and values unchanged."""
+    """Escape the names among axis positions; numeric positions are unchanged."""
     return (
         [_text(at) if isinstance(at, str) else at for at in positions]
         if isinstance(positions, list | tuple)

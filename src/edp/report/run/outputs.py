@@ -124,5 +124,5 @@ def by_output(scores: ScoresFile, horizon: int, targets: Sequence[tuple[str, str
 
 
 def _places(value: float) -> int:
-    """Return the decimals that show three digits of a value."""
+    """Return the number of decimals that shows three digits of a value."""
     return 4 if not value else int(min(max(2 - math.floor(math.log10(abs(value))), 0), 8))

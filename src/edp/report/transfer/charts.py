@@ -33,7 +33,7 @@ DOMAINS = {TARGET: "On the target's logs", SOURCE: "On the source's recordings"}
 
 
 def picture_charts(facts: Transfer) -> list[Chart]:
-    """Return the figures of the thesis, before and after; predictions of the first recording."""
+    """Return the thesis's figures before and after fine-tuning, and the predictions of the first recording."""
     charts = []
     for method in facts.pair:
         label = facts.methods[method].label

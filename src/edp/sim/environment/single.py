@@ -154,7 +154,7 @@ class ExcavatorEnv(SingleEnvironment):
         return self._batch.observation(0)
 
     def branch(self, seed: int) -> None:
-        """Draw new random values for sensors and soil from now on; the present state is unchanged.
+        """Draw new random values for sensors and soil; the present state is unchanged.
 
         Raises:
             ConfigError: no episode has begun.

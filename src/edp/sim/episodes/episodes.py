@@ -127,7 +127,7 @@ class Episodes:
         )
 
     def ticks(self, index: int) -> int:
-        """Return the ticks done since an episode began."""
+        """Return the number of samples since the start of an episode."""
         return int(self.memory[index, blocks.BLOCKS * blocks.ENTRY + blocks.TICK])
 
     def shares(self) -> Callable[[], Array] | None:

@@ -75,6 +75,6 @@ class SwingDig(Dig):
         """Return the lever towards the goal, centred as soon as braking suffices."""
         left = self._swing_goal - view.swing
         braking = view.swing_rate * abs(view.swing_rate) / (2.0 * self.BRAKES_AT)
-        # What is left once the motion has died out by itself.
+        # Angle to the goal that remains after braking to standstill.
         left -= braking
         return self._level * float(np.sign(left)) if abs(left) > self.CLOSE_RAD else 0.0

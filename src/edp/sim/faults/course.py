@@ -158,7 +158,7 @@ class SensorCourse:
         self.table = np.array(rows, dtype=float).reshape(len(rows), alterations.COLUMNS)
 
     def drawn(self, healthy: Array, rate_hz: float, chance: np.random.Generator) -> Array:
-        """Return the random values of a recording with the faults' noise, then one column per row of the table.
+        """Return the random values of a recording with the noise of faults, and one further column per fault.
 
         Args:
             healthy: random values of `edp.sim.sensors.draws.draw`, shape (time, draws).

@@ -25,7 +25,7 @@ UNBOUNDED = 1e12
 
 
 def conductance(rating: Rating) -> float:
-    """Return the k of Q = k sqrt(dp), m^3/s/sqrt(Pa), from L/min at bar."""
+    """Return k of Q = k sqrt(dp), m^3/s/sqrt(Pa), from L/min at bar."""
     flow, pressure = rating
     # 6e4 L/min are 1 m^3/s.
     return flow / 6e4 / math.sqrt(pressure * 1e5)

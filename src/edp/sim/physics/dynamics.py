@@ -116,7 +116,7 @@ def bias_torque(psi: Array, rate: Array, axes: Array, plant: Array) -> Array:
 
 
 def mechanical_energy(psi: Array, rate: Array, axes: Array, plant: Array) -> float:
-    """Return the kinetic plus potential energy, J (zero height at the boom foot)."""
+    """Return the sum of kinetic and potential energy, J (zero height at the boom foot)."""
     mass = np.empty((3, 3))
     mass_matrix(psi, axes, mass)
     angles = np.cumsum(psi)

@@ -17,7 +17,7 @@ NEGLIGIBLE = 6.5
 
 @inlined
 def lugre(v: float, z: float, axes: Array, i: int, viscous: float) -> tuple[float, float, float, float, float, float]:
-    """Return the luGre friction with bristle damping that fades with speed (which keeps it passive).
+    """Return LuGre friction with a bristle damping that decreases with speed, which keeps it passive.
 
     Args:
         v: cylinder velocity, m/s.

@@ -20,7 +20,7 @@ UNLOADING = 1.5
 
 @inlined
 def orifice(dp: float) -> tuple[float, float]:
-    """Return the dp / (dp^2 + delta^2)^(1/4), which is sqrt(dp) smoothed over 1 bar, and its derivative."""
+    """Return dp / (dp^2 + delta^2)^(1/4), which is sqrt(dp) smoothed over 1 bar, and its derivative."""
     q2 = dp * dp + SMOOTH2
     # Two square roots replace the slower pow(q2, 0.25).
     root = math.sqrt(math.sqrt(q2))

@@ -31,7 +31,7 @@ def motors_of(machine: Machine) -> tuple[SwingMotor, Motor, Motor]:
 
 
 def pack_motors(machine: Machine) -> Array:
-    """Return the numbers of the motors of a machine that has them, shape (3, MOTOR_VALUES)."""
+    """Return the parameters of the motors of a machine, shape (3, MOTOR_VALUES)."""
     numbers, motors = np.zeros((at.MOTORS, at.MOTOR_VALUES)), motors_of(machine)
     for row, motor in zip(numbers, motors, strict=True):
         row[: at.FOOT_AHEAD] = (

@@ -81,7 +81,7 @@ class Ground:
 
 
 def no_ground() -> tuple[Array, ...]:
-    """Return the stand-in of `Ground.arrays` in free air."""
+    """Return the arrays of `Ground.arrays` for free air."""
     return np.zeros(terramechanics.NUMBERS), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros(2), np.zeros(at.MEMORY + 2)
 
 

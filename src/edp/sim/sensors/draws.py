@@ -98,7 +98,7 @@ def _bus(machine: Machine, samples: int, rate_hz: float, rng: np.random.Generato
 
 
 def pack_sensors(machine: Machine, rate_hz: float, noisy: bool, faults: Array | None = None) -> chain.Setup:
-    """Return the numbers of the chain, `axes` and `plant` of the machine as built, and the table of faults.
+    """Return the arrays of the sensor chain: parameters, `axes` and `plant` of the machine, and the table of faults.
 
     As built, since payload, oil and faults change the plant's own.
 

@@ -17,7 +17,7 @@ from edp.storage.writing import make_folder, write_bytes
 
 
 def claim(folder: str | Path, key: str) -> Claim:
-    """Return the claim a training for this process until it ends or releases the claim.
+    """Claim a training for this process until it ends or releases the claim.
 
     Raises:
         BusyError: another process trains it.

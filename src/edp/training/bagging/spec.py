@@ -1,4 +1,4 @@
-"""Settings of an ensemble of networks, each trained on different folds."""
+"""Settings of an ensemble whose networks have different training folds."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ class GreyParts:
 
     @property
     def fixed(self) -> NDArray[np.bool_]:
-        """Numbers that a machine has no place for, or that are constants of the simulator ``(number,)``."""
+        """Mask of grey-box parameters that a machine file lacks or that the simulator fixes, shape ``(number,)``."""
         at, table = np.zeros(len(self.table.numbers), np.bool_), self.table
         at[[table.circuit_at + k for k in (grey.SUPPLY, grey.DEMAND_START, grey.DEMAND_SPAN)]] = True
         at[table.actuator_at + grey.ASYMMETRY] = True
@@ -73,7 +73,7 @@ class GreyParts:
 
 
 def grey_numbers(machine: Machine, parts: GreyParts, load: Doubles) -> Doubles:
-    """Return the numbers of the grey box of a machine, in its own units ``(number,)``.
+    """Return the grey-box parameters of a machine, in grey-box units ``(number,)``.
 
     Args:
         machine: machine of the simulator.

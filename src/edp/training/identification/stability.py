@@ -78,7 +78,7 @@ def spread(theta: Doubles, matrices: Doubles, gradients: Doubles) -> Doubles:
     prior = np.eye(size)
 
     def moved(matrix: Doubles, gradient: Doubles, share: float) -> Doubles:
-        # A part of the logs stands for all of them: as much information, other numbers.
+        # Scale the information of a part of the logs to the amount of information in all logs.
         return np.asarray(np.linalg.solve(matrix / share + prior, gradient / share + theta))
 
     inverse = np.linalg.inv(matrices.sum(axis=(0, 1)) + prior)

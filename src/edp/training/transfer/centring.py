@@ -98,7 +98,7 @@ def _shift(net: Predictor, change: NDArray[np.float64]) -> None:
     bias = net.heads.biases[-1]
     features = torch.zeros(1, 1, len(net.task.features.features), device=bias.device)
     future = torch.as_tensor(change, dtype=torch.float32, device=bias.device)[None, None]
-    # The difference of two codes turns an SI change into the network's units, whatever the scaling.
+    # The difference of two encoded targets is the change in network units, for any offset of the scaling.
     coded: Tensor = net.code.encode(future, features) - net.code.encode(torch.zeros_like(future), features)
     with torch.no_grad():
         bias[:, :: net.spec.output.values] += coded[0, 0].transpose(0, 1)

@@ -193,7 +193,7 @@ def replay_run(
     progress: Progress = SILENT,
     twin: str | Path | None = None,
 ) -> AdaptationFile:
-    """Return the replay logs through a run that `edp adapt` wrote; see `replay`.
+    """Replay logs through a run that `edp adapt` wrote; see `replay`.
 
     Args:
         run: run with an adaptation.

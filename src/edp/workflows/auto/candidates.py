@@ -359,7 +359,7 @@ def _columns(amount: Amount) -> int:
 
 
 def _steps(amount: Amount, groups: int) -> int:
-    """Return the updates of each perceptron within the budget and the useful number for these rows."""
+    """Return the number of updates of each perceptron within the budget and within the useful number."""
     weights = MEMBERS * groups * (_columns(amount) * UNITS + UNITS * UNITS + UNITS * amount.outputs)
     affordable = amount.seconds("perceptrons") * OPERATIONS_PER_S / (PASSES * BATCH * weights)
     useful = max(USUAL_STEPS, ROW_PASSES * amount.rows // BATCH)

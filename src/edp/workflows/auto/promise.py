@@ -206,7 +206,7 @@ def to_report_units(error: DoubleArray, data: Prepared) -> dict[str, dict[str, f
 
 
 def by_output(values: DoubleArray, data: Prepared) -> dict[str, dict[str, float]]:
-    """Return the numbers ``(output,)`` by horizon and target."""
+    """Return the errors ``(output,)`` by horizon and target."""
     return {
         str(horizon): dict(zip(data.task.targets, map(float, row), strict=True))
         for horizon, row in zip(data.task.horizons, values.reshape(len(data.task.horizons), -1), strict=True)

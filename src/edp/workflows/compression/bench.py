@@ -25,16 +25,16 @@ TUNING_EPOCHS, TUNING_RATE = 1 / 3, 1 / 5
 
 @dataclass(frozen=True, kw_only=True)
 class CompressionRequest:
-    """A training that makes a smaller network of a teacher.
+    """Request to train a smaller network from a teacher.
 
     Attributes:
         name: name of the network.
-        units: its width; that of the teacher keeps all of it.
-        levels: convolution levels; None as `student` chooses.
-        pruned: begin with what pruning leaves of the teacher, which needs all its levels.
-        distillation: the objective; None for `DistillationSpec()`, and for rows where `imitates` holds.
-        rounding: number format that the training imitates; it continues from the network `of`.
-        of: the order whose network a rounded training goes on from; None for the teacher itself.
+        units: width of the network, at most the width of the teacher.
+        levels: convolution levels; None lets `student` choose.
+        pruned: whether training starts from the pruned teacher, which requires all convolution levels.
+        distillation: objective; None for `DistillationSpec()`, or for a student that imitates bank rows (`imitates`).
+        rounding: number format that the training simulates, starting from the network of the request `of`.
+        of: request whose network a training with rounding continues; None for the teacher.
     """
 
     name: str

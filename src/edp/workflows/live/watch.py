@@ -84,7 +84,7 @@ class LiveMonitor(LivePart):
         note("note", f"monitor: {monitor.limit.sentence()}", "")
 
     def step(self, row: Row, missed: int) -> Row:
-        """See `LivePart`: statistics over the limit, of the last block."""
+        """Return the statistics of the last block, each divided by its limit; see `LivePart`."""
         block = self._stream.monitor.chain.summaries.block
         if missed > block:
             self.reset()

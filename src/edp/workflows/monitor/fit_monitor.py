@@ -223,7 +223,7 @@ def _assemble_monitor(
     sessions: Sequence[Recording],
     rest: Sequence[Recording],
 ) -> Monitor:
-    """Return the monitor without a dictionary; `rest` are the sessions that no residual was trained on."""
+    """Return the monitor without a dictionary; `rest` are the sessions outside the training of residuals."""
     doubtful = fitted.doubtful
     provenance: dict[str, object] = {
         "sessions": len(sessions),

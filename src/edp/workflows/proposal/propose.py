@@ -130,7 +130,7 @@ def _quoted(path: Path) -> str:
 
 
 def propose(path: str | Path | Sequence[str | Path], progress: Progress = SILENT) -> LogsProposal:
-    """Return the examine logs and propose a map and settings, without writing files.
+    """Examine logs and propose a map and settings, without writing files.
 
     Args:
         path: a log or a folder of logs, or several of them.

@@ -121,7 +121,7 @@ def _correlation(arm: Arm) -> Arm:
 
 
 def _focal(arm: Arm) -> Arm:
-    """Weight the loss by the size of the error; a squared loss gets a threshold that no error reaches."""
+    """Use the focal loss, which weights large errors more; for a squared loss, set its threshold above every error."""
     if arm["training.loss.kind"] == "focal":
         return arm
     delta = arm.get("training.loss.delta", NO_THRESHOLD)

@@ -41,7 +41,7 @@ Weights = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class Recipe:
-    """Recipe that makes a network from that of a request.
+    """Recipe that turns the network of a request into a smaller network.
 
     Attributes:
         updates: training steps of a smaller network over all epochs, 0 for passes over the data; one that is trained
@@ -97,7 +97,7 @@ class Recipe:
 
 
 def before(order: TrainingRequest) -> list[TrainingRequest]:
-    """Return requests of phase 6 whose state can start this one, the most useful first; none in other phases."""
+    """Return requests of phase 6 whose state can start this request, the most useful first."""
     if order.recipe is None:
         return []
     recipe = Recipe.from_json(order.recipe)

@@ -1,4 +1,4 @@
-"""Dimensions of a search apart from modules: each has a range and gives an arm a value."""
+"""Dimensions of a search other than modules, each with a range and a function that sets its value."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Choice:
             raise ConfigError(f"a choice of {list(self.options)}; two values or more, each once, must hold")
 
     def holds(self, value: Value) -> bool:
-        """Test whether a value is one of the options."""
+        """Return whether a value is among the options."""
         return value in self.options
 
 
@@ -158,7 +158,7 @@ def _schedule(arm: Arm, value: str) -> Arm:
 
 @DIMENSIONS.register("patience")
 def _patience(arm: Arm, value: int) -> Arm:
-    """Set the patience of a plateau in epochs; other schedules have none."""
+    """Set the patience of a plateau schedule in epochs; other schedules are unchanged."""
     is_plateau = arm["training.schedule.kind"] == "plateau"
     return arm.with_value("training.schedule.patience", int(value)) if is_plateau else arm
 
@@ -262,7 +262,7 @@ def elastic(space: Space, baseline: Candidate, reach: Mapping[str, float] = ELAS
 
 
 def check(space: Space, candidate: Candidate) -> None:
-    """Refuse a candidate that lacks a dimension of the space or lies outside it.
+    """Raise an error for a candidate that lacks a dimension of the space or is outside it.
 
     Raises:
         ConfigError: a dimension is missing or out of range; the message states value and range.

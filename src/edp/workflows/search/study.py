@@ -1,4 +1,4 @@
-"""Ask-and-tell access to Optuna; nothing is stored, and a continued search reports its values again.
+"""Ask-and-tell interface to Optuna without storage; a continued search reports its values again.
 
 A study is a pure function of its root seed and of the reports, in the order of the trials: each question is asked
 with a sampler seeded by root and number. So a search that was killed asks the same again and finds the answers in the
@@ -104,7 +104,7 @@ class SamplerSpec:
 
 @dataclass
 class Study:
-    """Questions about a space and their answers; smaller values are better.
+    """Optuna study of a space; smaller values are better.
 
     Attributes:
         space: dimensions and their ranges.
@@ -235,7 +235,7 @@ class Study:
     def tell(
         self, number: int, values: Sequence[float] | None, costs: Sequence[float] = (), pruned: bool = False
     ) -> None:
-        """Report the answer of a question in any order; answers count in the order of values.
+        """Report the values of a trial; trials enter the study in the order of their numbers.
 
         Args:
             number: number of the trial.

@@ -91,7 +91,7 @@ class StudyLog:
         self.phases[phase.name] = phase
 
     def on_record(self, record: Record, order: TrainingRequest, trained: bool) -> None:
-        """Note that a training, or a part of one, is in the ledger."""
+        """Record that a training, or a part of a training, is in the ledger."""
         # A search that goes on comes by earlier records again.
         if record.key in self._heard:
             return
@@ -167,7 +167,7 @@ class StudyLog:
         self.write(force=True)
 
     def counts(self) -> TrainingCounts:
-        """Return the numbers of finished trainings, requested ones, and the largest total."""
+        """Return the counts of finished trainings, requested trainings and the largest total."""
         done = sum(row.status != "waiting" for row in self.rows.values())
         # A phase that has ended asks for no more.
         ahead = sum(

@@ -106,7 +106,7 @@ class TrainingRequest:
         return replace(self, until=None, stops=())
 
     def to_json(self) -> dict[str, object]:
-        """Return the plain values, from which `from_json` makes the same order."""
+        """Return the request in JSON types; `from_json` is the inverse."""
         return dict(plain_tree(self))
 
     @staticmethod
@@ -154,7 +154,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class TrainedPart:
-    """A training that has ended, or a part of one.
+    """Finished training, or a part of a training.
 
     Attributes:
         result: for JSON. ``sessions``: for each evaluation session its scores at each horizon, report units, mean over
@@ -287,7 +287,7 @@ class _Named:
 # One source: a worker serves one search, and two data sets might not fit in memory.
 @lru_cache(maxsize=1)
 def _recordings(source: str) -> Sequence[Recording]:
-    """Return the recordings of a source, kept by the process that trains on them repeatedly."""
+    """Return the recordings of a source, cached for repeated trainings in this process."""
     return DataSource.from_dict(json.loads(source)).read()
 
 

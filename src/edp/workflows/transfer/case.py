@@ -130,7 +130,7 @@ def tuned(
 
 
 def repeat_chunks(chunks: ChunkSpec) -> ChunkSpec:
-    """Return chunks for minutes of logs, which fill few lanes: they are read repeatedly with other cuts."""
+    """Return chunk settings that read minutes of logs repeatedly with different cuts."""
     if chunks.reset_after_chunks or chunks.regime == "window":
         return chunks
     # A piece must be longer than its burn-in; eight chunks leave most of its ticks with a loss.

@@ -1,4 +1,4 @@
-"""Network for another machine from that of one machine and the other's logs, with baselines on the same ticks."""
+"""Fine-tuning of a network of one machine with the logs of another, compared with baselines."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class FinetuneRequest:
 
     @property
     def names(self) -> list[str]:
-        """Return all methods: the kept one, direct transfer, and the others in the registry's order."""
+        """Return all methods: the selected method, direct transfer, and the others in the order of the registry."""
         asked_names = {self.method, BEFORE, *self.baselines}
         first = [self.method, BEFORE]
         return first + [name for name in METHODS if name in asked_names and name not in first]
@@ -93,7 +93,7 @@ def finetune(
     progress: Progress = SILENT,
     workers: Workers = IN_PROCESS,
 ) -> TransferFile:
-    """Train a network of one machine further for another, evaluate it with baselines, and write a run folder.
+    """Fine-tune a network of one machine with logs of another, compare it with baselines, and write a run folder.
 
     The source's scaling is carried and never fitted again. Each log is divided by time into training, validation and
     test part with a gap of W + k. The same call goes on after a stop. Baselines lie in ``baselines/`` of the folder.
@@ -205,7 +205,7 @@ def _able(source: SourceModel, order: FinetuneRequest) -> tuple[list[str], list[
 def target_data(
     source: SourceModel, logs: DataSource, experiment: Experiment, order: FinetuneRequest
 ) -> tuple[Prepared, list[str]]:
-    """Return the logs of a target, divided and checked against the source, and notes on missing checks.
+    """Split the logs of the target machine and check them against the source machine; return data and notes.
 
     Raises:
         EdpError: logs that do not go with the source.

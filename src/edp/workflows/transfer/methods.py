@@ -90,7 +90,7 @@ def code_names(network: Predictor) -> list[str]:
 
 @METHODS.register("code")
 class MachineCodeAlone(Method):
-    """Search of the target machine's code; all weights stay those of the fleet."""
+    """Search of the target machine's code with the weights of the fleet."""
 
     label = "Code alone"
     needs_code = True
@@ -209,7 +209,7 @@ class Rehearsal(Method):
 
 @METHODS.register("rehearsal_distilled")
 class DistilledRehearsal(Method):
-    """Rehearsal with a fraction of the source's domain that the source's own network teaches."""
+    """Rehearsal with a fraction of the source domain, distilled from the source network."""
 
     label = "Rehearsal, distilled"
     needs_source = True

@@ -116,7 +116,7 @@ class TwinChoice:
     run: KeyedRun
 
     def best(self) -> tuple[FittedFormulation, list[TwinCandidate]]:
-        """Return the simplest of the candidates that are as good as the best, and all of them.
+        """Return the simplest candidate within the tolerance of the best, and all candidates.
 
         Raises:
             ConfigError: no formulation can be fitted to these recordings.
@@ -178,7 +178,7 @@ class TwinChoice:
         return [self._runs(spec.start(*shared, fold.train, seed), fold) for fold in self.folds]
 
     def _try_formulation(self, name: str, rival: TwinCandidate | None) -> list[TwinCandidate]:
-        """Try a formulation with default options; the recurrent one in several forms, the simplest first."""
+        """Try a formulation with default options, or the recurrent formulation in several forms, the simplest first."""
         if name == "recurrent":  # a short training far behind a floor may be ahead of it as a long one
             return self._recurrent()
         spec = self._default(name)
@@ -193,7 +193,7 @@ class TwinChoice:
         return [self._attempt(described(spec), spec, fitted, rival, FAR_BEHIND)]
 
     def _recurrent(self) -> list[TwinCandidate]:
-        """Try the recurrent twin with and without a static map, with longer training as long as it helps."""
+        """Try the recurrent twin with and without a static map, and with longer trainings while the error decreases."""
         count = len(self.folds)
         plain = Recurrent(prefix_ticks=self.auto.prefix_ticks)
         if count > 1:
@@ -233,7 +233,7 @@ class TwinChoice:
     def _train_members(
         self, form: Recurrent, training: FreeRunSpec, rival: TwinCandidate | None, most: float
     ) -> TwinCandidate:
-        """Train the members of a form for a length, each without one of the folds."""
+        """Train the members of a form for a length; each member leaves out a fold."""
         whole, label = self._whole, labelled(form, training)
         static = form.static_map(whole.channels, whole.scales, whole.data.train)
         name = f"recurrent{'_map' if form.valve_map else ''}_{sum(training.updates)}"
@@ -334,7 +334,7 @@ class TwinChoice:
         return spec
 
     def _runs(self, twin: Any, fold: StretchFold) -> FreeRuns:
-        """Return free runs on the left-out part of a fold, as long as those that select weights.
+        """Return free runs on the left-out part of a fold, with the length of the validation runs.
 
         More of them fit into it, and differ more from one another, than long ones.
         """

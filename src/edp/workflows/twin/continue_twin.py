@@ -157,7 +157,7 @@ class ContinuedTwin:
     run: KeyedRun
 
     def best(self) -> tuple[FittedFormulation, list[TwinCandidate]]:
-        """Return the best of the unchanged twin and trainings of several lengths, and all of them."""
+        """Return the best of the unchanged twin and the fine-tuned twins, and all candidates."""
         start = self.start.twin
         scales = scales_for(start, self.fit.scales, self.fit.data.train)
         # End stops are the machine's: the twin as it is has those of these recordings, too.
@@ -178,7 +178,7 @@ class ContinuedTwin:
         return FittedFormulation(self.start.bundle.spec, replace(fits[best], seconds=seconds, facts=facts)), tried
 
     def _train_members(self, start: RecurrentTwin, share: float) -> FittedTwin:
-        """Train each member further from its start, and average them again."""
+        """Fine-tune each member from its start, and average the members again."""
         training = shortened(self.fit.experiment.training, share)
         train, validation = self.fit.data.train, self.fit.data.validation
         label = f"{sum(training.updates):,} further updates"

@@ -104,7 +104,7 @@ class TwinFit:
     def train_members(
         self, jobs: Sequence[MemberTraining], on_event: Callable[[FreeRunProgress], None] | None
     ) -> Iterable[FittedTwin]:
-        """Train networks in parallel or one by one, and return them in order.
+        """Train networks in sequence or in parallel, and return them in order.
 
         Raises:
             EdpError: see `fit_free_runs`, or a process was killed again and again.

@@ -120,7 +120,7 @@ def forecast_logs(
 
 
 def _choose_gain(bundle: TwinBundle, recordings: Sequence[Recording], horizons: Sequence[int]) -> float:
-    """Choose a gain on the twin's training logs, or on the first logs if none of them is given."""
+    """Choose a gain on the twin's training logs, or on the first logs if they contain no training log."""
     learned_names = bundle.provenance.recording_names("train", "validation")
     chosen = [logged for logged in recordings if logged.name in learned_names] or list(recordings)
     task = bundle.twin.channels.task()

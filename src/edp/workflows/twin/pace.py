@@ -19,7 +19,7 @@ MIN_TICKS = 16
 
 
 def paced(training: FreeRunSpec, rate_hz: float, block: int) -> FreeRunSpec:
-    """Return the training with lengths in ticks for slow or short logs; lengths that the settings name are kept.
+    """Return the training with lengths in samples that suit slow or short logs; lengths in the settings are unchanged.
 
     On the Sjoberg arm, whose tick counts as a second, the chosen twin is 0.62 off (one seed), and networks with lengths
     of a league's own, all validated by one segment, 0.66 (median of five; `benchmarks/results`).

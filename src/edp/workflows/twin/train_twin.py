@@ -1,4 +1,4 @@
-"""Training of a twin into a run folder, with its scores and those of the baselines in free run."""
+"""Training of a twin into a run folder, with free-run scores of the twin and its baselines."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def _check_judged(channels: TwinChannels, data: Prepared, experiment: TwinExperi
 
 
 def _linkage(experiment: TwinExperiment) -> dict[str, object]:
-    """Return all numbers of the machine that the settings name for the linkage: an edited file requires another twin.
+    """Return all parameters of the linkage's machine file, so that an edited file requires a new twin.
 
     Raises:
         ConfigError: no such machine.
@@ -167,7 +167,7 @@ def _linkage(experiment: TwinExperiment) -> dict[str, object]:
 
 
 def _train_or_choose(fit: TwinFit, run: KeyedRun, base: BaseTwin | None) -> FittedFormulation:
-    """Return the twin of the settings, or the fine-tuned one; a choice is kept in ``candidates.json``."""
+    """Return the twin of the settings, or the fine-tuned twin; write a choice to ``candidates.json``."""
     spec = fit.experiment.twin
     if base is not None:
         result, tried = ContinuedTwin(fit, base, run).best()

@@ -50,7 +50,7 @@ def replay(bag: Path, ticks: Assembler, joints: str = "/joint_states", pressures
 
 
 def write(bag: Path, ticks: Assembler, to: TextIO) -> int:
-    """Return the predictions of a bag as CSV, a row a message of joints; returns how many were valid."""
+    """Write the predictions of a bag as CSV, one row per joint message, and return the number of valid rows."""
     about, table, valid = ticks.core.about, csv.writer(to), 0
     heads = [f"{target['name']}+{ahead['ticks']}" for ahead in about["horizons"] for target in about["targets"]]
     table.writerow(["time_s", "valid", "status", "why", *heads])

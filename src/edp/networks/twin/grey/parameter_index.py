@@ -32,7 +32,7 @@ VALVE_PLACES = 13
 
 # linkage: gravity (m/s^2), lengths of the bodies that carry another one (m), then for each body from the first one on:
 # its actuator, and at each knot the stroke (m), the joint angle there (rad) and its first and second derivative by the
-# stroke; empty: inertia and gravity are polynomials
+# stroke; without a linkage the array is empty, and polynomials describe inertia and gravity
 BODIES, LINKAGE_KNOTS = 3, 33
 GRAVITY, LENGTH, JOINTS = 0, 1, BODIES
 ACTUATOR, KNOT = 0, 1
@@ -54,8 +54,8 @@ VALVE_STATES = 5
 BY_DELAY, BY_PILOT_LAG, BY_SPOOL_LAG, BY_PLAY = range(4)
 OWN = 4
 
-# tangents that a tick carries along: none, by all numbers, or by the state before:
-# pressures and velocities, strokes, bristles, displacements; valves depend on the commands alone
+# tangents that a sample propagates: none, with respect to all parameters, or with respect to the previous state
+# (pressures, velocities, strokes, bristles and displacements; the state of valves depends only on the commands)
 NONE, BY_PARAMETERS, BY_STATE = range(3)
 
 ATMOSPHERE = 0.1013

@@ -145,7 +145,7 @@ def motor_numbers(name: str, travel: Travel, areas: tuple[float, float], declare
 
 
 def pump_numbers(name: str, flow: float, highest: float) -> list[Parameter]:
-    """Return the numbers of a pump, from a plausible flow (m^3/s) and the highest pressure of its line (MPa)."""
+    """Return the parameters of a pump, from a plausible flow (m^3/s) and the highest pressure of its line (MPa)."""
     rows = [
         ("full_flow", "m^3/s", 1.0, flow, 0.5),
         ("least_displacement", "1", 1.0, 0.15, 0.7),

@@ -75,7 +75,7 @@ class OnnxStep:
 
 @FORMS.register("onnx_window")
 class OnnxWindow:
-    """``edp export --format onnx``: the graph of a window."""
+    """Parity form of ``edp export --format onnx``: run the exported graph of a window in ONNX Runtime."""
 
     title: ClassVar[str] = "ONNX window, ONNX Runtime"
 

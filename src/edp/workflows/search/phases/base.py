@@ -1,4 +1,4 @@
-"""Interface of a phase, and steps common to several: ask a study, train its questions, report results."""
+"""Interface of a phase, and common steps: request trainings of a study, train them, report results."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Quest:
 def answer_all(
     context: SearchContext, quests: list[Quest], stops: Sequence[int] = ()
 ) -> Generator[list[TrainingRequest], list[Outcome], list[list[Trial]]]:
-    """Ask all quests in parallel, one batch each at a time, until each has all its answers.
+    """Run all studies in parallel, one batch of trainings each at a time, until every study is complete.
 
     A trial whose costs exceed the limits, or whose network cannot be, is reported so and not trained.
 
@@ -98,7 +98,7 @@ def answer_all(
         for quest, own, trial in batch:
             trial.score = None if trial.pruned else trial.mean(spec.horizon)
             own.append(trial)
-            _tell(context, quest.study, trial)
+            _report_trial(context, quest.study, trial)
     return answers
 
 
@@ -149,7 +149,7 @@ def possible(context: SearchContext, space: Space, arm: Arm) -> tuple[Space, lis
     return feasible, notes
 
 
-def _tell(context: SearchContext, study: Study, trial: Trial) -> None:
+def _report_trial(context: SearchContext, study: Study, trial: Trial) -> None:
     """Pass the score of a trial on to its study."""
     spec = context.spec
     # Positive means violated, as Optuna has it.
@@ -176,7 +176,7 @@ def new_study(
 
 
 def said_of_pruned(context: SearchContext, trials: Sequence[Trial]) -> list[str]:
-    """State the number of trials that ended at a rung; no sentence if none did."""
+    """Return a sentence on the trials that ended early; empty without such trials."""
     pruned = [trial for trial in trials if trial.pruned]
     if not pruned:
         return []
@@ -195,7 +195,7 @@ def scored(trials: Sequence[Trial]) -> list[tuple[float, Trial]]:
 
 
 def best(trials: Sequence[Trial]) -> Trial | None:
-    """Return the trial with the lowest score; None if none was trained to its end."""
+    """Return the trial with the lowest score; None without a complete trial."""
     # Ties go to the earlier question, so that replays decide alike.
     pairs = scored(trials)
     return min(pairs, key=lambda pair: (pair[0], pair[1].number))[1] if pairs else None

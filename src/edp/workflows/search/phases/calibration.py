@@ -39,7 +39,7 @@ class Calibration:
     title = "calibration"
 
     def trainings(self, context: SearchContext) -> int:
-        """Count every question of every backbone, as if none were too costly, and the final between them."""
+        """Count the trainings of all backbones and the final comparison, if no backbone is too costly."""
         spec = context.spec
         final = spec.folds if spec.mode == "sound" and len(spec.backbones) > 1 else 0
         return len(spec.backbones) * (spec.calibration.trials * spec.trial_runs + final)

@@ -27,7 +27,7 @@ NAME = "compression"
 
 
 class CompressionPhase:
-    """Phase 6: networks are compared on development sessions that do not train; the second test set selects nothing."""
+    """Phase 6: compare networks on development sessions outside the training, and report on the second test set."""
 
     title = NAME
 

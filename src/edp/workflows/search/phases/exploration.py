@@ -24,7 +24,7 @@ from edp.workflows.search.trainings import Outcome
 
 
 class Exploration:
-    """Phase 5: its winner is compared with that of phase 4 on folds that no earlier phase has used."""
+    """Phase 5: compare its winner with the winner of phase 4 on new folds."""
 
     title = "exploration"
 
@@ -57,7 +57,7 @@ class Exploration:
         options: Mapping[str, tuple[Value, ...]],
         outcomes: Sequence[Outcome],
     ) -> Decision:
-        """Choose the teacher: the winner of phase 5 if fresh folds confirm it, else that of phase 4."""
+        """Choose the teacher: the winner of phase 5 if new folds confirm it, otherwise the winner of phase 4."""
         size = len(outcomes) // 2
         # The last rows of the mask are the fresh runs.
         mask = context.folds(fresh_runs(context)[-1] + 1)[-size:]

@@ -56,7 +56,7 @@ def _sound(context: SearchContext) -> Decision:
 
 
 def _thesis(context: SearchContext) -> Decision:
-    """Return the j after eq. 3.42 on the mean absolute error.
+    """Return J after eq. 3.42 on the mean absolute error.
 
     The standard deviation between seeds is the largest of all backbones (3.3.1); the error of which a share is to be
     seen is that of the baseline's backbone in phase 0. Both with the feature set that went on.

@@ -37,7 +37,7 @@ class ModuleScreening:
         return max(spec.screening.runs, least_runs(len(spec.modules or MODULES))) * spec.screening.repeats
 
     def run(self, context: SearchContext) -> Course:
-        """Return the trainings of the mode, and what passes."""
+        """Request the trainings of the screening, and select the modules that pass."""
         return (yield from (_thesis(context) if context.spec.mode == "thesis" else _sound(context)))
 
 
