@@ -242,9 +242,9 @@ class HybridSpec:
 @BACKBONES.register("committee")
 @dataclass(frozen=True, kw_only=True)
 class CommitteeSpec:
-    """Perceptrons side by side on present values and their changes over several spans, for a linear head.
+    """Ensemble of perceptrons on present values and their changes over several spans, for a linear head.
 
-    Without recurrence: a member sees the changes over `lags` ticks and nothing older. With the head ``linear`` the
+    The backbone has no recurrence: a member reads only changes over `lags` samples. With the head ``linear`` the
     prediction is a linear map of the changes plus a weighted mean of the members.
 
     Attributes:

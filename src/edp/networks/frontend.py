@@ -46,10 +46,9 @@ class FrontEnd(Streaming):
     """Derived channels and scaling (eq. 3.1, 3.4, 3.5), with the parameters stored as buffers.
 
     Maps inputs ``(batch, time, input)`` in SI units to physical features ``(batch, time, feature)``; `scale` gives
-    the standardised ones. State: the previous tick's inputs, whether there was one, and what the derived channels'
-    means need; at the first tick after a reset every change is 0. Inputs of the physics base follow those of the
-    features and are passed over. Channels of the start have their mean from `init_samples` on, whatever is fed; the
-    state then counts the ticks.
+    the standardised features. The state has the previous inputs, a flag for their presence, and the sums for derived
+    means. At the first sample after a reset every change is 0. Inputs of the physics base come after the inputs of
+    features and are ignored here. From sample `init_samples` on, initialisation inputs are replaced by their means.
     """
 
     offset: Tensor

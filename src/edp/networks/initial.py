@@ -103,8 +103,8 @@ class LearnedFromPrefix(Streaming):
     """Recurrent layers whose state is corrected once, `ticks` ticks after a reset.
 
     State: state of the layers; sum of the prefix so far ``(batch, width_in)``; samples since the reset, up to
-    `ticks`, ``(batch, 1)``. The network runs at every call and its result is used at one, so that all ticks of a
-    stream take the same time.
+    `ticks`, ``(batch, 1)``. The correction network runs at every sample, although only one result is used, so that all
+    samples take the same time.
     """
 
     operations = frozenset({Operation.LINEAR, Operation.TANH})

@@ -19,8 +19,8 @@ Array = NDArray[np.float64]
 def usual_range(predictor: Predictor) -> tuple[Array, Array]:
     """Return middle and width of each input's usual range in SI units, each ``(input,)``, from the scaler.
 
-    A channel that only a derived one reads has the width of that one's change; one that only a physics base reads has
-    what is usual for it.
+    For a channel that is only an input of a derived channel, the width is the width of the derived change. For a
+    channel that only a physics base reads, the range is typical for its kind.
     """
     front, features = predictor.front, predictor.task.features
     offset, width = (part.detach().cpu().double().numpy() for part in (front.offset, front.width))

@@ -140,7 +140,7 @@ def streamed(
 def stream_groups(series: Sequence[Series], batch: int = 16) -> list[list[int]]:
     """Return groups of series indices whose streams run in parallel, sorted by length.
 
-    A stream's answers may differ in their last bits with its neighbours, which these groups settle once for all.
+    The last bits of an output can depend on the other streams of its batch; fixed groups make the bits reproducible.
     """
     # Streams of like length run together, so that little is computed beyond the end of the shorter ones.
     order = sorted(range(len(series)), key=lambda i: series[i].samples)

@@ -77,9 +77,9 @@ class StreamTick:
 class Stream:
     """Predictor run sample by sample, as on the machine: one row of SI inputs gives predictions, intervals and flags.
 
-    The rules are those of the exported C (docs/howto/deploy_c.md): inputs with a NaN, an infinite value or one beyond a
-    million standard widths are rejected as a whole, counted, and the tick is held: the last accepted inputs are fed
-    again. After `HOLD_TICKS` held ticks in a row the memory is cleared, and the next accepted inputs start it again.
+    The rules equal the rules of the exported C code (docs/howto/deploy_c.md). A row with a NaN, an infinite value or a
+    value beyond a million standard widths is rejected and counted; the network then repeats the last accepted row.
+    After `HOLD_TICKS` rejected rows in sequence the memory is reset, and the next accepted row starts a new sequence.
 
     Args:
         predictor: the network; it is put in evaluation mode.

@@ -25,8 +25,8 @@ _SPREAD = 0.02
 class MachineCode:
     """Channel u becomes ``u (1 + G z) + S z``; z is the machine's code, a constant of the network.
 
-    Zero is the code of a machine that nothing is known of. `edp train pretrain --method codes` learns G and S from
-    machines with a code each, `edp train finetune --method code` finds z alone. Exports hold gains and shifts, no code.
+    An unknown machine has the code zero. `edp train pretrain --method codes` trains G, S and one code per machine;
+    `edp train finetune --method code` fits only z. Exports contain the resulting gains and shifts instead of the code.
 
     Attributes:
         size: numbers of a code.

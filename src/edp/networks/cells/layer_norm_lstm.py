@@ -23,8 +23,8 @@ from edp.networks.streaming import Cost, Operation, State, Streaming, parameters
 class LayerNormLstmCell:
     """LSTM with layer norms inside (Ba et al. 2016, arXiv 1607.06450, eq. 20 to 22; thesis 3.2.4.1).
 
-    The gates see ``norm(W x) + norm(U h) + b``, each norm over all 4 D numbers with gain and shift, and
-    ``h = o tanh(norm(c))``: 22 D parameters in addition to the matrices, which the thesis's printed counts ask for.
+    The gates read ``norm(W x) + norm(U h) + b``, with each norm over all 4 D values and with gain and shift;
+    ``h = o tanh(norm(c))``. These are 22 D parameters in addition to the matrices, as in the thesis's parameter counts.
     """
 
     family: ClassVar[str] = "lstm"

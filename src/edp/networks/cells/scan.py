@@ -53,8 +53,8 @@ class _Scan(torch.autograd.Function):
 def _run(a: Tensor, b: Tensor, start: Tensor, backwards: bool = False) -> Tensor:
     """Compute the recurrence with about ``2 sqrt(time)`` operations instead of one per sample.
 
-    Blocks of ``sqrt(time)`` ticks run side by side from zero, with the product of the factors kept; then the end of
-    each block enters the next. Products only shrink where ``|a| < 1``, so nothing overflows.
+    Blocks of ``sqrt(time)`` samples run in parallel from zero and store the products of their factors. The final state
+    of each block is then added to the next block. The products cannot overflow, since ``|a| < 1``.
     """
     ticks, constant = len(b), a.ndim == 1
     # Blocks of sqrt(ticks) balance the steps inside a block with the joins between blocks.

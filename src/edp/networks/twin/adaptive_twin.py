@@ -1,10 +1,9 @@
 """Grey box with on-board adaptation: wear and temperature are learned from its own free runs, within bounds.
 
-An observer follows the machine as in `edp.networks.twin.forecast`. Every `learn_ticks` ticks the segment that has just
-been measured is run again, freely, from the observer's state at its beginning with the commands that came: once with
-the present numbers, and once for each *group* of numbers a little grown. With e the errors of the velocities in units
-of what they lately were (root mean square), S the slopes of the runs by the logarithms x of the groups, and P their
-covariance::
+An observer follows the machine as in `edp.networks.twin.forecast`. Every `learn_ticks` samples, the last segment is
+simulated again from the observer's state at its start with the measured commands: once with the present parameters,
+and once for each *group* of parameters with a small increase. e are the velocity errors divided by their recent root
+mean square, S the derivatives of the simulation with respect to the logarithms x of the groups, P the covariance of x::
 
     P = (P^-1 + S' S / n)^-1,  x = x + P S' clip(e) / n,   n ticks of the segment, whose errors count as one tick's
     x = a x,  P = a^2 P + (1 - a^2) prior,                 a = exp(-learn_ticks / forgetting)

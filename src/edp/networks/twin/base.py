@@ -38,8 +38,8 @@ class Twin(ABC):
         state = twin.reset(commands[:, :50], measured[:, :50])
         outputs, state = twin.rollout(commands[:, 50:], state)  # outputs[:, t] is the machine after commands[:, 50 + t]
 
-    State is explicit: ticks, chunks and one call over everything give the same numbers, and so does a run that goes on
-    from a kept state. Arrays are float32 in SI units; nothing here needs torch.
+    State is explicit: single samples, chunks and one call over all samples give the same values, and so does a run that
+    continues from a stored state. Arrays are float32 in SI units. This module does not need torch.
 
     Attributes:
         channels: commands and outputs.

@@ -24,8 +24,8 @@ TICKS = integer(1, MAX_ROWS)
 class FreeRunIntervals:
     """Half widths of the intervals of each output by horizon, for runs with all ports free.
 
-    Between knots they are linear in the logarithm of the horizon; beyond the last one they stay, and so does the
-    promise: it is kept up to the last knot only.
+    Between knots, half widths are linear in the logarithm of the horizon. Beyond the last knot they are constant, and
+    the coverage is not validated there.
 
     Attributes:
         coverage: intended fraction of the runs within the interval, equal for all horizons.

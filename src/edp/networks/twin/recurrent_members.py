@@ -34,9 +34,9 @@ stop."""
 def scales_for(twin: RecurrentTwin, own: TwinScales, train: list[Series]) -> TwinScales:
     """Return scales for continued training on other recordings: units stay the same, bounds follow the data.
 
-    A stroke ends where these recordings come to the same outermost place at least twice, or stay there though a lever
-    pushes on; an end that they do not show so is the farther one of theirs and the twin's. Velocities and pressures
-    have the wider bounds of both.
+    An end stop is set where the recordings reach the same outermost stroke at least twice, or stay there under command.
+    Otherwise the end is the outermost stroke of recordings and twin. Velocities and pressures have the wider bounds of
+    both.
 
     Args:
         twin: trained before.

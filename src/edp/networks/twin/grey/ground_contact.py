@@ -1,7 +1,7 @@
 """Compiled ground contact of a grey box with a known linkage: tip position, depth and holding forces.
 
-A force of the ground is a damper for one tick, the size of the force over the speed: it does not move within the tick,
-opposes the motion or stands across it, so that the ground never gives energy, whatever the numbers of its law are.
+Within one sample a ground force acts as a damper with the coefficient force / speed. The force opposes the motion or is
+perpendicular to it, so that the ground never adds energy for any parameters of its law.
 """
 
 from __future__ import annotations
